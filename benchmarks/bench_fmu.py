@@ -21,9 +21,9 @@ import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
 import sealscope as ss
-from sealscope.simulation.commands import recorded
+from sealscope.simulation.commands import sampled_signal
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
 
 SPAN = 1e-3
 CHANNELS = ("p_A", "p_B", "x")
@@ -77,9 +77,9 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "unit.fmu"
             ss.write_fmu(path, rig=rig, step=step)
-            command = recorded(np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]])
+            command = sampled_signal(np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]])
             same = Experiment.of(rig=rig, command=command, duration=chosen.seconds, rate=1 / SPAN, step=step)
-            run = trajectory(same, ())
+            run = integrate_run(same, ())
             every = round(SPAN * (run.t.size - 1) / run.t[-1])
             theirs = np.stack([run[name][::every][: t.size - 1] for name in CHANNELS], axis=1)
             rows, by_master = stepped(path, t, u)
@@ -88,7 +88,7 @@ def main() -> None:
             ours, alone = [], []
             for _ in range(chosen.rounds):
                 begin = time.perf_counter()
-                trajectory(held, ())
+                integrate_run(held, ())
                 ours.append(time.perf_counter() - begin)
                 unit, references = started(path)
                 unit.setReal([references["u"]], [0.05])

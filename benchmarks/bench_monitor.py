@@ -37,7 +37,7 @@ from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
-from sealscope.monitor.sources.source_block import decoded
+from sealscope.monitor.sources.source_block import decode_message
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.monitor.servers import MOSQUITTO, Broker
@@ -83,7 +83,11 @@ def main() -> None:
 
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    forms = {"JSON": lambda values: json.dumps(values).encode(), "CBOR": cbor2.dumps, "CBOR, typed arrays": typed}
+    forms = {
+        "JSON": lambda values: json.dumps(values).encode(),
+        "CBOR": cbor2.dumps,
+        "CBOR, typed arrays": encode_typed_arrays,
+    }
     for form, dumps in forms.items():
         payloads = [dumps(message(samples)) for samples in messages]
         spent, took, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by], 1)
@@ -176,7 +180,7 @@ def message(samples: ss.Recording) -> dict[str, object]:
     return {"t": float(samples.t[0]), "rate": samples.rate, **channels}
 
 
-def typed(values: dict[str, object]) -> bytes:
+def encode_typed_arrays(values: dict[str, object]) -> bytes:
     """A message as CBOR with its channels as arrays of floats (RFC 8746)."""
     arrays = {
         name: cbor2.CBORTag(86, np.array(value, "<f8").tobytes())
@@ -198,7 +202,7 @@ def learn(settings: MonitorSettings, payloads: list[bytes], learned: int, phases
     watched = WatchedActuators(teachers, store)
     for k, teacher in enumerate(teachers):
         for payload in payloads[k:learned]:
-            watched.take([decoded(payload, teacher.name)])
+            watched.store_blocks([decode_message(payload, teacher.name)])
     with store.writing() as connection:
         for table in (store.tables.actuators, store.tables.pending):
             rows = [dict(row._mapping) for row in connection.execute(select(table))]
@@ -232,7 +236,7 @@ def served(
                 done[0] += 1
                 waits.append(time.perf_counter() - due)
 
-            service.hand(replace(decoded(payload, name), done=stored))  # type: ignore[attr-defined]
+            service.submit(replace(decode_message(payload, name), done=stored))  # type: ignore[attr-defined]
 
         def wait_for_blocks(number: int) -> None:
             while done[0] < number:

@@ -17,8 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import sealscope as ss
-from sealscope.campaigns.cases.case import CampaignCase, cases_of, interleave_cases
-from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.case import CampaignCase, interleave_cases, list_cases
+from sealscope.campaigns.cases.machines import case_experiment
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.simulation.simulate import simulate_experiment
@@ -47,7 +47,7 @@ def machines(name: str, count: int, skip: int) -> Iterator[tuple[SimulatedPlan, 
     """Yield machines of a plan, healthy as they are."""
     plan = load_plan(name)
     assert isinstance(plan, SimulatedPlan)
-    cases = [case for case in interleave_cases(cases_of(plan)) if not case.leak_lpm and not case.fault]
+    cases = [case for case in interleave_cases(list_cases(plan)) if not case.leak_lpm and not case.fault]
     for case in cases[skip : skip + count]:
         yield plan, case
 
@@ -59,7 +59,7 @@ def recording_of(plan: SimulatedPlan, case: CampaignCase, fault: str, folder: Pa
     if path is not None and path.exists():
         return ss.read(path)
     own = replace(case, leak_lpm=LEAK) if fault == "leak" else replace(case, fault=fault)
-    recording = simulate_experiment(experiment_of(plan, own)).recording
+    recording = simulate_experiment(case_experiment(plan, own)).recording
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         ss.write(recording, path)

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from verdicts import recording_of
 
 import sealscope as ss
-from sealscope.campaigns.cases.case import CampaignCase, cases_of
+from sealscope.campaigns.cases.case import CampaignCase, list_cases
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.recordings.channels import Array
 
@@ -329,7 +329,7 @@ row("against a baseline of noise", "baseline", lambda s: s.changed(lambda v: v.m
 def machines(number: int, first: int, leaking: bool, folder: Path | None) -> list[Machine]:
     """Return machines of the plan, healthy or leaking; four in a row differ in command and throttles."""
     cases = [
-        case for case in cases_of(load_plan(PLAN)) if case.leak_lpm == (LEAK if leaking else 0.0) and not case.fault
+        case for case in list_cases(load_plan(PLAN)) if case.leak_lpm == (LEAK if leaking else 0.0) and not case.fault
     ]
 
     def place(k: int) -> int:

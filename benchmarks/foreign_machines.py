@@ -34,7 +34,7 @@ import numpy as np
 from numba import njit
 
 import sealscope as ss
-from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.units import LITRE_PER_MINUTE
 
 DT, TANK, HEALTHY_DAYS, LOGS = 5e-5, 2e5, 5, 2  # s, Pa gauge, healthy days, logs of a machine with a leak
@@ -267,7 +267,7 @@ class Machine(NamedTuple):
     def answers(self, seed: list[int]) -> Iterator[tuple[str, float, float, ss.Diagnosis]]:
         """Yield `alone` or `baseline`, nominal and true leak [L/min], and the diagnosis of a log."""
         known = dict(zip(("cylinder.A_A", "cylinder.A_B", "pump.q_b"), self.known, strict=False))
-        rig, days = unstated().with_overrides(known, source="stated"), count(1)
+        rig, days = unstated_rig().with_overrides(known, source="stated"), count(1)
         with tempfile.TemporaryDirectory() as folder:
             healthy = [self.recording(folder, seed, next(days), 0.0, 0.0)[0] for _ in range(HEALTHY_DAYS)]
             for kind, opens, others in (("alone", 0.5 * self.seconds, ()), ("baseline", 0.0, healthy)):

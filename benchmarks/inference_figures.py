@@ -13,9 +13,9 @@ import matplotlib
 import numpy as np
 
 import sealscope as ss
-from sealscope.diagnosis.inference.balance import blocks_of
+from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.blocks import information
-from sealscope.diagnosis.inference.onset import Information, course, step_test
+from sealscope.diagnosis.inference.onset import Information, fit_history, step_test
 from sealscope.diagnosis.inference.rows.weak_form import test_function
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array
@@ -33,15 +33,16 @@ def balance() -> None:
     """Draw the test function, the leak of each block beside the course fitted to them, and the chance of each onset."""
     rig = load_rig("thesis")
     recording = ss.simulate(rig=rig, leak=f"{LEAK} L/min from {ONSET:g} s", seed=5)
-    made = blocks_of(recording, rig)
+    made = recorded_blocks(recording, rig)
     assert made is not None
-    blocks, columns = made
+    regime = made.regime(made.odds)
+    blocks, columns = regime.blocks, regime.columns
     step_information = information(blocks, columns, columns[0].leak)
     test = step_test(step_information)
     assert test is not None
-    unit = float(blocks.driving().mean()) / LITRE_PER_MINUTE
+    unit = float(blocks.mean_pressure().mean()) / LITRE_PER_MINUTE
     free = np.linalg.pinv(step_information.precision, hermitian=True)
-    fitted = course(step_information, test, step=True)
+    fitted = fit_history(step_information, test, with_step=True)
     before = float((unit * fitted.mean)[blocks.time < ONSET].mean())
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11.0, 3.2), layout="constrained")
     phi = test_function(recording.rate).ravel()

@@ -41,7 +41,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from sqlalchemy import create_engine, text
 
-from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, DOUBLE, INT64, SparkplugMetric, SparkplugPayload, encoded
+from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, DOUBLE, INT64, SparkplugMetric, SparkplugPayload, encode_payload
 from sealscope.recordings import write
 from sealscope.recordings.recording import Recording
 
@@ -290,7 +290,7 @@ class Attacks:
 
     def forwarded_guesses(self) -> None:
         """Guess the token, each time for another address; five are looked at."""
-        looked_at = 0
+        viewing = 0
         for k in range(20):
             request = urllib.request.Request(f"http://127.0.0.1:{self.monitor.page}/metrics")
             request.add_header("Authorization", f"Bearer guess {k}")
@@ -298,17 +298,17 @@ class Attacks:
             try:
                 urllib.request.urlopen(request, timeout=10.0).close()
             except urllib.error.HTTPError as error:
-                looked_at += error.code == 401
+                viewing += error.code == 401
             except OSError:
                 pass  # it is being killed, or its connections are held
-        if looked_at > 6:  # a pause may end meanwhile
-            self.deaf.append(f"{looked_at} guesses were looked at")
+        if viewing > 6:  # a pause may end meanwhile
+            self.deaf.append(f"{viewing} guesses were looked at")
 
     def death_with_an_array(self) -> None:
         birth = (SparkplugMetric(BIRTH_SEQUENCE, 3, INT64), SparkplugMetric("p_A", 1.0, DOUBLE))
         array = (SparkplugMetric(BIRTH_SEQUENCE, np.arange(3.0), 31),)
-        self.publish("spBv1.0/plant/NBIRTH/bait", encoded(SparkplugPayload(1, birth, 0)))
-        self.publish("spBv1.0/plant/NDEATH/bait", encoded(SparkplugPayload(1, array, None)))
+        self.publish("spBv1.0/plant/NBIRTH/bait", encode_payload(SparkplugPayload(1, birth, 0)))
+        self.publish("spBv1.0/plant/NDEATH/bait", encode_payload(SparkplugPayload(1, array, None)))
         self.publish("spBv1.0/plant/NDATA/bait", self.chance.randbytes(60))
 
     def hostile_file(self, suffix: bytes, contents: bytes, folder: str | None = None) -> Path:

@@ -32,7 +32,6 @@ import csv
 import math
 import time
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,7 @@ from threadpoolctl import threadpool_limits
 import sealscope as ss
 from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged, size_error
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"
 SHIFT_S, DAY_S = 16 * 3600.0, 24 * 3600.0
@@ -60,7 +59,7 @@ COLUMNS = (
     *("delay_h", "delay_watched_h", "test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
 )
 Libraries = dict[tuple[float, float] | str, list[BlockConductance]]
-WARMEST = priors("inference")["oil"]["warmest"]
+WARMEST = INFERENCE.oil.warmest
 
 
 def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
@@ -97,16 +96,14 @@ def libraries(seed: int) -> tuple[ss.Recording, Libraries, float]:
 def changed(block: BlockConductance, begin: float, g: float, friction: float, level: float) -> BlockConductance:
     """Return a block as of the clock `begin`, with g in place of a level of conductance, and with dp scaled."""
     conductance = g + (block.g - level) / friction
-    return replace(
-        block,
+    return block._replace(
         begin=begin,
         end=begin + block.end - block.begin,
         g=conductance,
         total=conductance,
         offset=math.hypot(block.offset, size_error(ss.load_rig("thesis")) * conductance),
         sd=block.sd / friction,
-        flow=block.flow * friction,
-        duty=(block.duty[0] + math.log(friction), block.duty[1]),
+        pressure=block.pressure * friction,
     )
 
 
@@ -138,7 +135,7 @@ class Life:
         self.random = np.random.default_rng([chosen.seed, number])
         usual = made[CHARGES[1], NOISES[0]]
         self.seconds = usual[0].end - usual[0].begin
-        self.flow = float(np.mean([block.flow for block in usual]))
+        self.flow = float(np.mean([block.lpm for block in usual]))
         self.levels = {key: float(np.mean([block.g for block in blocks])) for key, blocks in made.items()}
         self.levels[OUTSIDE] = self.levels[CHARGES[1], NOISES[0]]
         self.made, self.outside_lpm, self.chosen = made, outside_lpm, chosen
@@ -185,7 +182,7 @@ class Life:
                 lpm = self.lpm(clock - onset)
                 g = cold * WARMEST**warm * (1.0 + slow.after(passed)) + lpm / flow
                 drawn = blocks[random.integers(len(blocks))]
-                estimate = watch.judged([changed(drawn, 1000.0 + clock, g, scaled, self.levels[key])])
+                estimate = watch.judge([changed(drawn, 1000.0 + clock, g, scaled, self.levels[key])])
                 leaked = ran if clock <= onset else leaked
                 ran += self.seconds
                 if watch.leak is None:

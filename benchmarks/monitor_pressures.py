@@ -36,7 +36,7 @@ from threadpoolctl import threadpool_limits
 
 import sealscope as ss
 from sealscope.simulation.changes import ParameterDrift
-from sealscope.simulation.commands import tabulated
+from sealscope.simulation.commands import polyline_from_table
 
 RESULTS = Path(__file__).parent / "results" / "monitor_pressures.csv"
 ONSET_S = 720.0
@@ -112,9 +112,12 @@ class Machine:
             seed=self._seeds + self.pieces + (500 if fails else 0),
             **fails,
             drifts=[
-                *(ParameterDrift(name, tabulated(t, course / course[0] - 1)) for name, course in courses.items()),
                 *(
-                    ParameterDrift(f"sensors.{name}.offset", tabulated(t, zero), absolute=True)
+                    ParameterDrift(name, polyline_from_table(t, course / course[0] - 1))
+                    for name, course in courses.items()
+                ),
+                *(
+                    ParameterDrift(f"sensors.{name}.offset", polyline_from_table(t, zero), absolute=True)
                     for name, zero in zeros.items()
                 ),
             ],

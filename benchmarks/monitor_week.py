@@ -31,7 +31,7 @@ import sealscope as ss
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings
-from sealscope.monitor.sources.source_block import BlockReceiver, decoded
+from sealscope.monitor.sources.source_block import BlockReceiver, decode_message
 
 DAY = 86_400
 #: The duty has a cycle of 1 s, so that its end joins its beginning; so long it settles, and so long it is repeated [s].
@@ -77,7 +77,7 @@ def week(folder: Path, days: float, names: list[str], keep_days: float, rate: in
         for k in range(first, total):
             for name in names:
                 values = {"t": float(k * seconds), "rate": recording.rate, "id": k, **channels[k % len(channels)]}
-                service.hand(decoded(cbor2.dumps(values), name))
+                service.submit(decode_message(cbor2.dumps(values), name))
             if (k + 1) % day == 0 or k + 1 in (first + 1000, total):
                 files = sum(file.stat().st_size for file in folder.iterdir())
                 spent = time.process_time() - began
@@ -87,7 +87,7 @@ def week(folder: Path, days: float, names: list[str], keep_days: float, rate: in
     service = Service(settings, stdout=io.StringIO(), sources=[source])
     service.run()
     _, state, _ = service.store.checkpoint(names[0]) or ("", {}, [])
-    statuses = service.actuators.plain()
+    statuses = service.actuators.summaries()
     print(f"shown: {statuses[names[0]]['status']}, {statuses[names[0]]['counters']}; {service.actuators.counters}")
     print(f"state {len(json.dumps(state))} bytes as JSON", end="; ")
     gc.collect()

@@ -94,7 +94,7 @@ def row(name: str, log: Recording, rig: Rig) -> str:
     """Return what is said of a recording as a row of the table."""
     verdict = ss.diagnose(log, rig=rig)
     balance = VolumeBalance(rig).balance(log)
-    passes = "" if balance is None else np.array(balance.level) * balance.mean_pressure() / LPM * 1e3
+    passes = "" if balance is None else np.array(balance.conductance) * balance.mean_pressure() / LPM * 1e3
     passed = "" if balance is None else f"{passes[0]:.1f} ({passes[1]:.1f} to {passes[2]:.1f})"
     bound = "" if verdict.bound_lpm is None else f"{1e3 * verdict.bound_lpm:.3g}"
     return f"| {name} | {verdict.verdict} | {verdict.cause or ''} | {bound} | {passed} |"

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tally import Tally, judge, print_heads, print_row
 
-from sealscope.diagnosis.diagnose import Examination
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import Rig, load_rig
@@ -121,37 +121,22 @@ def machines(family: str, count: int, seed: int) -> Iterator[Machine]:
     yield from (machine(family, number, seed) for number in range(count))
 
 
-def row(family: str, count: int, seed: int) -> tuple[str, np.ndarray]:
-    """Return the line of a family, and its counts: records, leaks found, stated, held; leak-free records and alarms."""
-    counts = np.zeros(6, dtype=int)
-    ratios = []
+def tally_family(family: str, count: int, seed: int) -> tuple[Tally, Tally]:
+    """Judge the machines of a family: their records with a leak, and without."""
+    leaking, healthy = Tally(), Tally()
     for number, drawn in enumerate(machines(family, count, seed)):
         for law in (LAWS[number % 2], None):
             try:
                 simulated = simulate_experiment(drawn.experiment(law))
             except (InputError, SimulationFailed):
                 continue
-            examination = Examination(simulated.recording, false_alarm_probability=P, rig=drawn.rig)
-            evidence = examination.evidence("volume balance")
+            evidence = judge(simulated.recording, "volume balance", rig=drawn.rig, false_alarm=P)
             if law is None:
-                counts[4:] += 1, evidence.verdict == "leak"
+                healthy.add(evidence)
                 continue
-            counts[:2] += 1, evidence.verdict == "leak"
-            if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
-                continue
-            if not stopped(simulated, drawn.rig.cylinder.L):
-                truth = simulated.truth.mean_leak_lpm
-                low, high = evidence.leak_interval_lpm
-                counts[2:4] += 1, low <= truth <= high
-                ratios.append(evidence.leak_lpm / truth)
-    return _line(family, counts, ratios), counts
-
-
-def _line(family: str, counts: np.ndarray, ratios: list[float]) -> str:
-    size = f"{np.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})" if ratios else ""
-    return (
-        f"| {family} | {counts[1]} of {counts[0]} | {counts[3]} of {counts[2]} | {size} | {counts[5]} of {counts[4]} |"
-    )
+            sized = not stopped(simulated, drawn.rig.cylinder.L)
+            leaking.add(evidence, simulated.truth.mean_leak_lpm if sized else None)
+    return leaking, healthy
 
 
 def main() -> None:
@@ -161,15 +146,14 @@ def main() -> None:
     parser.add_argument("--machines", type=int, default=8, help="of each family")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args()
-    print("| family | leaks found | intervals that hold | stated over true: median, range | leak-free called a leak |")
-    print("| --- | --- | --- | --- | --- |")
-    total = np.zeros(6, dtype=int)
+    print_heads("family", "leak-free")
+    total: list[bool] = []
     for family in DEVELOPED if chosen.half == "developed" else JUDGED:
-        line, counts = row(family, chosen.machines, chosen.seed)
-        total += counts
-        print(line, flush=True)
-    low, high = clopper_pearson(int(total[3]), int(total[2]))
-    print(f"{total[3]} of {total[2]} intervals hold ({100.0 * low:.0f} to {100.0 * high:.0f} %)")
+        leaking, healthy = tally_family(family, chosen.machines, chosen.seed)
+        total += leaking.holds
+        print_row(family, healthy.leaks(), *leaking.cells())
+    low, high = clopper_pearson(sum(total), len(total))
+    print(f"{sum(total)} of {len(total)} intervals hold ({100.0 * low:.0f} to {100.0 * high:.0f} %)")
 
 
 if __name__ == "__main__":

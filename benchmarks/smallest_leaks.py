@@ -21,10 +21,10 @@ import numpy as np
 from real_eha import AREAS, DISPLACEMENT, MAP, leaking
 
 import sealscope as ss
-from sealscope.campaigns.smallest import PlannedDuty, experiment_of, findable
+from sealscope.campaigns.smallest import PlannedDuty, detectable_leak, duty_experiment
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.parameters import load_rig
-from sealscope.simulation.leaks import Leak, from_time
+from sealscope.simulation.leaks import Leak, opening_from
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -85,13 +85,14 @@ def main() -> None:
     print("| --- | --- | " + "--- | " * len(FACTORS))
     for name, command in CASES:
         rig, duty = load_rig(name), PlannedDuty(command)
-        predicted = findable(rig, duty, given.duration)
+        predicted = detectable_leak(rig, duty, given.duration)
         counts = []
         for factor in FACTORS:
-            leak = Leak("laminar", coefficient=factor * predicted.conductance, opening=from_time(0.5 * given.duration))
+            opening = opening_from(0.5 * given.duration)
+            leak = Leak("laminar", coefficient=factor * predicted.conductance, opening=opening)
             detected = 0
             for seed in range(given.seeds):
-                experiment = replace(experiment_of(rig, duty, given.duration, 1000 + seed), leaks=(leak,))
+                experiment = replace(duty_experiment(rig, duty, given.duration, 1000 + seed), leaks=(leak,))
                 recording = simulate_experiment(experiment).recording
                 examination = Examination(recording, false_alarm_probability=0.01, rig=rig)
                 detected += examination.evidence("volume balance").verdict == "leak"

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 import sealscope as ss
-from sealscope.campaigns.cases.case import CampaignCase, cases_of
-from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.case import CampaignCase, list_cases
+from sealscope.campaigns.cases.machines import case_experiment
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.simulation.simulate import simulate_experiment
 
@@ -32,7 +32,7 @@ VIEWS = {"all": None, "pressures": {"u", "p_A", "p_B"}}
 def chosen_cases() -> Iterator[CampaignCase]:
     """Yield the first cases of each kind of record."""
     taken: Counter[tuple[float, str]] = Counter()
-    for case in cases_of(load_plan("bench-detectors")):
+    for case in list_cases(load_plan("bench-detectors")):
         kind = (case.leak_lpm, case.fault)
         most = FAULT if case.fault else SIZE if case.leak_lpm else HEALTHY
         if taken[kind] < most:
@@ -45,7 +45,7 @@ def recording_of(case: CampaignCase, folder: Path | None) -> ss.Recording:
     file = None if folder is None else folder / f"{case.id}.nc"
     if file is not None and file.is_file():
         return ss.read(file)
-    recording = simulate_experiment(experiment_of(load_plan("bench-detectors"), case)).recording
+    recording = simulate_experiment(case_experiment(load_plan("bench-detectors"), case)).recording
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         ss.write(recording, file)

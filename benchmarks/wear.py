@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.trend.reading import reading_of, scatter_of
-from sealscope.diagnosis.trend.wear import Levels, episodes, search
+from sealscope.diagnosis.trend.reading import estimate_reading, scatter_prior
+from sealscope.diagnosis.trend.wear import Levels, find_episodes, score_changes
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array, Recording
@@ -110,7 +110,7 @@ def simulate(folder: Path, machines: int, pressures_of: int, seconds: float) -> 
             with path.open("a", encoding="utf-8") as file:
                 for view in wanted:
                     channels_of_view = recording if view == "all channels" else recording.only(("u", "p_A", "p_B"))
-                    own = reading_of(channels_of_view, rig)
+                    own = estimate_reading(channels_of_view, rig)
                     row = {
                         "machine": seed,
                         "day": day,
@@ -145,7 +145,7 @@ def machines_of(folder: Path, view: str) -> list[list[dict[str, Any]]]:
 
 def levels_at(t: Array, value: Array, error: Array | float, basis: str, healthy_days: int, unit: float) -> Levels:
     """Return levels of recordings that can all be compared, with the prior as `sealscope trend` sets it."""
-    zeros, own = np.zeros(len(t)), scatter_of(basis, float(np.mean(value[:healthy_days])) / unit)  # type: ignore[arg-type]
+    zeros, own = np.zeros(len(t)), scatter_prior(basis, float(np.mean(value[:healthy_days])) / unit)  # type: ignore[arg-type]
     prior = own._replace(scale=own.scale * unit)
     return Levels(t, value, zeros + error, zeros.astype(np.int64), zeros, prior)
 
@@ -161,7 +161,7 @@ def levels_of(days: Sequence[dict[str, Any]], basis: str, healthy_days: int = HE
 
 def first_alarm(levels: Levels, healthy_days: int) -> float | None:
     """Return the day of the first alarm when each day was the last one, None where there is none."""
-    alarm = search(levels, healthy_days).alarm(YEARS * DAYS_PER_YEAR)
+    alarm = score_changes(levels, healthy_days).find_alarm(YEARS * DAYS_PER_YEAR)
     return None if alarm is None else float(levels.t[alarm])
 
 
@@ -229,11 +229,11 @@ def false_alarms(folder: Path, years: int) -> None:
                 for k in range(1, noise.size):
                     noise[k] = lasts * noise[k - 1] + math.sqrt(1.0 - lasts**2) * noise[k]
                 levels = levels_at(np.arange(365.0), mean + scatter * noise, error, basis, healthy_days, unit)
-                few = levels.merged()
+                few = levels.average_neighbours()
                 known = max(1, round(healthy_days * len(few) / len(levels)))
                 begin = 0
                 while begin < len(few) - 1:  # an alarm is looked into, and the series goes on
-                    alarm = search(few.part(slice(begin, None)), known).alarm(YEARS * DAYS_PER_YEAR)
+                    alarm = score_changes(few.select(slice(begin, None)), known).find_alarm(YEARS * DAYS_PER_YEAR)
                     if alarm is None:
                         break
                     alarms, begin = alarms + 1, begin + alarm + 1
@@ -253,7 +253,7 @@ def growths(folder: Path) -> None:
         values, held, count = [], 0, 0
         for days in machines_of(folder, view):
             levels, _ = levels_of(days, basis)
-            own = episodes(levels, years=YEARS, known=HEALTHY_DAYS)[-1]
+            own = find_episodes(levels, years=YEARS, n_healthy=HEALTHY_DAYS)[-1]
             count += 1
             if own.alarm is not None:
                 values.append(own.wear.growth.value)

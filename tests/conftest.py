@@ -25,7 +25,8 @@ CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50
 HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
 
-settings.register_profile("sealscope", deadline=None)  # the first example of a test may have to compile
+# no deadline: the first example of a test may have to compile; a CI run judges a commit by the same examples each time
+settings.register_profile("sealscope", deadline=None, derandomize=bool(os.environ.get("CI")))
 settings.load_profile("sealscope")
 
 
@@ -83,7 +84,7 @@ class Driven:
         t = start[:, None] + offsets
         return np.ascontiguousarray(self.volts(t)), np.full_like(t, self.G), np.full_like(t, self.C)
 
-    def largest(self, t: np.ndarray) -> tuple[float, float]:
+    def max_leakage(self, t: np.ndarray) -> tuple[float, float]:
         return self.G, self.C
 
 

@@ -7,7 +7,8 @@ import inspect
 import pytest
 
 from sealscope.calls import checked_call
-from sealscope.errors import InputError
+
+from .refusals import refusal
 
 
 @checked_call
@@ -25,18 +26,17 @@ def test_a_right_call_is_the_call_itself():
 
 
 @pytest.mark.parametrize(
-    ("args", "kwargs", "message"),
+    ("args", "kwargs", "names"),
     [
-        ((), {"comand": "sine"}, "simulated has no argument 'comand'; did you mean 'command'?"),
-        (("sine",), {"zzz": 1}, "simulated has no argument 'zzz'"),
-        ((), {}, "simulated: missing a required argument: 'command'"),
-        (("sine", 2.0), {}, "simulated: too many positional arguments"),
+        ((), {"comand": "sine"}, "simulated, 'comand', 'command'"),
+        (("sine",), {"zzz": 1}, "simulated, 'zzz'"),
+        ((), {}, "simulated, 'command'"),
+        (("sine", 2.0), {}, "simulated, positional"),
     ],
 )
-def test_a_wrong_call_names_the_right_argument(args, kwargs, message):
-    with pytest.raises(InputError) as refused:
+def test_a_wrong_call_names_the_right_argument(args, kwargs, names):
+    with refusal(*names.split(", ")):
         simulated(*args, **kwargs)
-    assert str(refused.value) == message
 
 
 def test_an_error_from_inside_is_left_alone():

@@ -47,7 +47,7 @@ def test_alarms_follow_the_schema():
         cause="piston leak", evidence="a step", next_check="hold a load", baseline=1,
     )  # fmt: skip
     schema = validator("alarm")
-    written = json.loads(json.dumps(alarm.plain()))
+    written = json.loads(json.dumps(alarm.as_dict()))
     schema.validate(written)
     assert {field.name for field in fields(Alarm)} <= set(written)
     assert not schema.is_valid(written | {"state": "gone"})

@@ -15,12 +15,12 @@ from typing import Any
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 #: Export -> module that it is loaded from.
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
-#: Name of the release before -> what is used in its place, and the module and name that it still is.
+#: Deprecated name -> its replacement, and the module and name that it still stands for.
 _DEPRECATED = {
     "load_machine": ("read_machine", "sealscope.diagnosis.commissioned.machine_file", "read_machine"),
     "write_page": ("report(recording, path, diagnosis)", "sealscope.reporting.page", "write_page"),
 }
-# LeakDetector needs the extra `learn`, so it is in no `import *`
+# LeakDetector needs the extra `learn`, so that `import *` must not load it
 __all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 
@@ -34,9 +34,9 @@ def __getattr__(name: str) -> Any:
     if name in _DEPRECATED:
         from warnings import warn
 
-        instead, home, own = _DEPRECATED[name]
-        warn(f"sealscope.{name} is deprecated and goes with the next release: use {instead}", DeprecationWarning, 2)
-        return getattr(import_module(home), own)
+        replacement, home, attribute = _DEPRECATED[name]
+        warn(f"sealscope.{name} is deprecated and goes with the next release: use {replacement}", DeprecationWarning, 2)
+        return getattr(import_module(home), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,13 +1,12 @@
-"""The one way a function is compiled: numba, with a cache that cannot return old physics.
+"""Compile functions by numba, with a cache that never returns code of outdated sources.
 
-Plain ``cache=True`` keys a kernel by its own file only, so an edit to a law in another file leaves the kernel's
-old machine code valid and silently wrong. Here the cache directory is named by a hash over the sources of every
-package that holds compiled code, the versions of numba and Python and the processor, and lies in the user's cache
-folder (never in site-packages, which may be read-only). `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching
-off.
+Numba's ``cache=True`` keys a kernel by its own file only: after an edit to a law in another file it would silently
+return the old machine code. Here the name of the cache folder is a hash over the sources of all packages with compiled
+code, the versions of numba and Python, and the processor. It lies in the user's cache folder, as site-packages may be
+read-only. `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
 
-Compiled code is unpickled, which can run any command: only folders of the user that nobody else can write are used. A
-file of the cache that is cut off or cannot be written is a cache miss.
+Compiled code is unpickled, which can run any command: only folders that no other user can write are used. A file of
+the cache that is truncated or cannot be written is a cache miss.
 """
 
 from __future__ import annotations
@@ -34,31 +33,35 @@ from numba import types
 from numba.extending import intrinsic
 from platformdirs import user_cache_path
 
-# numba's settings in the working folder may be hostile, and name a library to load
+# ignore numba's settings in the working folder, which may be hostile and name a library to load
 numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_WALK = "monitor/sources/message_limits.py"
+_MESSAGE_LIMITS = "monitor/sources/message_limits.py"
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py"),
-    *("physics", "signals", "control", "simulation", "diagnosis", _WALK),
+    *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
 )
-_KEPT_GENERATIONS = 4
-#: Versions of numba whose private names are known: from the first to before the second.
+#: Cache folders of the last sources that are not removed.
+_MAX_GENERATIONS = 4
+#: Range of numba versions with known private names: from the first to before the second.
 KNOWN_VERSIONS = (0, 61, 2), (0, 69, 0)
 _log = logging.getLogger(__name__)
 
 
-def knows_version(version: str) -> bool:
-    """Return True for a version of numba with known private names."""
+def is_known_version(version: str) -> bool:
+    """Test whether the private names of this numba version are known."""
     first, after = KNOWN_VERSIONS
     return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
 
 
 @cache
 def _compiler() -> ModuleType:
-    """Choose what compiles: numba's private classes where this version's are known, else its whole pipeline."""
-    if knows_version(numba.__version__):
+    """Choose the module that compiles.
+
+    It uses numba's private classes if this version's are known, else numba's whole pipeline.
+    """
+    if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
     _log.warning(
@@ -69,7 +72,7 @@ def _compiler() -> ModuleType:
 
 
 def source_hash(root: Path) -> str:
-    """Compute a hash of every source file, and of the numbers beside them, in the compiled packages under `root`."""
+    """Compute a hash over the Python and TOML files of the compiled packages under `root`."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         place = root / package
@@ -81,36 +84,36 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Choose the folder for compiled code; None where caching is turned off."""
-    chosen = os.environ.get("SEALSCOPE_CACHE_DIR")
-    if chosen is not None:
-        return Path(chosen) if chosen else None
+    """Choose the folder for compiled code; None if caching is turned off."""
+    setting = os.environ.get("SEALSCOPE_CACHE_DIR")
+    if setting is not None:
+        return Path(setting) if setting else None
     folder = user_cache_path("sealscope", appauthor=False)
-    return folder if folder.is_absolute() else None  # of a user without a home
+    return folder if folder.is_absolute() else None  # relative for a user without a home
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove the generations of compiled code that nobody used for the longest time."""
+    """Remove all but the most recently used generations of compiled code."""
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
         reverse=True,
     )
-    for entry in older[_KEPT_GENERATIONS - 1 :]:
+    for entry in older[_MAX_GENERATIONS - 1 :]:
         shutil.rmtree(entry, ignore_errors=True)
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
     """Raise PermissionError unless `folder` is a directory, no link, of this user, without the `forbidden` bits."""
     status = folder.lstat()
-    if not hasattr(os, "getuid"):  # Windows keeps the folders of a user to itself
+    if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
         return
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & forbidden:
         raise PermissionError(f"{folder} must be a folder of this user alone")
 
 
-def _private(folder: Path) -> None:
-    """Make a folder with mode 0700; raise OSError where one is there that another user owns or can write."""
+def _make_private(folder: Path) -> None:
+    """Make a folder with mode 0700; raise OSError if another user owns it or can write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_owner(folder, 0o022)
     if folder.lstat().st_mode & 0o077:
@@ -120,25 +123,24 @@ def _private(folder: Path) -> None:
 
 @cache
 def cache_directory() -> Path | None:
-    """Make and return the directory of this source's compiled code; None where none can be written safely."""
+    """Make and return the folder for compiled code of these sources; None if none can be written safely."""
     base = _user_cache_folder()
     if base is None:
         return None
     environment = f"{numba.__version__} {platform.python_version()} {platform.machine()} {numba.config.CPU_NAME}"
     key = hashlib.sha256((source_hash(Path(__file__).parent) + environment).encode()).hexdigest()[:20]
     for temporary in (False, True):
-        directory = Path("kernels") / key
+        if temporary:
+            base = Path(tempfile.gettempdir()) / f"sealscope-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+        directory = base / "kernels" / key
         try:
-            if temporary:  # anybody can make a folder of this name
-                user = os.getuid() if hasattr(os, "getuid") else "user"
-                base = Path(tempfile.gettempdir()) / f"sealscope-{user}"
-                _private(base)
+            if temporary:  # another user may have made a folder with this name
+                _make_private(base)
             else:
                 base.mkdir(mode=0o700, parents=True, exist_ok=True)
                 _check_owner(base.resolve(), 0o022)
-            directory = base / directory
-            _private(directory.parent)
-            _private(directory)
+            _make_private(directory.parent)
+            _make_private(directory)
             os.utime(directory)
             with tempfile.TemporaryFile(dir=directory):
                 pass
@@ -152,37 +154,38 @@ def cache_directory() -> Path | None:
 
 
 def kernel(function: _F, fastmath: Any = False) -> _F:
-    """Compile `function` (no Python objects, GIL released) with the safe cache; errors in floats follow IEEE 754."""
+    """Compile `function` without Python objects and GIL, with the safe cache; float errors follow IEEE 754."""
     return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
 
 
-def _law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
+def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
+    """Compile a physical law that other compiled functions call."""
     if numba.config.DISABLE_JIT:
         return function
     return _compiler().compile_law(function, fastmath, inlined, cache_directory())  # type: ignore[no-any-return]
 
 
 def law(function: _F) -> _F:
-    """Compile a small law that other compiled functions call: inlined and cached with them. Python runs it itself."""
-    return _law(function, False)
+    """Compile a small law that is inlined in other compiled functions; called from Python it is plain Python."""
+    return _compile_law(function, False)
 
 
 def large_law(function: _F) -> _F:
-    """Compile a law that is too large to be inlined at each of its calls; else as `law`."""
-    return _law(function, False, inlined=False)
+    """Compile a law like `law`, but one too large to be inlined at each call."""
+    return _compile_law(function, False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
     """Compile a law whose products and sums may be contracted to fused multiply-adds.
 
-    Divisions by what does not change may become products. Last digits depend on the processor, never on the block or
+    Divisions by loop invariants may become products. The last digits depend on the processor, but not on the block or
     the lane.
     """
-    return _law(function, {"contract", "arcp"})
+    return _compile_law(function, {"contract", "arcp"})
 
 
 class Entry:
-    """A function double f(double *memory, double *input), compiled when its address is first asked for, and cached."""
+    """A function double f(double *memory, double *input), compiled when its address is first requested, and cached."""
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
@@ -196,70 +199,76 @@ class Entry:
 
 
 def entry(function: Callable[..., Any]) -> Entry:
-    """Compile a function of two blocks of numbers that kernels call by its address."""
+    """Compile a function of two arrays of doubles that kernels call by its address."""
     return Entry(function)
 
 
 @intrinsic  # type: ignore[misc]
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
-    """Call double f(double *memory, double *sample) at an address; all three are addresses as whole numbers."""
+    """Call double f(double *memory, double *sample) by its address; all three arguments are integer addresses."""
 
-    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+    def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        """Emit the call in LLVM."""
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
         function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
         return builder.call(function, [builder.inttoptr(value, pointer) for value in values[1:]])
 
-    return numba.float64(numba.int64, numba.int64, numba.int64), generate
+    return numba.float64(numba.int64, numba.int64, numba.int64), emit_call
 
 
 @intrinsic  # type: ignore[misc]
 def address_of(context: Any, pointer: Any) -> Any:
-    """Return the address of a pointer as a whole number."""
+    """Return the address of a pointer as an integer."""
 
-    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+    def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        """Emit the conversion in LLVM."""
         return builder.ptrtoint(values[0], target.get_value_type(numba.int64))
 
-    return numba.int64(pointer), generate
+    return numba.int64(pointer), emit_conversion
 
 
-def layout_of(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the type of a record of numbers by name, and of parts: arrays of a shape, or records of a type."""
+def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
+    """Build the dtype of a record of doubles by name, and of parts: arrays of a shape, or records of a dtype."""
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
 
-def record_of(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make an array (1,) of a record; its parts are `values` or else attributes of `source` by name, or zeros."""
+def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
+    """Make a record array (1,) from `values`, or else from attributes of `source` by name, or zeros."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))
     return record
 
 
-def record_at(layout: Any) -> Callable[[Any], Any]:
-    """Build the law that reads a block of numbers, at the pointer to its first, as a record.
+def record_view(layout: Any) -> Callable[[Any], Any]:
+    """Build the law that views the doubles at a pointer as a record, without copying them.
 
-    `layout`: NumPy's type of a record of doubles and arrays of them; what is assigned to its parts is in the block.
+    `layout`: NumPy's dtype of a record of doubles and arrays of them.
     """
     kind = numba.types.CPointer(numba.from_dtype(layout))
 
     @intrinsic  # type: ignore[misc]
-    def cast(context: Any, pointer: Any) -> Any:
-        def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+    def cast_pointer(context: Any, pointer: Any) -> Any:
+        """Cast a pointer to doubles to a pointer to the record."""
+
+        def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+            """Emit the cast in LLVM."""
             return builder.bitcast(values[0], target.get_value_type(kind))
 
-        return kind(pointer), generate
+        return kind(pointer), emit_cast
 
     @law
     def record(pointer: Any) -> Any:
-        return numba.carray(cast(pointer), 1)[0]
+        """View the doubles at a pointer as the record."""
+        return numba.carray(cast_pointer(pointer), 1)[0]
 
     return record  # type: ignore[no-any-return]
 
 
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
-    """Compile a function to LLVM code free of Python; return the code and the function's symbol.
+    """Compile a function to LLVM code without Python; return the code and the function's symbol.
 
     `arguments`: "double*", "double" or "int64" each. The function returns an integer, takes pointers and numbers, and
     allocates nothing; what C calls is ``int symbol(int64_t *result, void **unused, arguments...)``.
@@ -271,7 +280,7 @@ def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]
     )
     (compiled,) = dispatcher.overloads.values()
     text = dispatcher.inspect_llvm(compiled.signature.args)
-    # numba's counting of references comes with every module; nothing calls it here, and it is for one processor only
+    # remove numba's reference counting, which is not called and is specific to one processor
     text = re.sub(r"^define linkonce_odr void @NRT_decref\(.*?^}\n", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r"^declare .* @(NRT_MemInfo_call_dtor|llvm\.x86\.[\w.]+)\(.*\n", "", text, flags=re.MULTILINE)
     return text, compiled.fndesc.llvm_func_name

@@ -1,4 +1,4 @@
-"""The main job shown once, whole: a machine is commissioned, then a healthy and a leaking recording are judged."""
+"""Demonstrate the main task: commission a machine, then diagnose a healthy and a leaking recording."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from sealscope.storage.folders import make_folder
 
 #: The command of the demo, on the thesis's rig.
 COMMAND = "3 sin(4t)"
-#: Healthy recordings that the machine is commissioned on, and the length of each, and of the healthy one judged [s].
-HEALTHY, SECONDS = 5, 20.0
-#: What is judged as leaking: the thesis's smallest leak, from half time on.
+#: Number of healthy recordings for the commissioning, and the length of healthy recordings [s].
+N_HEALTHY, SECONDS = 5, 20.0
+#: The leak to be found: the thesis's smallest, from half of the recording on.
 LEAK = "0.0042 L/min from 30 s"
 
 
@@ -37,13 +37,13 @@ class Demo:
 
 
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
-    """Simulate and write all recordings, commission the machine, diagnose two and write the page, all into `folder`."""
+    """Simulate recordings, commission the machine, diagnose two of them and write a page, all into `folder`."""
     update = progress or (lambda task, share: None)
-    names = [*(f"healthy/run{k + 1}.nc" for k in range(HEALTHY)), "healthy.nc"]
+    names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}
     for k, name in enumerate(names):
-        without = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
-        recordings[name] = simulate_experiment(without).recording
+        healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=len(names) * seed + k)
+        recordings[name] = simulate_experiment(healthy_experiment).recording
         update("simulating healthy recordings", (k + 1) / len(names))
     experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
     result = simulate_experiment(experiment, progress)
@@ -55,8 +55,8 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     machine = commission(folder / "healthy", rig=experiment.rig, name="demo")
     machine_file = write_machine(machine, folder / "machine.toml")
     update("diagnosing", 0.0)
-    judged = partial(_judged, machine, folder)
-    healthy, diagnosis = judged("healthy.nc"), judged(file.name)
+    diagnose = partial(_diagnose_file, machine, folder)
+    healthy, diagnosis = diagnose("healthy.nc"), diagnose(file.name)
     update("writing the page", 0.5)
     report(
         read(file),
@@ -71,5 +71,6 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
     return Demo(machine, healthy, diagnosis, result.truth, machine_file, file, page)
 
 
-def _judged(machine: CommissionedMachine, folder: Path, name: str) -> Diagnosis:
+def _diagnose_file(machine: CommissionedMachine, folder: Path, name: str) -> Diagnosis:
+    """Diagnose a recording in the folder; the diagnosis gets its file name."""
     return replace(machine.diagnose(machine.read(folder / name)), file=name)

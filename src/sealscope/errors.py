@@ -1,4 +1,4 @@
-"""The errors a caller can act on, and texts fit to print.
+"""Errors that a caller can act on, and printable texts.
 
 Each message is one line that names the rule, the value and the place, for example
 ``charge_pressure must be > 0 Pa, got -3.0 (rigs/lab.toml)``.
@@ -6,25 +6,25 @@ Each message is one line that names the rule, the value and the place, for examp
 
 from __future__ import annotations
 
-#: Most characters of a message at its beginning, where the rule stands, and at its end, where the place does.
-_BEGINNING, _END = 1500, 2500
+#: Most characters of a message at its beginning, with the rule, and at its end, with the place.
+_MAX_BEGINNING, _MAX_END = 1500, 2500
 
 
 def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
-    """Return a text without what a terminal would obey, whatever a file's name or header brought; `kept` stays."""
-    return "".join(sign if sign.isprintable() or sign in kept else instead for sign in text)
+    """Replace unprintable characters, which may control a terminal, by `instead`, except those in `kept`."""
+    return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
 
 class SealscopeError(Exception):
-    """Base of every error that Sealscope raises on purpose; its text is one line, fit to print.
+    """Base of every error that Sealscope raises on purpose; its text is one printable line.
 
-    Line breaks of a text from outside become blanks, and the middle of a very long one is left out.
+    Line breaks become blanks, and the middle of a very long text is omitted.
     """
 
     def __init__(self, message: object = "") -> None:
         line = " ".join(str(message).splitlines())
-        if len(line) > _BEGINNING + _END:
-            line = f"{line[:_BEGINNING]} ... {line[-_END:]}"
+        if len(line) > _MAX_BEGINNING + _MAX_END:
+            line = f"{line[:_MAX_BEGINNING]} ... {line[-_MAX_END:]}"
         super().__init__(line)
 
 

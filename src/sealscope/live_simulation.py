@@ -1,7 +1,7 @@
-"""The simulated rig as a source of a monitor: in the place of an actuator's samples, at a multiple of real time.
+"""Simulated actuators as sources of a monitor, at a multiple of real time.
 
-A run is the same to the last bit whenever it is simulated, and its blocks are named by all that it depends on. So a
-monitor that begins again goes on after the last block that it stored, and no block is counted twice.
+A simulation is reproducible, and the identity of a block contains everything that it depends on. A restarted monitor
+therefore continues after the last block that it stored, and counts no block twice.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from threading import Lock
 
 from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError
-from sealscope.monitor.database.store import KEPT_IDENTITIES
+from sealscope.monitor.database.store import MAX_IDENTITIES
 from sealscope.monitor.service import Source
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings, SimulateSettings
 from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
-#: Samples that a block holds [s].
+#: Length of a block [s].
 BLOCK_S = 1.0
 #: Settings of the demo: three actuators at 20 times real time, of which one begins to leak after two minutes.
 DEMO = """\
@@ -48,53 +48,60 @@ simulate = {{ command = "2.5 sin(4t)", leak = "0.0042 L/min from 120 s", seed = 
 name = "clamp"
 simulate = {{ command = "3 sin(5t)", seed = 2, speed = {speed:g} }}
 """
-_one_at_a_time = Lock()
+#: Lets one simulation run at a time.
+_simulation_lock = Lock()
 
 
-def simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
-    """Build a source for each actuator that has `simulate`; raise InputError where its words make no experiment.
+def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
+    """Build a source for each actuator that has `simulate`; raise InputError if its settings make no experiment.
 
-    `say` is told when a simulation begins, and when its time is over.
+    `say`: called when a simulation begins, and when its time is over.
     """
     return [
-        _source(actuator.name, _experiment(actuator, actuator.simulate), actuator.simulate, say)
+        _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
         for actuator in settings.actuator
         if actuator.simulate is not None
     ]
 
 
-def _experiment(actuator: ActuatorSettings, words: SimulateSettings) -> Experiment:
+def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
+    """Make the experiment of an actuator; raise InputError, with its name, for wrong settings."""
     try:
-        experiment = Experiment.of(rig=actuator.rig, **words.model_dump(exclude={"speed"}))
-        if experiment.duration / BLOCK_S > KEPT_IDENTITIES:
-            raise InputError(f"duration must be at most {KEPT_IDENTITIES * BLOCK_S:g} s, got {experiment.duration:g} s")
+        experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
+        if experiment.duration / BLOCK_S > MAX_IDENTITIES:
+            raise InputError(f"duration must be at most {MAX_IDENTITIES * BLOCK_S:g} s, got {experiment.duration:g} s")
     except InputError as error:
         raise InputError(f"{actuator.name}: simulate: {error}") from None
     return experiment
 
 
-def _source(name: str, experiment: Experiment, words: SimulateSettings, say: Callable[[str], None]) -> Source:
+def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
+    """Make a source that simulates the experiment and delivers its blocks in time, from the first unknown one on."""
+
     def play(receiver: BlockReceiver) -> None:
+        """Simulate if any block is unknown to the store, and deliver the unknown blocks in time."""
         blocks = range(math.floor(experiment.duration / BLOCK_S))
-        first = bisect_left(blocks, True, key=lambda number: not receiver.store.is_known(name, _identity(number)))
+        # the store knows all blocks before some block, and none after it
+        first = bisect_left(blocks, True, key=lambda number: not receiver.store.is_known(name, block_identity(number)))
         if first < len(blocks):
-            with _one_at_a_time:
+            with _simulation_lock:
                 if receiver.stopping.is_set():
                     return
                 say(f"simulates {name}")
                 run = simulate_experiment(experiment).recording
             recording = run.only([channel for channel in CHANNELS if channel in run])
-            count = round(BLOCK_S * recording.rate)
-            began = time.monotonic()
+            n_samples = round(BLOCK_S * recording.rate)
+            start_time = time.monotonic()
             for number in blocks[first:]:
-                due = began + (number + 1 - first) * BLOCK_S / words.speed
+                due = start_time + (number + 1 - first) * BLOCK_S / settings.speed
                 if receiver.stopping.wait(max(0.0, due - time.monotonic())):
                     return
-                samples = recording.samples(slice(number * count, (number + 1) * count))
-                receiver.hand(SourceBlock(name, _identity(number), samples))
+                samples = recording.samples(slice(number * n_samples, (number + 1) * n_samples))
+                receiver.submit(SourceBlock(name, block_identity(number), samples))
         say(f"{name}: the simulated time is over")
 
-    def _identity(number: int) -> str:
+    def block_identity(number: int) -> str:
+        """Return the identity of a block, by which the store recognises it."""
         return f"simulated {experiment.key()} {number}"
 
     return play

@@ -1,8 +1,8 @@
-"""Compilation by numba's documented extension points: its whole pipeline with one pass of ours, and no cache.
+"""Compile by numba's documented extension points: its whole pipeline with one additional pass, without a cache.
 
-The pass settles which laws a rig has before types are inferred; without it a law that is absent would be typed, and
-fail. `compiled` takes these functions for a version of numba whose private names are not known (`numba_private`): the
-results are the same; each process compiles anew.
+The pass decides which laws a rig has before types are inferred; otherwise the code of an absent law would be typed, and
+fail. `compiled` uses these functions for versions of numba whose private names are not known (`numba_private`). The
+results are the same, but each process compiles anew.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba.core.ir_utils import get_definition, guard
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import register_jitable
 
-#: Names of numba beyond its reference manual that both ways of compiling, lanes and units use, by module.
+#: Names of numba that are not in its reference manual but used by both modules, `physics.lanes` and `fmu`, by module.
 EXTENSION_NAMES = {
     "numba.core": ("cgutils", "config", "ir"),
     "numba.core.compiler": ("CompilerBase", "DefaultPassBuilder"),
@@ -35,11 +35,11 @@ EXTENSION_NAMES = {
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
-class SettledLaws(FunctionPass):  # type: ignore[misc]
-    """Replace len(p.law) by its number, `p` an argument that is a named tuple or a record, `law` a tuple or an array.
+class ConstantLengths(FunctionPass):  # type: ignore[misc]
+    """Replace len(p.law) by its number, for an argument `p`, a named tuple or record, and `law`, a tuple or array.
 
-    So is len(choice) of an argument that is a tuple itself. Branches on it are then settled before types are inferred,
-    and a law that is absent is not even compiled.
+    The same holds for len(choice) of an argument that is a tuple. Branches on the length are then decided before types
+    are inferred, and an absent law is not compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -48,27 +48,30 @@ class SettledLaws(FunctionPass):  # type: ignore[misc]
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Run the pass; True where it changed something."""
+        """Replace each len() of an argument of fixed size by a constant; return True if any was."""
         code, changed = state.func_ir, False
 
-        def definition(variable: Any) -> Any:
+        def find_definition(variable: Any) -> Any:
+            """Find the expression that defines a variable; None if it is not unique."""
             return guard(get_definition, code, variable)
 
         def type_of(source: Any) -> Any:
+            """Find the type of an argument, or of a part of one; None for other expressions."""
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
-            numbers = definition(source.value) if getattr(source, "op", None) == "getattr" else None
-            kind = state.args[numbers.index] if isinstance(numbers, ir.Arg) else None
+            owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
+            kind = state.args[owner.index] if isinstance(owner, ir.Arg) else None
             if isinstance(kind, types.BaseNamedTuple) and source.attr in kind.fields:
                 return kind.types[kind.fields.index(source.attr)]
             return kind.typeof(source.attr) if isinstance(kind, types.Record) and source.attr in kind.fields else None
 
-        def length(value: Any) -> int | None:
+        def find_length(value: Any) -> int | None:
+            """Compute the length in a call of `len`; None for other expressions or unknown lengths."""
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
-            if getattr(definition(value.func), "value", None) is not len:
+            if getattr(find_definition(value.func), "value", None) is not len:
                 return None
-            kind = type_of(definition(value.args[0]))
+            kind = type_of(find_definition(value.args[0]))
             if isinstance(kind, types.NestedArray):
                 return int(kind.shape[0])
             return kind.count if isinstance(kind, types.BaseTuple) else None
@@ -76,27 +79,27 @@ class SettledLaws(FunctionPass):  # type: ignore[misc]
         for block in code.blocks.values():
             for statement in block.body:
                 value = statement.value if isinstance(statement, ir.Assign) else None
-                count = length(value)
-                if count is not None:
-                    statement.value = ir.Const(count, statement.loc)
-                    known = code._definitions[statement.target.name]
-                    known[known.index(value)] = statement.value
+                length = find_length(value)
+                if length is not None:
+                    statement.value = ir.Const(length, statement.loc)
+                    definitions = code._definitions[statement.target.name]
+                    definitions[definitions.index(value)] = statement.value
                     changed = True
         return changed
 
 
-class _WholeCompiler(CompilerBase):  # type: ignore[misc]
-    """numba's own compiler, with `SettledLaws` where it settles other constants."""
+class _FullCompiler(CompilerBase):  # type: ignore[misc]
+    """numba's own compiler, with `ConstantLengths` after its pass that replaces other constants."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the one pipeline."""
+        """Return the only pipeline."""
         pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state, "sealscope")
-        pipeline.add_pass_after(SettledLaws, RewriteSemanticConstants)
+        pipeline.add_pass_after(ConstantLengths, RewriteSemanticConstants)
         pipeline.finalize()
         return [pipeline]
 
 
-_OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _WholeCompiler}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _FullCompiler}
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
@@ -105,19 +108,20 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function that other compiled functions call; Python runs a small (`inlined`) one itself."""
+    """Compile a function that other compiled functions call; Python runs an `inlined` one itself."""
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)
     return compile_kernel(function, fastmath, folder)
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Prepare a function that C calls; what is returned compiles it, and returns its address."""
+    """Return a function that compiles `function` for calls from C and returns its address."""
 
-    def address() -> int:
+    def compile_address() -> int:
+        """Compile the function and return its address."""
         callback = numba.cfunc(signature, **_OPTIONS)(function)
-        kept.append(callback)
+        callbacks.append(callback)  # keeps the code in memory
         return int(callback.address)
 
-    kept: list[Any] = []
-    return address
+    callbacks: list[Any] = []
+    return compile_address

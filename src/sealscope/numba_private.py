@@ -1,7 +1,7 @@
-"""Compilation by numba's private classes: less of its work, and a cache whose damaged files are cache misses.
+"""Compile by numba's private classes: fewer passes, and a cache that treats damaged files as cache misses.
 
-Imported for a version within `VERSIONS` alone; `NAMES` and `ATTRIBUTES` are all that this module relies on, and
-`tests/physics/test_numba_names.py` looks at each. Elsewhere `numba_pipeline` compiles.
+Imported only for numba versions within `compiled.KNOWN_VERSIONS`; others use `numba_pipeline`. `NAMES` and `ATTRIBUTES`
+list all private names in this module, which `tests/physics/test_numba_names.py` checks.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from numba.core.untyped_passes import (
     TranslateByteCode,
 )
 
-from sealscope.numba_pipeline import SettledLaws
+from sealscope.numba_pipeline import ConstantLengths
 
 _log = logging.getLogger(__name__)
-#: Names that are imported, by module.
+#: Imported private names, by module.
 NAMES = {
     "numba.core.caching": ("FunctionCache",),
     "numba.core.codegen": ("JITCodeLibrary",),
@@ -59,7 +59,7 @@ NAMES = {
         *("RewriteSemanticConstants", "TranslateByteCode"),
     ),
 }
-#: Attributes of these classes and modules that are overridden, called or set.
+#: Attributes of classes and modules that are overridden, called or set.
 ATTRIBUTES = {
     "numba.core.caching:FunctionCache": (
         *("load_overload", "_load_overload", "_guard_against_spurious_io_errors"),
@@ -74,46 +74,46 @@ ATTRIBUTES = {
 }
 
 
-class PatientCache(FunctionCache):  # type: ignore[misc]
-    """numba's cache, where a file that cannot be read or written is a cache miss."""
+class TolerantCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache, with files that cannot be read or written as cache misses."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled code of a signature, None where there is none or it is damaged.
+        """Load the compiled code of a signature; None if there is none or it is damaged.
 
-        Of what numba prepares before it compiles, which takes longer than the loading, machine code needs the memory's
-        reference counts alone. A compilation prepares the rest.
+        Of numba's preparations for compiling, which take longer than loading, machine code needs only the reference
+        counts. A later compilation does the rest.
         """
         try:
             rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)
-        except Exception as error:  # unpickling a cut-off file raises many kinds
+        except Exception as error:  # unpickling a truncated file raises errors of many classes
             _log.debug("compiled code in %s is damaged: %s", self.cache_path, error)
             with suppress(OSError):
                 self.flush()
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save the compiled code of a signature, if there is room for it."""
+        """Save the compiled code of a signature; an error, such as a full disk, is only logged."""
         try:
             super().save_overload(sig, data)
         except Exception as error:
             _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
-#: What of numba's compiler numbers and arrays need, closures, literals and expressions of whole arrays apart.
+#: Passes that code of numbers and arrays needs, without closures, literals and array expressions.
 _PASSES = (
-    *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, SettledLaws, DeadBranchPrune),
+    *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, ConstantLengths, DeadBranchPrune),
     *(GenericRewrites, ReconstructSSA, NopythonTypeInference, PreLowerStripPhis, IRLegalization, AnnotateTypes),
     *(NativeLowering, NoPythonBackend),
 )
 
 
 class _ShortCompiler(CompilerBase):  # type: ignore[misc]
-    """numba's compiler, reduced to `_PASSES`."""
+    """numba's compiler with only the passes in `_PASSES`."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the one pipeline."""
+        """Return the only pipeline."""
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -121,20 +121,21 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
         return [pipeline]
 
 
-_one_at_a_time = Lock()
+_config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
+    """Make numba's dispatcher of a function, with a cache in `folder` unless that is None."""
     dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
     if folder is None:
         return dispatcher
-    # numba reads the folder when the decorator runs; other users of numba in this process keep theirs. Two threads that
-    # import kernels at once would take each other's setting: none at all is the working directory.
-    with _one_at_a_time:
+    # numba reads this global setting when the cache is made. It is restored for other users of numba in the process;
+    # the lock keeps two threads that import kernels from restoring each other's value.
+    with _config_lock:
         before = config.CACHE_DIR
         config.CACHE_DIR = str(folder)
         try:
-            dispatcher._cache = PatientCache(function)  # as `cache=True` does
+            dispatcher._cache = TolerantCache(function)  # as `cache=True` does
         except (OSError, RuntimeError) as error:  # the folder is gone
             _log.debug("cannot cache compiled code in %s: %s", folder, error)
         finally:
@@ -148,42 +149,44 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law, which kernels are linked with: without machine code, for no address of it is asked for.
+    """The code of a law for linking with kernels, without machine code, as nobody asks for its address.
 
-    It is optimised here, not anew within each kernel: a law gives the same bits in all of them.
+    The law is optimised here once, not within each kernel, so that all kernels compute identical results.
     """
 
     def _finalize_final_module(self) -> None:
+        """Skip the generation of machine code."""
         self._finalized = True
 
 
 class _LawCompiler(_ShortCompiler):
-    """The compiler of laws, which makes no machine code: it is a fifth of the time that a kernel takes."""
+    """The compiler of laws, without machine code, which takes a fifth of the time of a kernel."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the one pipeline."""
+        """Return the only pipeline."""
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
 
 
 class _Law(CPUDispatcher):  # type: ignore[misc]
-    """A function that other compiled functions take in whole: made without the code by which Python calls it.
+    """A law for other compiled functions, without the wrapper by which Python calls it.
 
-    That code unpacks and checks each argument and takes more time to make than the law itself. Called from Python, a
-    small law is run by Python, a large one is compiled a second time, as a kernel is, and cached in `folder`.
+    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Called from Python, a
+    small law is run by Python; a large one is compiled a second time, as a kernel, and cached in `folder`.
     """
 
     folder: Path | None = None
 
     def add_overload(self, cres: Any) -> None:
-        """Keep compiled code for other compiled functions; nothing that Python could call."""
-        name = object()  # in place of machine code
+        """Register compiled code for other compiled functions, without an entry point for Python."""
+        name = object()  # stands for the missing machine code
         self.targetctx.insert_user_function(name, cres.fndesc, [cres.library])
         self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=name)
 
     @cached_property
     def _for_python(self) -> Any:
+        """The function that runs the law for calls from Python."""
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
@@ -196,19 +199,20 @@ def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, fold
     """Compile a function that other compiled functions call, `inlined` at each of its calls."""
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    options |= {} if inlined else {"_nrt": False}
+    options |= {} if inlined else {"_nrt": False}  # no reference counting: a law allocates nothing
     law = _Law(function, targetoptions=options, pipeline_class=_LawCompiler)
     law.folder = folder
     return law
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Prepare a function that C calls; what is returned compiles it, and returns its address."""
+    """Return a function that compiles `function` for calls from C and returns its address."""
     dispatcher = _dispatcher(function, {"no_cpython_wrapper": True}, folder)
 
-    def address() -> int:
+    def compile_address() -> int:
+        """Compile the function and return its address."""
         dispatcher.compile(signature)
         code = dispatcher.overloads[signature.args]
         return int(code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name))
 
-    return address
+    return compile_address

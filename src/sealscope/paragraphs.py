@@ -1,4 +1,4 @@
-"""Text for a terminal: paragraphs without what a terminal would obey."""
+"""Text of messages and terminals: counts, lists of names, and paragraphs without what a terminal would obey."""
 
 from __future__ import annotations
 
@@ -12,21 +12,34 @@ WIDTH = 80
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
-    """Wrap a text beside `head` in lines as wide as whole words allow.
+    """Wrap a text after `head` to lines of at most `width` columns; longer words are not broken.
 
-    The second line and those below are indented by `indent` columns, by default those of the head.
+    Lines after the first are indented by `indent` columns, by default the length of the head.
     """
-    further = " " * (len(head) if indent is None else indent)
+    indentation = " " * (len(head) if indent is None else indent)
     return fill(
         printable(text, "\n\t"),
         width,
         initial_indent=head,
-        subsequent_indent=further,
+        subsequent_indent=indentation,
         break_long_words=False,
         break_on_hyphens=False,
     )
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Format rows (label, text) as paragraphs beside their labels, which take `columns`; empty texts are left out."""
+    """Format rows (label, text) as paragraphs after labels of width `columns`; empty texts are omitted."""
     return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]
+
+
+def format_count(count: int, noun: str) -> str:
+    """Return the count and the noun, in the plural unless the count is 1: ``1 gap``, ``2 gaps``, ``3 stretches``."""
+    ending = "" if count == 1 else "es" if noun.endswith(("s", "ch")) else "s"
+    return f"{count} {noun}{ending}"
+
+
+def join_names(names: Iterable[str], most: int = 12) -> str:
+    """Join names for a message, at most so many of them; one of over 80 characters ends in three points."""
+    names = list(names)
+    shown = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"

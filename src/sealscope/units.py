@@ -1,9 +1,9 @@
-"""Units at the edges: what a file, an option or a figure says, turned into the SI doubles used inside, and back.
+"""Convert the units of files, options and figures to the SI doubles used inside, and back.
 
-A unit is parsed into powers of base units, its factor held as an exact fraction times a power of pi, so that
-``234 cm^3`` is exactly the double ``2.34e-4``. An angle and a count of a converter are dimensions of their own:
-``Hz`` is not ``rad/s``, ``m^3/rev`` is not ``m^3``, and raw counts are not a pressure. The units of hydraulics are
-known without help; for all others pint is asked, and loaded only then.
+A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi, so that ``234 cm^3`` is
+exactly the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``, ``m^3/rev`` is not
+``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are looked up by pint,
+which is loaded only then.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply by a power of another unit without an offset; raise ValueError beyond a double's range."""
+        """Multiply by a power of another unit, without its offset; raise ValueError beyond a double's range."""
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
-        if abs(power) * bits > _MOST_BITS:
+        if abs(power) * bits > _MAX_BITS:
             raise ValueError
         factor, pi_power = self.factor * Fraction(other.factor**power), self.pi_power + other.pi_power * power
-        if max(factor.numerator, factor.denominator).bit_length() > _MOST_BITS or abs(pi_power) > _MOST_PI:
+        if max(factor.numerator, factor.denominator).bit_length() > _MAX_BITS or abs(pi_power) > _MAX_PI:
             raise ValueError
         powers = dict(self.powers)
         for base, exponent in other.powers:
@@ -61,31 +61,33 @@ class Unit(NamedTuple):
         return Unit(factor, pi_power, tuple(sorted((base, total) for base, total in powers.items() if total)))
 
 
-def _unit(row: Mapping[str, Any]) -> Unit:
-    powers = {base: Fraction(power) for base, power in row.items() if base not in ("factor", "pi", "offset")}
-    factor, pi_power, offset = (Fraction(row.get(name, usual)) for name, usual in _USUAL.items())
+def _build_unit(row: Mapping[str, Any]) -> Unit:
+    """Build the Unit of a row of `units.toml`; its keys are base units with their powers, `factor`, `pi`, `offset`."""
+    powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
+    factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
     return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
-def _absolute(unit: Unit) -> Unit:
-    """Build the unit of an absolute pressure: inside are gauge pressures, a standard atmosphere less."""
+def _absolute_unit(unit: Unit) -> Unit:
+    """Make the unit of an absolute pressure; its offset subtracts one atmosphere, as pressures inside are gauge."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
-_USUAL = {"factor": 1, "pi": 0, "offset": 0}
+_DEFAULTS = {"factor": 1, "pi": 0, "offset": 0}
 _TABLES: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+#: Unit without powers, products and other spellings -> its meaning.
 _ATOMS = {
-    prefix + name: _unit({**row, "factor": Fraction(row.get("factor", 1)) * Fraction(10) ** power})
+    prefix + name: _build_unit({**row, "factor": Fraction(row.get("factor", 1)) * Fraction(10) ** power})
     for name, row in _TABLES["prefixed"].items()
     for prefix, power in _TABLES["prefixes"].items()
-} | {name: _unit(row) for name, row in _TABLES["plain"].items()}
-#: Standard atmosphere [Pa], by which a gauge pressure is less than the absolute one.
+} | {name: _build_unit(row) for name, row in _TABLES["plain"].items()}
+#: Standard atmosphere [Pa], the difference between absolute and gauge pressure.
 P_ATM = float(_TABLES["absolute"]["atmosphere"])
-_ATOMS |= {name: _absolute(_ATOMS[gauge]) for name, gauge in _TABLES["absolute"].items() if name != "atmosphere"}
+_ATOMS |= {name: _absolute_unit(_ATOMS[gauge]) for name, gauge in _TABLES["absolute"].items() if name != "atmosphere"}
 _SPELLINGS = {spelling: name for name, spellings in _TABLES["spellings"].items() for spelling in spellings.split()} | {
     "": "1"
 }
-_SIGNS, _KINDS = str.maketrans(_TABLES["signs"]), _TABLES["kinds"]
+_CHARACTERS, _KINDS = str.maketrans(_TABLES["signs"]), _TABLES["kinds"]
 _TOKEN = re.compile(
     r"\s*(?:(?P<op>[/()])|\^(?P<power>[+-]?\d(?:\.5)?)(?![\d.])|(?P<name>[^\W\d]\w*?|%|°[CF]?|1)(?P<digit>[23]?)(?=$|[\s/()^]))"
 )
@@ -93,33 +95,35 @@ _NUMBER = re.compile(
     r"\s*(?P<number>[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:inf|nan)\b)(?P<rest>.*)",
     re.DOTALL | re.IGNORECASE,
 )
-#: How instruments mark a pressure as absolute or as gauge: `bar abs`, `MPa(g)`, `bar\u00fc`.
+#: Marks of absolute and gauge pressures: `bar abs`, `MPa(g)`, `bar\u00fc`.
 _MARKED = re.compile(
     r"(?P<unit>.{1,40}?)[\s_]*\(?(?:(?P<absolute>a|A|abs\.?|absolute?)|g|G|gauge|gage|rel\.?|relative?|\u00fc|\u00dc)\)?"
 )
-_LONGEST_TEXT = 200
-#: A unit's factor is a double: its fraction has at most so many bits, and pi at most this power.
-_MOST_BITS, _MOST_PI = 900, 100
+_MAX_TEXT = 200
+#: Most bits of a factor's numerator and denominator, and largest power of pi, so that the factor is a double.
+_MAX_BITS, _MAX_PI = 900, 100
 
 
 @cache
 def _registry() -> Any:
+    """Make pint's registry of units; it is cached, as this takes long."""
     import pint
 
     return pint.UnitRegistry(cache_folder=None)
 
 
-def _atom(name: str) -> Unit:
-    known = _ATOMS.get(_SPELLINGS.get(name, name))
-    if known is not None:
-        return known
+def _parse_name(name: str) -> Unit:
+    """Return the unit with this name, from `units.toml` or pint; raise InputError if there is none."""
+    unit_of_table = _ATOMS.get(_SPELLINGS.get(name, name))
+    if unit_of_table is not None:
+        return unit_of_table
     registry = _registry()
     try:
         factor, base = registry.get_base_units(name)
-        offset_free = registry.Quantity(0, name).to_base_units().magnitude == 0
-    except Exception as error:  # pint raises many kinds, some of its parser's own
+        is_proportional = registry.Quantity(0, name).to_base_units().magnitude == 0
+    except Exception as error:  # pint raises errors of many classes
         raise InputError(f"got {name}, which is no known unit") from error
-    if not offset_free:
+    if not is_proportional:
         raise InputError(f"got {name}, which is not proportional to an SI unit")
     result = Unit(Fraction(repr(float(factor))))
     for base_name, power in base._units.items():
@@ -128,14 +132,14 @@ def _atom(name: str) -> Unit:
     return result
 
 
-def _tokens(text: str) -> list[str]:
-    """Split a product of units into names, powers (^2), brackets and strokes; raise ValueError for anything else."""
-    tokens, place = [], 0
-    while place < len(text):
-        match = _TOKEN.match(text, place)
+def _tokenize(text: str) -> list[str]:
+    """Split a product of units into names, powers (^2), brackets and slashes; raise ValueError for other text."""
+    tokens, position = [], 0
+    while position < len(text):
+        match = _TOKEN.match(text, position)
         if match is None:
             raise ValueError
-        place = match.end()
+        position = match.end()
         name, digit = match["name"] or "", match["digit"] or ""
         if not digit or name + digit in _SPELLINGS:
             tokens.append(match["op"] or (f"^{match['power']}" if match["power"] else name + digit))
@@ -144,10 +148,10 @@ def _tokens(text: str) -> list[str]:
     return tokens
 
 
-def _product(tokens: list[str]) -> Unit:
-    """Take a product with `/`, blanks and brackets, as ``m^3/(s Pa)`` or ``rad/s/V``, off the tokens' beginning.
+def _parse_product(tokens: list[str]) -> Unit:
+    """Parse a product with `/`, blanks and brackets, such as ``m^3/(s Pa)``, and remove its tokens from the list.
 
-    It ends before a closing bracket. ValueError where there is none.
+    It ends at the end or before a closing bracket. Raises ValueError if there is none.
     """
     result: Unit | None = None
     divides = False
@@ -157,63 +161,63 @@ def _product(tokens: list[str]) -> Unit:
             divides = True
             continue
         if token == "(":
-            unit = _product(tokens)
+            unit = _parse_product(tokens)
             if not tokens or tokens.pop(0) != ")":
                 raise ValueError
         elif token[0] in "/^":
             raise ValueError
         else:
-            unit = _atom(token)
+            unit = _parse_name(token)
         power = Fraction(tokens.pop(0)[1:]) if tokens and tokens[0][0] == "^" else Fraction(1)
-        # a unit alone keeps its offset, a product has none
-        alone = result is None and power == 1
-        result = unit if alone else (result or Unit()).times(unit, -power if divides else power)
+        # only a single unit keeps its offset
+        is_single = result is None and power == 1
+        result = unit if is_single else (result or Unit()).times(unit, -power if divides else power)
         divides = False
     if result is None or divides:
         raise ValueError
     return result
 
 
-def _marked_pressure(text: str) -> Unit | None:
-    """Find the unit of a pressure marked as absolute, with its offset, or as gauge; None for other texts."""
-    marked = _MARKED.fullmatch(text)
-    if marked is None:
+def _parse_marked_pressure(text: str) -> Unit | None:
+    """Parse the unit of a pressure marked as absolute or gauge; None for other texts."""
+    match = _MARKED.fullmatch(text)
+    if match is None:
         return None
     try:
-        unit = parse_unit(marked["unit"])
+        unit = parse_unit(match["unit"])
     except InputError:
         return None
     if unit.powers != _ATOMS["Pa"].powers or unit.offset:
         return None
-    return _absolute(unit) if marked["absolute"] else unit
+    return _absolute_unit(unit) if match["absolute"] else unit
 
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """Parse the unit that `text` names; raise InputError for any other text."""
+    """Parse the unit in `text`; raise InputError if it is none."""
     text = text.strip()
     text = _SPELLINGS.get(text, text)
     if text in _ATOMS:
         return _ATOMS[text]
-    if len(text) > _LONGEST_TEXT:
+    if len(text) > _MAX_TEXT:
         raise InputError(f"got {text[:60]}..., which is no product of units")
-    pressure = _marked_pressure(text)
+    pressure = _parse_marked_pressure(text)
     if pressure is not None:
         return pressure
-    plain = re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text.replace("**", "^").translate(_SIGNS))
+    normalised = re.sub(r"(?<=[A-Za-z])-(?=[A-Za-z])", " ", text.replace("**", "^").translate(_CHARACTERS))
     try:
-        tokens = _tokens(plain.strip())
-        unit = _product(tokens)
+        tokens = _tokenize(normalised.strip())
+        unit = _parse_product(tokens)
         if not tokens:
             return unit
     except InputError:
         raise
     except ValueError:
         pass
-    raise InputError(f"got {plain.strip()[:60]}, which is no product of units")
+    raise InputError(f"got {normalised.strip()[:60]}, which is no product of units")
 
 
-def _expected(si_unit: str) -> str:
+def _describe_dimension(si_unit: str) -> str:
     """Describe the units of a dimension for messages: `a unit of pressure, such as Pa`."""
     if parse_unit(si_unit).powers == ():
         return "no unit, or %"
@@ -221,7 +225,7 @@ def _expected(si_unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Return True for two units whose values can be converted; False also for a text that is no unit."""
+    """Test whether values can be converted between two units; False also if one is not a unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -229,9 +233,9 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Return True for a unit made of those known without pint, such as `bar`, `psig` and `cm3/s`.
+    """Test whether a unit consists of units known without pint, such as `bar`, `psig` and `cm3/s`.
 
-    Of pint's thousands of names many are plain words: a rod is 5 m long.
+    Many of pint's thousands of names are ordinary words, such as `rod`, which is 5 m.
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
@@ -240,28 +244,30 @@ def is_familiar(unit: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
-    """Compute (factor, power of pi, offsets): target = (value + before) * factor * pi**power - after."""
+    """Compute (factor, power of pi, two offsets): target = (value + first) * factor * pi**power - second."""
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
         raise InputError(f"got {unit.strip() or 'none'}")
     return source.factor / target.factor, float(source.pi_power - target.pi_power), source.offset, target.offset
 
 
-def _look_up(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
+def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
+    """Compute the conversion to `si_unit`; the InputError names `name`, the expected dimension and `place`."""
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
         where = f" ({place})" if place else ""
-        raise InputError(" ".join(f"{name} must have {_expected(si_unit)}, {error}{where}".split())) from None
+        raise InputError(" ".join(f"{name} must have {_describe_dimension(si_unit)}, {error}{where}".split())) from None
 
 
-def _convert_one(value: Fraction, conversion: _Conversion) -> float:
-    factor, pi_power, before, after = conversion
-    exact = (value + before) * factor
+def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
+    """Convert one number exactly and round it once; infinite if it exceeds the range of doubles."""
+    factor, pi_power, offset_before, offset_after = conversion
+    exact = (value + offset_before) * factor
     try:
         if pi_power == 0:
-            return float(exact - after)
-        return float(float(exact) * math.pi**pi_power - float(after))
+            return float(exact - offset_after)
+        return float(float(exact) * math.pi**pi_power - float(offset_after))
     except OverflowError:
         return math.inf if exact > 0 else -math.inf
 
@@ -275,28 +281,28 @@ def to_si(
 ) -> Array | float:
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
-    One number is converted exactly and rounded once; an array within 2 units in the last place. Raises InputError that
-    names `name`, the unit and the dimension expected (and `place`, a file), where the dimension is another.
+    One number is converted exactly and rounded once, an array to within 2 units in the last place. Raises InputError
+    for a unit of another dimension; it names `name`, the unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:
         return float(values) if scalar else np.asarray(values, dtype=np.float64)  # type: ignore[arg-type]
-    conversion = _look_up(unit, si_unit, name, place)
+    conversion = _find_conversion(unit, si_unit, name, place)
     if scalar:
         number = float(values)  # type: ignore[arg-type]
-        return _convert_one(Fraction(repr(number)), conversion) if math.isfinite(number) else number
-    factor, pi_power, before, after = conversion
+        return _convert_exactly(Fraction(repr(number)), conversion) if math.isfinite(number) else number
+    factor, pi_power, offset_before, offset_after = conversion
     result = np.array(values, dtype=np.float64)
-    if before:
-        result += float(before)
+    if offset_before:
+        result += float(offset_before)
     if factor.numerator == 1 and float(factor.denominator) == factor.denominator:
         result /= float(factor.denominator)
     else:
         result *= float(factor)
     if pi_power:
         result *= math.pi**pi_power
-    if after:
-        result -= float(after)
+    if offset_after:
+        result -= float(offset_after)
     return result
 
 
@@ -307,8 +313,8 @@ def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., plac
 def from_si(
     values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
 ) -> Array | float:
-    """Convert `values` in `si_unit` to doubles in `unit`; the inverse of `to_si`, with the same errors."""
-    _look_up(unit, si_unit, name, place)
+    """Convert `values` in `si_unit` to doubles in `unit`, the inverse of `to_si`, with the same errors."""
+    _find_conversion(unit, si_unit, name, place)
     return to_si(values, si_unit, unit, name=name, place=place)
 
 
@@ -317,14 +323,14 @@ def parse_quantity(
 ) -> float:
     """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) to a number in `si_unit`.
 
-    A number is taken as SI. Raises InputError where there is no number, for another dimension, and, if `finite`, for an
-    infinite one or NaN.
+    A number is in SI. Raises InputError if there is no number, for another dimension and, if `finite`, for an infinite
+    number or NaN.
     """
     where = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""
     if isinstance(value, Real) and not isinstance(value, bool):
         text = repr(float(value))
-    match = _NUMBER.fullmatch(text) if len(text) <= _LONGEST_TEXT else None
+    match = _NUMBER.fullmatch(text) if len(text) <= _MAX_TEXT else None
     if match is None:
         shown = repr(value[:60] if isinstance(value, str) else value)
         raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {shown}{where}")
@@ -336,7 +342,7 @@ def parse_quantity(
     elif unit == si_unit:
         result = number
     else:
-        result = _convert_one(Fraction(match["number"]), _look_up(unit, si_unit, name, place))
+        result = _convert_exactly(Fraction(match["number"]), _find_conversion(unit, si_unit, name, place))
     if finite and not math.isfinite(result):
         raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{where}")
     return result

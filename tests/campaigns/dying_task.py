@@ -2,15 +2,15 @@
 
 import os
 
-from sealscope.campaigns.cases.case import cases_of
-from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.cases.case import list_cases
+from sealscope.campaigns.cases.work import run_case
 
 
 def die_on_one(plan, case, folder=None):
     """A task that kills its process on one case, for good."""
-    if case.id == min(one.id for one in cases_of(plan)):
+    if case.id == min(one.id for one in list_cases(plan)):
         os._exit(3)
-    return work(plan, case, folder)
+    return run_case(plan, case, folder)
 
 
 def die_on(deadly, item):

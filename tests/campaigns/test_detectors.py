@@ -13,22 +13,23 @@ from typing import get_args
 
 import pytest
 
-from sealscope.campaigns.cases.row import CaseRow, cause_of, rank_of
+from sealscope.campaigns.cases.row import CaseRow, expected_cause, ranking_score
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.store import read_rows
 from sealscope.campaigns.judging.judge import judge
-from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, plan_detector
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, parse_detector_name
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.campaigns.results import judge_simulated_campaign, write_result
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
-from sealscope.errors import InputError
 from sealscope.recordings import read
 from sealscope.reporting.campaign.page import campaign_text, render_campaign_page
 from sealscope.simulation.faults import FAULTS
+
+from ..refusals import refusal
 
 PLAN = """
 [campaign]
@@ -81,14 +82,14 @@ class Watcher:
         return make_observable(name, math.exp(-1.0 - abs(math.log(moved))), size=self.rig.pump.q_b)
 
 
-def decide_for_watcher(report, reports, null, context):
+def decide_for_watcher(report, reports, null, probability, weigh_rivals):
     """Decide as always, but state figures for the watcher that campaigns have to keep."""
     if report.provider != "watcher":
-        return decide(report, reports, null, context)
+        return decide(report, reports, null, probability, weigh_rivals)
     (change,) = report.observables
     is_whole = change.name == "all channels"
     return Evidence(
-        "leak" if is_whole else "no leak", f"at {context.false_alarm_probability}", change.score, 2.0, 13.0,
+        "leak" if is_whole else "no leak", f"at {probability}", change.score, 2.0, 13.0,
         (11.0, 15.0), change.size, (0.0, 1.0), cause=None if is_whole else "friction change", detector="watcher",
     )  # fmt: skip
 
@@ -100,7 +101,7 @@ def plan(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "entry_points", lambda group: ())
     monkeypatch.setattr("sealscope.diagnosis.diagnose.decide", decide_for_watcher)
     registry.plug_ins.cache_clear()
-    plan_detector.cache_clear()
+    parse_detector_name.cache_clear()
     examined.clear()
     path = tmp_path / "watched.toml"
     path.write_text(PLAN, encoding="utf-8")
@@ -158,7 +159,7 @@ def test_the_fused_verdict_is_that_of_diagnose(plan, done):
             said = row.statements[key]
             assert (said.verdict, said.cause, said.onset_s) == (outcome.verdict, outcome.cause, outcome.onset_s)
             assert said.score == pytest.approx(outcome.score)
-            if rank_of(said) is not None:
+            if ranking_score(said) is not None:
                 beyond = (
                     outcome.score / outcome.threshold if outcome.threshold > 0 else outcome.score - outcome.threshold
                 )
@@ -171,7 +172,7 @@ def recall(confusion, fault):
 
 
 def test_what_it_adds_up_to(plan, done):
-    result = simulated_result(plan, done)
+    result = judge_simulated_campaign(plan, done)
     table = {(one.detector, one.leak_lpm): one for one in result.judgement.table}
     assert table["watcher", 0.02].alarms.value == table["watcher", 0.02].false_alarm.value == 1.0
     assert table["watcher @ pressures", 0.02].alarms.count == 0
@@ -208,22 +209,22 @@ def test_what_it_adds_up_to(plan, done):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "words"),
     [
-        (('assume_set = { "pump.q_b" = 1e-7 }', ""), "rig that its detectors assume"),
-        (("", ('pressures = ["u", "p_A", "p_B"]', 'pressures = ["p_A", "p_B"]')), "channels that its detectors see"),
-        (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm probability"),
+        (('assume_set = { "pump.q_b" = 1e-7 }', ""), "rig"),
+        (("", ('pressures = ["u", "p_A", "p_B"]', 'pressures = ["p_A", "p_B"]')), "channels"),
+        (("", ("false_alarm = 0.2", "false_alarm = 0.19")), "false-alarm"),
     ],
 )
-def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, message):
+def test_rows_of_other_assumptions_are_not_mixed_in(plan, done, tmp_path, change, words):
     text = PLAN.replace("seed = 3", f"seed = 3\n{change[0]}")
     if change[1]:
         assert change[1][0] in text
         text = text.replace(*change[1])
     (tmp_path / "watched.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=message):
-        simulated_result(load_plan(tmp_path / "watched.toml"), done)
-    with pytest.raises(InputError, match=message):
+    with refusal(*words.split(", ")):
+        judge_simulated_campaign(load_plan(tmp_path / "watched.toml"), done)
+    with refusal(*words.split(", ")):
         campaign.run(load_plan(tmp_path / "watched.toml"), done, jobs=1)
 
 
@@ -231,7 +232,7 @@ def test_rows_of_an_older_form_are_refused(plan, done):
     head = json.loads((done / "campaign.json").read_text())
     del head["format"]
     (done / "campaign.json").write_text(json.dumps(head))
-    with pytest.raises(InputError, match="form of rows"):
+    with refusal("rows"):
         campaign.run(plan, done, jobs=1)
 
 
@@ -246,46 +247,44 @@ def test_detectors_may_assume_another_rig(plan, done, tmp_path):
     rows, before = read_rows(tmp_path / "other"), read_rows(done)
     assert set(rows) < set(before)  # the records are the same
     assert {row.statements["watcher"].leak_lpm for row in rows.values()} == {1e-7}
-    assert "differs from the rig" in render_campaign_page(simulated_result(other, tmp_path / "other"))
+    assert "differs from the rig" in render_campaign_page(judge_simulated_campaign(other, tmp_path / "other"))
 
 
 def test_what_names_stand_for(plan):
-    observed = plan_detector("watcher @ pressures")
+    observed = parse_detector_name("watcher @ pressures")
     assert (observed.base, observed.view, observed.scorer) == ("watcher", "pressures", None)
-    assert plan_detector("rms change").scorer is None
-    assert plan_detector("d3 of p_A fell @ pressures").needs_threshold
-    assert not plan_detector("sign rule: d3 of p_A fell").needs_threshold
-    for name, message in (
-        ("watchr", "did you mean 'watcher'"),
-        ("watcher, calibrated", "must be one of"),
-        ("watcher, quick", "must be one of"),
-        ("watcher @ nowhere", "must be one of"),
+    assert parse_detector_name("rms change").scorer is None
+    assert parse_detector_name("d3 of p_A fell @ pressures").needs_threshold
+    assert not parse_detector_name("sign rule: d3 of p_A fell").needs_threshold
+    for wrong, named in (
+        ("watchr", "'watcher'"),
+        ("watcher, calibrated", "'watcher, calibrated'"),
+        ("watcher, quick", "'watcher, quick'"),
+        ("watcher @ nowhere", "nowhere"),
     ):
-        with pytest.raises(InputError, match=message):
-            check_detector(name, plan.views)
+        with refusal(named):
+            check_detector(wrong, plan.views)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("before", "after", "words"),
     [
-        ('pressures = ["u"', 'pressures = ["q_leak"', "must not hold q_leak"),
-        ('pressures = ["u"', 'pressures = ["v"', "must be a list of channels"),
-        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "views.pressures must have at least 1"),
-        ("[views]", '[views]\n"a @ b" = ["u"]', "plain name"),
+        ('pressures = ["u"', 'pressures = ["q_leak"', "views.pressures, q_leak"),
+        ('pressures = ["u"', 'pressures = ["v"', "views.pressures"),
+        ('pressures = ["u", "p_A", "p_B"]', "pressures = []", "views.pressures, 1"),
+        ("[views]", '[views]\n"a @ b" = ["u"]', "a @ b"),
         ("seed = 3", 'seed = 3\nassume = "nowhere"', "campaign.assume"),
-        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume_set must be"),
+        ("seed = 3", "seed = 3\nassume_set = 3", "campaign.assume_set"),
         ("seed = 3", 'seed = 3\nassume_set = { "V_9" = 1.0 }', "campaign.assume"),
-        ("false_alarm = 0.2", "false_alarm = 0.3", "campaign.false_alarm: .* got 0.3"),
-        ('"watcher",', '"watcher", 3,', "campaign.detectors.2. must be"),
+        ("false_alarm = 0.2", "false_alarm = 0.3", "0.3, campaign.false_alarm"),
+        ('"watcher",', '"watcher", 3,', "campaign.detectors[2]"),
     ],
 )
-def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, message):
+def test_what_breaks_a_rule_is_one_line(plan, tmp_path, before, after, words):
     assert before in PLAN
     (tmp_path / "watched.toml").write_text(PLAN.replace(before, after, 1), encoding="utf-8")
-    with pytest.raises(InputError, match=message) as error:
+    with refusal(*words.split(", "), "watched.toml"):
         load_plan(tmp_path / "watched.toml")
-    assert "watched.toml" in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow
@@ -298,7 +297,7 @@ def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
 
 def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
     said = Evidence(verdict, "", 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
-    scores = {"watcher": (rank_of(said), said.onset_s)}
+    scores = {"watcher": (ranking_score(said), said.onset_s)}
     inputs = {"id": f"{number:04x}", "use": use, "leak_lpm": leak, "fault": fault, "levels": {}, "replicate": number}
     return CaseRow(**inputs, flow_lpm=leak, scores=scores, statements={"watcher": said})
 
@@ -353,16 +352,16 @@ def test_a_fault_has_the_cause_that_a_detector_should_name():
         ("filter A x10", "filter A x10"),
         ("what nobody simulates", "what nobody simulates"),
     ):
-        assert cause_of(words) == cause
+        assert expected_cause(words) == cause
     assert {row.cause for row in FAULTS.values()} - {""} <= set(get_args(Cause))
 
 
 def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch):
     example = Path(__file__).resolve().parents[2] / "docs" / "examples" / "ringing-energy"
     made = runpy.run_path(str(example / "ringing_energy.py"))["RingingEnergy"]
-    with pytest.raises(InputError, match="ringing energy"):
+    with refusal("ringing energy"):
         load_plan(example / "judge.toml")
     monkeypatch.setattr(registry, "DETECTORS", {**registry.DETECTORS, "ringing energy": made})
     plan = load_plan(example / "judge.toml")
-    assert not any(plan_detector(name).needs_threshold for name in plan.detectors)
+    assert not any(parse_detector_name(name).needs_threshold for name in plan.detectors)
     assert plan.views == {"pressures": ("u", "p_A", "p_B")}

@@ -9,8 +9,9 @@ import pytest
 
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.judging.judge import judge
-from sealscope.errors import InputError
 from sealscope.evaluation.binomial import clopper_pearson
+
+from ..refusals import refusal
 
 CHANGED, SIGN = "d3 of p_A changed", "sign rule: d3 of p_A fell"
 
@@ -85,7 +86,7 @@ def test_a_duty_without_leak_free_records_cannot_be_told():
     result = judged(rows)
     last = next(one for one in result.table if (one.detector, one.leak_lpm) == (CHANGED, 3.0))
     assert (last.alarms.count, last.cannot_tell.count, last.alarms.n) == (1, 1, 2)
-    with pytest.raises(InputError, match="must be at least 999 of a duty, got at most 199"):
+    with refusal("999", "199"):
         judged(rows, false_alarm=0.001)
 
 
@@ -119,5 +120,5 @@ def test_the_order_of_rows_does_not_matter():
 
 def test_a_campaign_without_records_to_judge_is_refused():
     rows = [one for one in rows_of(8) if one.use == "calibrate"]
-    with pytest.raises(InputError, match="at least one record to judge"):
+    with refusal("record"):
         judged(rows)

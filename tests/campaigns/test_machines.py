@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of, profile_key
-from sealscope.campaigns.cases.machines import SIZING_SECONDS, experiment_of
-from sealscope.campaigns.cases.work import work
-from sealscope.campaigns.plans.duty import closing_values, fault_of
+from sealscope.campaigns.cases.case import list_cases, profile_key
+from sealscope.campaigns.cases.machines import SIZING_SECONDS, case_experiment
+from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.plans.duty import parse_plan_fault, throttle_values
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.errors import InputError
 from sealscope.simulation.bench import profile
 from sealscope.simulation.simulate import simulate_experiment
+
+from ..refusals import refusal
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def bench(text, tmp_path):
 
 
 def test_every_case_has_a_machine_of_its_own(bench):
-    experiments = [experiment_of(bench, case) for case in cases_of(bench)[:12]]
+    experiments = [case_experiment(bench, case) for case in list_cases(bench)[:12]]
     assert len({one.rig["fluid.K_oil"] for one in experiments}) == 12
     assert len({one.seed for one in experiments}) == 12
     assert all(one.drifts for one in experiments)
@@ -34,8 +35,8 @@ def test_every_case_has_a_machine_of_its_own(bench):
 
 
 def test_the_cells_are_what_the_plan_says_and_not_what_was_drawn(bench):
-    for case in cases_of(bench)[:8]:
-        experiment = experiment_of(bench, case)
+    for case in list_cases(bench)[:8]:
+        experiment = case_experiment(bench, case)
         assert str(experiment.command) == case.levels["command"]
         closed = 0.5 if case.levels["closed"] == "50 %" else 0.0
         assert experiment.rig["line.closed_A"] == experiment.rig["line.closed_B"] == closed
@@ -43,10 +44,10 @@ def test_the_cells_are_what_the_plan_says_and_not_what_was_drawn(bench):
 
 
 def test_the_same_case_gives_the_same_bytes(bench):
-    case = cases_of(bench)[0]
-    one, other = (simulate_experiment(experiment_of(bench, case)).recording for _ in range(2))
+    case = list_cases(bench)[0]
+    one, other = (simulate_experiment(case_experiment(bench, case)).recording for _ in range(2))
     assert all(np.array_equal(one[name], other[name]) for name in one.channels)
-    rows = [work(bench, case).as_dict() | {"seconds": 0.0} for _ in range(2)]
+    rows = [run_case(bench, case).as_dict() | {"seconds": 0.0} for _ in range(2)]
     assert rows[0] == rows[1]
     assert rows[0]["error"] is None
 
@@ -54,20 +55,20 @@ def test_the_same_case_gives_the_same_bytes(bench):
 def test_a_leak_has_its_mean_on_its_own_machine(bench):
     """Sized over a short run; the row tells what the record had."""
     assert bench.duration_s < SIZING_SECONDS
-    for case in [case for case in cases_of(bench) if case.leak_lpm][:6]:
-        row = work(bench, case)
+    for case in [case for case in list_cases(bench) if case.leak_lpm][:6]:
+        row = run_case(bench, case)
         assert row.error is None
         assert row.flow_lpm == pytest.approx(case.leak_lpm, rel=0.15)
-        assert experiment_of(bench, case).onset() == bench.onset_s
+        assert case_experiment(bench, case).onset() == bench.onset_s
 
 
 def test_a_fault_sets_in_at_the_onset_unless_it_says_when(bench):
-    case = next(case for case in cases_of(bench) if case.fault)
-    (fault,) = experiment_of(bench, case).faults
+    case = next(case for case in list_cases(bench) if case.fault)
+    (fault,) = case_experiment(bench, case).faults
     assert fault.opening.onset() == bench.onset_s
-    assert fault_of("pump leak x3 from 1 s", 3.0).opening.onset() == 1.0
-    with pytest.raises(InputError, match="fault must be like"):
-        fault_of("a bad day", 3.0)
+    assert parse_plan_fault("pump leak x3 from 1 s", 3.0).opening.onset() == 1.0
+    with refusal("fault"):
+        parse_plan_fault("a bad day", 3.0)
 
 
 def test_a_profile_is_known_by_what_it_says(tmp_path):
@@ -83,11 +84,11 @@ def test_a_profile_beside_the_plan_is_found(text, tmp_path):
     (tmp_path / "own.toml").write_text((profile._PACKAGED / "bench.toml").read_text(encoding="utf-8"), encoding="utf-8")
     path = tmp_path / "plan.toml"
     path.write_text(text.replace("seed = 3", 'seed = 3\nprofile = "own.toml"'), encoding="utf-8")
-    assert experiment_of(load_plan(path), cases_of(load_plan(path))[0]).drifts
+    assert case_experiment(load_plan(path), list_cases(load_plan(path))[0]).drifts
 
 
 def test_closing_is_a_share():
-    assert closing_values("25 %")["line.closed_A"] == closing_values(0.25)["line.closed_A"] == 0.25
+    assert throttle_values("25 %")["line.closed_A"] == throttle_values(0.25)["line.closed_A"] == 0.25
     for wrong in ("100 %", -0.1, 1.0):
-        with pytest.raises(InputError, match="closed must be 0 to under 100 %"):
-            closing_values(wrong)
+        with refusal("closed"):
+            throttle_values(wrong)

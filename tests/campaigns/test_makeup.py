@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of
-from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.case import list_cases
+from sealscope.campaigns.cases.machines import case_experiment
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.simulation.simulate import simulate_experiment
@@ -17,9 +17,9 @@ from sealscope.simulation.simulate import simulate_experiment
 def test_a_circuit_that_fills_at_the_start_hides_no_small_leak() -> None:
     """The first block, into which a valve lets oil by one side, stood out beyond a step of 0.0002 L/min."""
     plan = load_plan("bench-detectors")
-    leaking = (case for case in cases_of(plan) if case.leak_lpm == 0.0002)
+    leaking = (case for case in list_cases(plan) if case.leak_lpm == 0.0002)
     (case,) = itertools.islice(leaking, 1, 2)
-    recording = simulate_experiment(experiment_of(plan, case)).recording
+    recording = simulate_experiment(case_experiment(plan, case)).recording
     evidence = Examination(recording, false_alarm_probability=0.01, rig="thesis").evidence("volume balance")
     assert evidence.verdict == "leak"
     assert evidence.onset_interval_s is not None

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import subprocess
 import sys
 
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of, interleave_cases
+from sealscope.campaigns.cases.case import interleave_cases, list_cases
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
-from sealscope.errors import InputError
+
+from ..refusals import refusal
 
 #: Digests of the ids and noise seeds of every packaged plan's cases. A change draws new machines: the published figures
 #: of the plan no longer belong to its records.
@@ -55,7 +55,7 @@ def test_a_plan_is_read_with_its_units(tiny):
 
 def test_kinds_of_records_take_turns(tiny):
     """However early a campaign ends, each kind has its share, within one record."""
-    cases = cases_of(load_plan(tiny))
+    cases = list_cases(load_plan(tiny))
     order = interleave_cases(cases)
     assert sorted(order, key=cases.index) == cases
     kinds = [(case.use, case.leak_lpm) for case in order]
@@ -65,44 +65,42 @@ def test_kinds_of_records_take_turns(tiny):
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("before", "after", "words"),
     [
-        ('name = "tiny"', 'name = "../tiny"', "name must be of at most 80 letters"),
+        ('name = "tiny"', 'name = "../tiny"', "name, 80"),
         ('duration = "6 s"', 'duration = "6 V"', "duration"),
-        ('onset = "3 s"', 'onset = "7 s"', "onset must be within the duration, 0 s to 6 s, got 7"),
-        ("false_alarm = 0.2", "false_alarm = 1.5", "campaign.false_alarm must be less than 1"),
+        ('onset = "3 s"', 'onset = "7 s"', "onset, duration, 7"),
+        ("false_alarm = 0.2", "false_alarm = 1.5", "campaign.false_alarm"),
         (
             "false_alarm = 0.2",
             "false_alarm = 0.01",
-            "records to calibrate must be at least 198 (99 for each of 2 commands)",
+            "198, 99, 2",
         ),
-        ("detectors = [", 'detectors = "all" # [', "campaign.detectors must be"),
-        ('"d3 of p_A fell", ', '"d3 of p_A fel", ', "did you mean 'd3 of p_A fell'"),
+        ("detectors = [", 'detectors = "all" # [', "campaign.detectors"),
+        ('"d3 of p_A fell", ', '"d3 of p_A fel", ', "'d3 of p_A fell'"),
         ('command = ["3 sin(4t)"', 'command = ["3 sinus(4t)"', "factors.command"),
-        ('closed = ["0 %"', 'closed = ["100 %"', "closed must be 0 to under 100 %"),
+        ('closed = ["0 %"', 'closed = ["100 %"', "closed, 0, 100"),
         ('closed = ["0 %", "50 %"]', 'opened = ["0 %"]', "factors.opened"),
-        ('use = "calibrate"', 'use = "guess"', "records[1].use must be 'calibrate' or 'judge'"),
-        ("count = 6", "count = 0", "records[2].count must be greater than or equal to 1"),
+        ('use = "calibrate"', 'use = "guess"', "records[1].use, 'calibrate', 'judge'"),
+        ("count = 6", "count = 0", "records[2].count, 1"),
         ('leak = "0.015 L/min"', 'leak = "0.015 L"', "leak"),
-        ('leak = "30 cm^3/min"', 'leak = "0.015 L/min"', "records must differ"),
-        ('use = "calibrate"', 'use = "calibrate"\nleak = "1 L/min"', "must be leak-free"),
-        ("seed = 3", "seed = 3\ncolour = 2", "campaign.colour is not known"),
-        ("[factors]", "[factor]", "[factor] is not known"),
-        ("seed = 3", "seed = 3\nrate = true", "campaign.rate must be"),
-        ("seed = 3", "seed = 3\nfactors = {}", "campaign.factors is not known"),
-        ("seed = 3", "seed = 3\nplace = 'here'", "campaign.place is not known"),
-        ("seed = 3", "seed = ", "must be TOML"),
+        ('leak = "30 cm^3/min"', 'leak = "0.015 L/min"', "records"),
+        ('use = "calibrate"', 'use = "calibrate"\nleak = "1 L/min"', "leak-free"),
+        ("seed = 3", "seed = 3\ncolour = 2", "campaign.colour"),
+        ("[factors]", "[factor]", "[factor]"),
+        ("seed = 3", "seed = 3\nrate = true", "campaign.rate"),
+        ("seed = 3", "seed = 3\nfactors = {}", "campaign.factors"),
+        ("seed = 3", "seed = 3\nplace = 'here'", "campaign.place"),
+        ("seed = 3", "seed = ", "TOML"),
         ("seed = 3", 'seed = 3\nrig = "nowhere"', "campaign.rig"),
         ("seed = 3", 'seed = 3\nset = { "V_9" = 1.0 }', "campaign.set"),
-        ("seed = 3", 'seed = 3\nkeep_recordings = "yes"', "campaign.keep_recordings must be a valid boolean"),
+        ("seed = 3", 'seed = 3\nkeep_recordings = "yes"', "campaign.keep_recordings"),
     ],
 )
-def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, message):
+def test_what_breaks_a_rule_is_one_line_with_the_place(tmp_path, text, before, after, words):
     assert before in text
-    with pytest.raises(InputError, match=re.escape(message)) as error:
+    with refusal(*words.split(", "), "plan.toml"):
         plan_of(tmp_path, text.replace(before, after, 1))
-    assert "plan.toml" in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_the_packaged_plans_are_sound():
@@ -121,12 +119,12 @@ def test_the_packaged_plans_are_sound():
 @pytest.mark.parametrize("name", DRAWN)
 @pytest.mark.slow
 def test_the_packaged_plans_draw_the_machines_of_their_published_figures(name):
-    text = "".join(f"{case.id}{case.noise_seed}" for case in cases_of(load_plan(name)))
+    text = "".join(f"{case.id}{case.noise_seed}" for case in list_cases(load_plan(name)))
     assert hashlib.sha256(text.encode()).hexdigest()[:16] == DRAWN[name]
 
 
 def test_records_go_round_the_cells(tiny):
-    cases = cases_of(load_plan(tiny))
+    cases = list_cases(load_plan(tiny))
     assert len({case.id for case in cases}) == len(cases) == 26
     assert len({case.machine_seed for case in cases} | {case.noise_seed for case in cases}) == 52
     per_cell = {}
@@ -138,8 +136,8 @@ def test_records_go_round_the_cells(tiny):
 
 
 def test_more_records_leave_the_others_what_they_were(tmp_path, text):
-    few = {case.id for case in cases_of(plan_of(tmp_path, text))}
-    more = {case.id for case in cases_of(plan_of(tmp_path, text.replace("count = 6", "count = 16")))}
+    few = {case.id for case in list_cases(plan_of(tmp_path, text))}
+    more = {case.id for case in list_cases(plan_of(tmp_path, text.replace("count = 6", "count = 16")))}
     assert few < more
     assert len(more - few) == 10
 
@@ -153,24 +151,24 @@ def test_more_records_leave_the_others_what_they_were(tmp_path, text):
     ],
 )
 def test_another_world_gives_other_cases(tmp_path, text, change):
-    few = {case.id for case in cases_of(plan_of(tmp_path, text))}
-    other = {case.id for case in cases_of(plan_of(tmp_path, text.replace(*change)))}
+    few = {case.id for case in list_cases(plan_of(tmp_path, text))}
+    other = {case.id for case in list_cases(plan_of(tmp_path, text.replace(*change)))}
     assert not few & other
 
 
 def test_detectors_do_not_change_the_records(tmp_path, text):
-    plain = cases_of(plan_of(tmp_path, text))
-    other = cases_of(plan_of(tmp_path, text.replace('"d3 of p_A changed", ', "")))
+    plain = list_cases(plan_of(tmp_path, text))
+    other = list_cases(plan_of(tmp_path, text.replace('"d3 of p_A changed", ', "")))
     assert [case.id for case in plain] == [case.id for case in other]
 
 
 def test_names_and_seeds_are_the_same_in_another_process(tiny):
     code = (
         "import sys\nfrom sealscope.campaigns.plans.reader import load_plan\n"
-        "from sealscope.campaigns.cases.case import cases_of\n"
-        "print([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(load_plan(sys.argv[1]))])"
+        "from sealscope.campaigns.cases.case import list_cases\n"
+        "print([(c.id, c.machine_seed, c.noise_seed) for c in list_cases(load_plan(sys.argv[1]))])"
     )
     result = subprocess.run([sys.executable, "-c", code, str(tiny)], capture_output=True, text=True, check=True)
     plan = load_plan(tiny)
     assert isinstance(plan, SimulatedPlan)
-    assert result.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in cases_of(plan)])
+    assert result.stdout.strip() == str([(c.id, c.machine_seed, c.noise_seed) for c in list_cases(plan)])

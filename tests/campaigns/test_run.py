@@ -8,28 +8,30 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns.cases.case import cases_of
+from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.cases.work import work
+from sealscope.campaigns.cases.work import run_case
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.campaigns.results import simulated_result, write_result
-from sealscope.errors import InputError, MissingExtra, SimulationFailed, UnreadableFile
-from sealscope.storage.rows import ROWS, locked
+from sealscope.campaigns.results import judge_simulated_campaign, write_result
+from sealscope.errors import MissingExtra, SimulationFailed, UnreadableFile
+from sealscope.storage.rows import ROWS, lock_rows
+
+from ..refusals import refusal
+from ..waiting import until
 
 SOURCES = Path(campaign.__file__).resolve().parents[3]
 
 
 def files_of(plan, folder):
     """Name -> bytes of every result file."""
-    return {path.name: path.read_bytes() for path in write_result(simulated_result(plan, folder), folder)}
+    return {path.name: path.read_bytes() for path in write_result(judge_simulated_campaign(plan, folder), folder)}
 
 
 @pytest.fixture
@@ -55,13 +57,12 @@ def start(plan, folder):
 def wait_for_rows(folder, count, process):
     """Until so many rows are there."""
     path = folder / ROWS
-    until = time.monotonic() + 120
-    while time.monotonic() < until:
-        if path.is_file() and path.read_bytes().count(b"\n") >= count:
-            return
+
+    def has_rows():
         assert process.poll() is None, "it ended before it could be killed"
-        time.sleep(0.005)
-    pytest.fail("no rows within two minutes")
+        return path.is_file() and path.read_bytes().count(b"\n") >= count
+
+    until(has_rows)
 
 
 @pytest.mark.slow
@@ -76,7 +77,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
         process.wait()
         with (folder / ROWS).open("ab") as file:  # the line that was being written when it died
             file.write(b'{"id": "0123", "sco')
-    before = store.progress_of(plan, folder)
+    before = store.read_progress(plan, folder)
     assert 12 <= before.done < 26
     reported = []
     assert campaign.run(plan, folder, jobs=2, progress=lambda *words: reported.append(words)).complete
@@ -86,6 +87,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
     assert len(ids) == len(set(ids)) == 26
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
 def test_no_process_outlives_a_killed_campaign(tiny, tmp_path):
     process = start(tiny, tmp_path / "killed")
@@ -114,10 +116,7 @@ def test_no_process_outlives_a_killed_campaign(tiny, tmp_path):
         except OSError:
             return False
 
-    until = time.monotonic() + 20
-    while any(alive(pid) for pid in workers) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not [pid for pid in workers if alive(pid)]
+    until(lambda: not any(alive(pid) for pid in workers))
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="interrupts as POSIX does")
@@ -126,7 +125,7 @@ def test_an_interrupt_ends_it_and_keeps_the_rows(tiny, tmp_path):
     wait_for_rows(tmp_path / "stopped", 3, process)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=60) == 130
-    assert store.progress_of(load_plan(tiny), tmp_path / "stopped").done >= 3
+    assert store.read_progress(load_plan(tiny), tmp_path / "stopped").done >= 3
 
 
 @pytest.mark.slow
@@ -142,13 +141,13 @@ def test_on_a_cluster_the_same_bytes(once, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_one_line(tiny, tmp_path):
     pytest.importorskip("distributed")
-    with pytest.raises(InputError, match="--cluster must be the address of a Dask scheduler, got nowhere"):
+    with refusal("--cluster", "nowhere"):
         campaign.run(load_plan(tiny), tmp_path / "none", cluster="nowhere")
 
 
 def test_without_dask_it_says_what_to_install(tiny, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[cluster\]'"):
+    with refusal("sealscope[cluster]", error=MissingExtra):
         campaign.run(load_plan(tiny), tmp_path / "none", cluster="tcp://127.0.0.1:1")
 
 
@@ -160,18 +159,18 @@ def break_some(plan, case, folder=None):
     """A task that fails on a third of the records to judge."""
     if doomed(case):
         return CaseRow.from_case(case, error=str(SimulationFailed("the run diverged")))
-    return work(plan, case, folder)
+    return run_case(plan, case, folder)
 
 
 def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     plan = load_plan(tiny)
-    bad = sum(doomed(case) for case in cases_of(plan))
+    bad = sum(doomed(case) for case in list_cases(plan))
     assert 0 < bad < 16
     state = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
     assert (state.done, state.failed) == (26, bad)
     again = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert again.failed == bad
-    result = simulated_result(plan, tmp_path / "bad")
+    result = judge_simulated_campaign(plan, tmp_path / "bad")
     assert {row.error for row in result.judgement.failed} == {"the run diverged"}
     outcome = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
     assert [row.alarms.n for row in outcome] == [5, 5]  # a failed record stays in the count, as one that cannot be told
@@ -187,31 +186,32 @@ def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatc
     plan, _ = once
     state = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
     assert (state.done, state.failed) == (26, 1)
-    rows = store.rows_of(plan, tmp_path / "dead")
+    rows = store.read_plan_rows(plan, tmp_path / "dead")
     assert [row.error for row in rows.values() if row.error] == ["the process that carried it out died"]
 
 
 def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):
     plan = load_plan(tiny)
-    case = cases_of(plan)[0]
+    case = list_cases(plan)[0]
 
     def broken(*_):
         raise ZeroDivisionError("by nought")
 
-    monkeypatch.setattr("sealscope.campaigns.cases.work.experiment_of", broken)
-    assert work(plan, case).error == "ZeroDivisionError: by nought"
+    monkeypatch.setattr("sealscope.campaigns.cases.work.case_experiment", broken)
+    assert run_case(plan, case).error == "ZeroDivisionError: by nought"
 
 
+@pytest.mark.slow
 def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
     """Whatever a worker has loaded after carrying out a case, run by run and in a batch, is in the key."""
     code = (
         "import sys; from sealscope.campaigns.plans.reader import load_plan\n"
-        "from sealscope.campaigns.cases.case import cases_of, sources\n"
-        "from sealscope.campaigns.cases.work import work\n"
-        "from sealscope.campaigns.execution.batches import in_batches\n"
-        "plan = load_plan(sys.argv[1]); cases = cases_of(plan)[-1:]\n"
-        "assert work(plan, cases[0]).error is None and next(in_batches(plan, cases, 1)).error is None\n"
-        "covered = {str(path) for path in sources()}\n"
+        "from sealscope.campaigns.cases.case import list_cases, iter_sources\n"
+        "from sealscope.campaigns.cases.work import run_case\n"
+        "from sealscope.campaigns.execution.batches import iter_batch_rows\n"
+        "plan = load_plan(sys.argv[1]); cases = list_cases(plan)[-1:]\n"
+        "assert run_case(plan, cases[0]).error is None and next(iter_batch_rows(plan, cases, 1)).error is None\n"
+        "covered = {str(path) for path in iter_sources()}\n"
         "loaded = {m.__file__ for n, m in sys.modules.items() if n.startswith('sealscope.') and m.__file__}\n"
         "print(sorted(loaded - covered)); print(len(loaded) > 60)"
     )
@@ -225,7 +225,7 @@ def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
 def test_rows_of_another_campaign_are_not_mixed_in(finished_tiny, text, tmp_path):
     other = tmp_path / "other.toml"
     other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
-    with pytest.raises(InputError, match="continues only with the same rig, bench, length, onset or seed"):
+    with refusal("rig", "bench", "onset", "seed"):
         campaign.run(load_plan(other), finished_tiny, jobs=1)
 
 
@@ -237,15 +237,15 @@ def test_more_records_and_detectors_are_added_to_what_is_there(finished_tiny, te
     campaign.run(load_plan(more), folder, jobs=1, progress=lambda *words: reported.append(words))
     assert reported[0] == (26, 28, 0)
     more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
-    assert store.progress_of(load_plan(more), folder).done == 0
+    assert store.read_progress(load_plan(more), folder).done == 0
     campaign.run(load_plan(more), folder, jobs=1)
-    assert store.progress_of(load_plan(more), folder).complete
+    assert store.read_progress(load_plan(more), folder).complete
 
 
 def test_two_at_once_are_refused(tiny, tmp_path):
     plan = load_plan(tiny)
-    store.begin(tmp_path / "mine", store.made_from(plan))
-    with locked(tmp_path / "mine", "a campaign"), pytest.raises(InputError, match="by one process at a time"):
+    store.begin_campaign(tmp_path / "mine", store.collect_row_inputs(plan))
+    with lock_rows(tmp_path / "mine", "a campaign"), refusal("one process"):
         campaign.run(plan, tmp_path / "mine", jobs=1)
 
 
@@ -253,24 +253,24 @@ def test_a_run_that_is_refused_changes_nothing_of_the_one_at_work(tiny, text, tm
     other = tmp_path / "other.toml"
     other.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
     folder = tmp_path / "mine"
-    store.begin(folder, store.made_from(load_plan(tiny)))  # it has no row yet
-    with locked(folder, "a campaign"), pytest.raises(InputError, match="by one process at a time"):
+    store.begin_campaign(folder, store.collect_row_inputs(load_plan(tiny)))  # it has no row yet
+    with lock_rows(folder, "a campaign"), refusal("one process"):
         campaign.run(load_plan(other), folder, jobs=1)
-    assert store.head(folder) == store.made_from(load_plan(tiny))
+    assert store.read_head(folder) == store.collect_row_inputs(load_plan(tiny))
 
 
 def test_rows_whose_origin_is_lost_are_not_continued(tiny, finished_tiny):
     (finished_tiny / store.HEAD).unlink()
-    with pytest.raises(InputError, match="continues only with the same"):
+    with refusal("same"):
         campaign.run(load_plan(tiny), finished_tiny, jobs=1)
 
 
 def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
     plan = load_plan(tiny)
-    store.begin(tmp_path, store.made_from(plan))
+    store.begin_campaign(tmp_path, store.collect_row_inputs(plan))
     (tmp_path / ROWS).write_bytes(b'{"id": 3}\n')
-    with pytest.raises(UnreadableFile, match=r"rows.jsonl, line 1"):
-        store.progress_of(plan, tmp_path)
+    with refusal("rows.jsonl, line 1", error=UnreadableFile):
+        store.read_progress(plan, tmp_path)
 
 
 def test_recordings_are_kept_only_where_asked(tiny, text, tmp_path):
@@ -280,7 +280,7 @@ def test_recordings_are_kept_only_where_asked(tiny, text, tmp_path):
     plan = load_plan(path)
     assert campaign.run(plan, tmp_path / "kept", jobs=1).failed == 0
     names = {path.stem for path in (tmp_path / "kept" / "recordings").glob("*.nc")}
-    assert names == {case.id for case in cases_of(plan)}
+    assert names == {case.id for case in list_cases(plan)}
     path.write_text(few, encoding="utf-8")
     campaign.run(load_plan(path), tmp_path / "bare", jobs=1)
     assert not (tmp_path / "bare" / "recordings").exists()

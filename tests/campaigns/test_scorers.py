@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.campaigns.plans.scorers import SCORERS, Sides
+from sealscope.campaigns.plans.scorers import SCORERS, SplitRms
 from sealscope.recordings.recording import Recording
 
 
@@ -20,7 +20,7 @@ def noise_record(seed, n):
 
 
 def middle(recording):
-    return Sides.from_recording(recording, float(recording.t[0]) + recording.duration / 2)
+    return SplitRms.from_recording(recording, float(recording.t[0]) + recording.duration / 2)
 
 
 def score(name, recording):

@@ -4,7 +4,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.campaigns.cases.scoring import run_watch
-from sealscope.campaigns.plans.detectors import check_detector, plan_detector
+from sealscope.campaigns.plans.detectors import check_detector, parse_detector_name
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +34,6 @@ def test_a_machine_without_its_channels_cannot_be_watched(recording):
 
 
 def test_a_plan_names_it_with_a_view():
-    parsed = plan_detector("watch @ some")
+    parsed = parse_detector_name("watch @ some")
     assert (parsed.base, parsed.scorer, parsed.view) == ("watch", None, "some")
     check_detector("watch", {})

@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns.execution.workers import carried_out
+from sealscope.campaigns.execution.workers import iter_results
+
+from ..waiting import until
 
 
 @pytest.fixture
@@ -23,14 +25,14 @@ def die_on(monkeypatch):
 
 
 def test_a_process_that_dies_loses_its_own_item_alone(die_on):
-    results = dict(carried_out(partial(die_on, 3), range(8), 2))
+    results = dict(iter_results(partial(die_on, 3), range(8), 2))
     assert results == {item: None if item == 3 else item for item in range(8)}
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
 def test_a_process_that_dies_idle_loses_nothing():
     others = {child.pid for child in multiprocessing.active_children()}
-    ended = carried_out(math.sqrt, (float(number) for number in range(6)), 2)
+    ended = iter_results(math.sqrt, (float(number) for number in range(6)), 2)
     results = dict([next(ended)])
     for child in multiprocessing.active_children():
         if child.pid not in others:
@@ -42,7 +44,7 @@ def test_a_process_that_dies_idle_loses_nothing():
 
 def test_what_a_task_raises_is_raised():
     with pytest.raises(ValueError, match="math domain error"):
-        list(carried_out(math.sqrt, [4.0, -1.0], 2))
+        list(iter_results(math.sqrt, [4.0, -1.0], 2))
 
 
 @pytest.fixture
@@ -60,13 +62,13 @@ def cluster(request):
 @pytest.mark.parametrize("cluster", [False], indirect=True, ids=["threads"])
 def test_what_a_task_raises_on_a_cluster_is_raised(cluster):
     with pytest.raises(ValueError, match="math domain error"):
-        list(carried_out(math.sqrt, [4.0, -1.0], 1, cluster))
+        list(iter_results(math.sqrt, [4.0, -1.0], 1, cluster))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [True], indirect=True, ids=["processes"])
 def test_a_worker_that_dies_loses_its_own_item_alone(die_on, cluster):
-    results = dict(carried_out(partial(die_on, 3), range(8), 1, cluster))
+    results = dict(iter_results(partial(die_on, 3), range(8), 1, cluster))
     assert results == {item: None if item == 3 else item for item in range(8)}
 
 
@@ -76,12 +78,9 @@ def test_closing_ends_processes_at_work():
         return {child.pid for child in multiprocessing.active_children()}
 
     others = alive()
-    ended = carried_out(time.sleep, [0.0, 600.0], 2)
+    ended = iter_results(time.sleep, [0.0, 600.0], 2)
     next(ended)
     (*_, pid) = alive() - others
     assert Path(f"/proc/{pid}").is_dir()
     ended.close()
-    until = time.monotonic() + 60
-    while alive() - others and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not alive() - others
+    until(lambda: not alive() - others)

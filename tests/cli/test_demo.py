@@ -34,7 +34,7 @@ def test_the_leak_is_found_within_ten_seconds_of_the_truth(first, folder):
     for name in ("machine.toml", "recording.nc", "report.html"):
         assert str(folder / "first" / name) in first.out
         assert (folder / "first" / name).stat().st_size > 10_000
-    names = ["healthy", "healthy.nc", "machine.lessons", "machine.toml", "recording.nc", "report.html"]
+    names = ["healthy", "healthy.nc", "machine.healthy", "machine.toml", "recording.nc", "report.html"]
     assert sorted(path.name for path in (folder / "first").glob("[!.]*")) == names
 
 
@@ -58,6 +58,7 @@ def test_the_page_needs_nothing_from_outside(first, folder):
     assert "<svg" in page
 
 
+@pytest.mark.slow
 def test_a_second_run_gives_the_same_bytes_and_the_same_words(first, folder, call):
     second = call("demo", "-o", folder / "second")
     assert second.status == 0

@@ -297,7 +297,7 @@ def test_side_by_side_says_what_one_after_the_other_says(form, tmp_path, monkeyp
     arguments = ["diagnose", *map(str, files), "--format", form]
     monkeypatch.setattr("sealscope.campaigns.execution.workers.cores", lambda: 2)
     beside = CliRunner().invoke(app, arguments)
-    monkeypatch.setattr(module, "_FEWEST_SIDE_BY_SIDE", 99)
+    monkeypatch.setattr(module, "_MIN_PARALLEL_FILES", 99)
     alone = CliRunner().invoke(app, arguments)
     assert beside.exit_code == alone.exit_code == 1
     assert beside.stdout == alone.stdout

@@ -95,7 +95,11 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     diagnosis = machine.diagnose("suspect/press_2026-04-21_0600.csv")
     assert diagnosis.leak_lpm == leaking["leak_lpm"]
     table = call("diagnose", "suspect", "--machine", "press.toml").out
-    assert messages.flow(diagnosis) in table and "2026-04-21" in table
+    assert messages.format_leak_flow(diagnosis) in table and "2026-04-21" in table
+    step = messages.next_steps(diagnosis)[0]
+    terminal = call("diagnose", "suspect/press_2026-04-21_0600.csv", "--machine", "press.toml").out
+    for words in (messages.how_much(diagnosis), messages.since(diagnosis), messages.state_text(diagnosis.state), step):
+        assert words in " ".join(terminal.split())
 
     # pages
     page = ss.report(machine.read("suspect/press_2026-04-21_0600.csv"), "leak.html", diagnosis, rig=machine.rig)
@@ -106,12 +110,13 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     assert "<title>press: leak" in Path("own.html").read_text(encoding="utf-8")
     assert call("report", "healthy", "suspect", "--machine", "press.toml", "-o", "press.html").status == 0
     history = Path("press.html").read_text(encoding="utf-8")
-    assert messages.flow(diagnosis) in history and "<title>press:" in history
+    assert messages.format_leak_flow(diagnosis) in history and "<title>press:" in history
 
     # trend
-    trend = call("trend", "healthy", "suspect", "--machine", "press.toml", "--healthy", "5", "-o", "trend.html")
+    trend = call("trend", "healthy", "suspect", "--machine", "press.toml", "-o", "trend.html")
     assert trend.status == 0, trend.err
-    assert "<title>press:" in Path("trend.html").read_text(encoding="utf-8")
+    drawn = Path("trend.html").read_text(encoding="utf-8")
+    assert "<title>press:" in drawn and "The first 5 recordings are taken to be of a healthy machine" in drawn
     assert "2026-04-01 to 2026-04-21" in trend.out
 
     # watched folder and alarm, the files in any order
@@ -126,6 +131,7 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     (event,) = map(json.loads, call("monitor", "watch.toml", "--once").out.splitlines())
     alarm = event["alarm"]
     assert event["event"] == "raised"
+    assert alarm["next_check"] == leaking["next_check"] == step
     figures = pytest.approx([leaking["leak_lpm"], low, high], rel=1e-9)
     assert [alarm["leak_lpm"], *alarm["leak_interval_lpm"]] == figures
 
@@ -137,12 +143,12 @@ def test_from_logs_of_several_loggers_to_a_watched_machine(press, call, monkeypa
     assert [metrics[f"sealscope_leak_{end}_lpm"] for end in ("low", "high")] == row["leak_interval_lpm"]
     assert [row["leak_lpm"], *row["leak_interval_lpm"]] == figures
     assert row["recording"]["size"] == messages.how_much(diagnosis)
-    assert row["state"]["name"] == leaking["state"]["name"]
+    assert row["state"]["name"] == leaking["state"]["name"] and row["state"]["action"] == step
     assert metrics["sealscope_severity"] == leaking["state"]["severity"]
     assert row["state"]["since_s"] == pytest.approx(1776751200.0, abs=86_400.0)  # of 2026-04-21, not of today
 
     # mark, and restart
-    service.actuators.mark("press", "valid", by_whom="A. B.")
+    service.actuators.apply_mark("press", "valid", by_whom="A. B.")
     service.close()
     assert "press-1 valid" in str(ss.read_machine("press.toml"))
     again = Service(read_settings(Path("watch.toml")), once=True)

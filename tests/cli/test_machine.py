@@ -3,18 +3,39 @@
 from __future__ import annotations
 
 import os
+from shutil import copytree
 
 import pytest
 
 import sealscope as ss
 
 
+def record_press(seed, **options):
+    """15 s of a machine whose logger has no command: nothing is fitted to what the pressures make of one."""
+    recording = ss.simulate(command="3 sin(4t)", duration="15 s", seed=seed, **options)
+    return recording.only(name for name in recording.channels if name != "u")
+
+
 @pytest.fixture(scope="module")
 def healthy(tmp_path_factory):
     folder = tmp_path_factory.mktemp("healthy")
     for seed in range(1, 4):
-        ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=seed), folder / f"run{seed}.nc")
+        ss.write(record_press(seed), folder / f"run{seed}.nc")
     return folder
+
+
+@pytest.fixture(scope="module")
+def commissioned(healthy, tmp_path_factory):
+    """The folder of a machine's file, `m.toml`, and of what it was taught."""
+    file = tmp_path_factory.mktemp("commissioned") / "m.toml"
+    return ss.write_machine(ss.commission(healthy, rig="thesis", limit="3 mL/min"), file).parent
+
+
+@pytest.fixture
+def file(commissioned, tmp_path):
+    """A copy of the machine's file."""
+    copytree(commissioned, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "m.toml"
 
 
 def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
@@ -24,8 +45,8 @@ def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
     assert (done.status, done.err) == (0, "")
     assert "smallest leak" in done.out
     assert max(map(len, done.out.splitlines()[1:])) <= 80
-    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=8), suspect / "good.nc")
-    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=9, leak="0.05 L/min"), suspect / "bad.nc")
+    ss.write(record_press(8), suspect / "good.nc")
+    ss.write(record_press(9, leak="0.05 L/min"), suspect / "bad.nc")
     (suspect / "page.html").write_text("Sealscope's own")
     done = call("diagnose", suspect, "--machine", file, "--fail-on", "leak")
     assert done.status == 3
@@ -37,12 +58,11 @@ def test_a_folder_is_judged_a_line_a_recording(call, healthy, tmp_path):
     assert max(map(len, done.out.splitlines())) <= 90
 
 
-def test_a_folder_gets_a_page_of_its_machine(call, healthy, tmp_path):
-    file, page, suspect = tmp_path / "m.toml", tmp_path / "page.html", tmp_path / "suspect"
+def test_a_folder_gets_a_page_of_its_machine(call, file, tmp_path):
+    page, suspect = tmp_path / "page.html", tmp_path / "suspect"
     suspect.mkdir()
-    call("commission", healthy, "-o", file, "--rig", "thesis", "--limit", "3 mL/min")
-    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=8), suspect / "run_2026-03-01.nc")
-    leaking = ss.simulate(command="3 sin(4t)", duration="15 s", seed=9, leak="0.05 L/min")
+    ss.write(record_press(8), suspect / "run_2026-03-01.nc")
+    leaking = record_press(9, leak="0.05 L/min")
     ss.write(leaking, suspect / "a_2026-04-01.nc")
     (suspect / "bad.csv").write_text("no recording")
     done = call("report", suspect, "--machine", file, "-o", page)
@@ -55,33 +75,27 @@ def test_a_folder_gets_a_page_of_its_machine(call, healthy, tmp_path):
     assert "--join must not stand" in call("report", suspect, "--join", "--machine", file, "-o", page).refused()
 
 
-def test_a_recording_is_added_and_the_old_file_kept(call, healthy, tmp_path):
-    file, new = tmp_path / "m.toml", tmp_path / "new.nc"
-    call("commission", healthy, "-o", file)
-    before = file.read_bytes()
-    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=5), new)
+def test_a_recording_is_added_and_the_old_file_kept(call, file, tmp_path):
+    new, before = tmp_path / "new.nc", file.read_bytes()
+    ss.write(record_press(5), new)
     assert "4 healthy" in call("commission", new, "-o", file, "--add").out
     assert (tmp_path / "m.toml.bak").read_bytes() == before
     assert "must be new" in call("commission", new, "-o", file, "--add").refused()
     assert "which exists" in call("commission", new, "-o", file).refused()
 
 
-def test_what_the_machine_states_is_not_stated_twice(call, healthy, tmp_path):
-    file = tmp_path / "m.toml"
-    call("commission", healthy, "-o", file)
+def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
     assert "--rig must not stand beside --machine" in refused
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
-def test_a_link_is_written_through(call, healthy, tmp_path):
+def test_a_link_is_written_through(call, commissioned, tmp_path):
     """Whatever reads the file that the link leads to reads what was added."""
-    there, new = tmp_path / "there", tmp_path / "new.nc"
-    there.mkdir()
-    file, link = there / "press.toml", tmp_path / "link.toml"
-    call("commission", healthy, "-o", file)
+    there, new = copytree(commissioned, tmp_path / "there"), tmp_path / "new.nc"
+    file, link = there / "m.toml", tmp_path / "link.toml"
     link.symlink_to(file)
-    ss.write(ss.simulate(command="3 sin(4t)", duration="15 s", seed=5), new)
+    ss.write(record_press(5), new)
     assert "4 healthy" in call("commission", new, "-o", link, "--add").out
     assert link.is_symlink()
     assert len(ss.read_machine(file).healthy) == len(ss.read_machine(link).healthy) == 4
@@ -92,12 +106,10 @@ def test_a_link_is_written_through(call, healthy, tmp_path):
     assert "must be readable, got" in call("commission", new, "-o", link, "--add").refused()
 
 
-def test_damaged_lessons_are_one_line_of_every_command(call, healthy, tmp_path):
+def test_damaged_summaries_are_one_line_of_every_command(call, healthy, file, tmp_path):
     """And no verdict: what is not compared with them is not `no leak`."""
-    file = tmp_path / "m.toml"
-    call("commission", healthy, "-o", file, "--rig", "thesis")
-    lessons = tmp_path / "m.lessons"
-    lessons.write_bytes(lessons.read_bytes().replace(b'"rate":500.0', b'"rate":5000.0', 1))
+    summaries = tmp_path / "m.healthy"
+    summaries.write_bytes(summaries.read_bytes().replace(b'"rate":500.0', b'"rate":5000.0', 1))
     run = healthy / "run1.nc"
     for words in (
         ("diagnose", run, "--machine", file),
@@ -107,5 +119,5 @@ def test_damaged_lessons_are_one_line_of_every_command(call, healthy, tmp_path):
         ("plan", "--machine", file, "--find", "0.01 L/min"),
     ):
         refused = call(*words).refused()
-        assert "the lesson of run1.nc must have the SHA-256" in refused
+        assert "the summary of run1.nc must have the SHA-256" in refused
         assert "commission it anew" in refused

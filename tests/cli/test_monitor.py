@@ -6,6 +6,7 @@ import json
 import sqlite3
 
 import numpy as np
+import pytest
 
 import sealscope as ss
 
@@ -13,6 +14,7 @@ from ..diagnosis.balance_machine import machine, step
 from ..monitor.plant import write_files
 
 
+@pytest.mark.slow
 def test_files_of_a_folder_end_in_one_alarm(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_files(tmp_path / "press 1", machine(1, G=step(0.0, 3.0e-13, at=100.0), duration=130.0, rate=50.0), 130.0)

@@ -94,7 +94,7 @@ def test_a_campaign_over_recordings_goes_on(batch, call, monkeypatch, tmp_path):
         raise IndexError("deep")
 
     monkeypatch.setattr(module, "judge_record", failing)
-    rows = module.recorded_rows(load_plan(tmp_path / "plan.toml"), batch)
+    rows = module.judge_recordings(load_plan(tmp_path / "plan.toml"), batch)
     assert len(rows) == 3
     assert sum(row.error == "IndexError: deep" for row in rows) == 2
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.campaigns.execution.workers import in_order
-from sealscope.recordings.apart import run_apart
+from sealscope.campaigns.execution.workers import iter_results_in_order
+from sealscope.recordings.subprocesses import run_in_subprocess
 
 from .conftest import SOURCES
 from .test_full_disk import PLAN
@@ -87,7 +87,7 @@ def test_none_runs_where_files_are_read_apart(planted: Path, run: Ran) -> None:
     names = files(planted)
     for name in names:
         ss.read(planted / name, map="auto")
-    loaded = run_apart(eval, LOADED, limit=10.0)
+    loaded = run_in_subprocess(eval, LOADED, limit=10.0)
     assert {"numpy", "h5py", "pyarrow", "python_calamine", "matio", "pickle"} <= set(loaded)
     done = run(loaded, COMMAND, "inspect", *names, "--map", "auto")
     assert done.stderr == ""
@@ -108,19 +108,20 @@ def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path,
 
 
 def test_none_runs_in_worker_processes(run: Ran) -> None:
-    ((_, loaded),) = in_order(2, eval, [LOADED])
+    ((_, loaded),) = iter_results_in_order(2, eval, [LOADED])
     assert loaded is not None
     assert "multiprocessing.spawn" in loaded
-    text = "from sealscope.campaigns.execution.workers import in_order\n"
-    text += "if __name__ == '__main__':\n    print(list(in_order(2, abs, [-1, 2])))\n"
+    text = "from sealscope.campaigns.execution.workers import iter_results_in_order\n"
+    text += "if __name__ == '__main__':\n    print(list(iter_results_in_order(2, abs, [-1, 2])))\n"
     done = run(loaded, text)
     assert done.stdout == "[(-1, 1), (2, 2)]\n", done.stderr
 
 
 def test_none_runs_in_the_compiler_of_units(run: Ran) -> None:
     pytest.importorskip("ziglang")
-    text = "import subprocess\nfrom sealscope.fmu.build import compiler\n"
-    text += "print(subprocess.run([*compiler()[0], '--version'], capture_output=True, check=True).stdout.decode())"
+    text = "import subprocess\nfrom sealscope.fmu.build import find_compiler\n"
+    text += "command = [*find_compiler().command, '--version']\n"
+    text += "print(subprocess.run(command, capture_output=True, check=True).stdout.decode())"
     assert "clang" in run(["ziglang"], text).stdout
 
 

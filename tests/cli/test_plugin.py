@@ -12,7 +12,8 @@ import pytest
 
 import sealscope as ss
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.errors import InputError
+
+from ..refusals import refusal
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def test_what_is_written_is_a_detector_with_an_entry_point_and_a_plan(call, tmp_
     assert detector.usable(recording.only(["p_A"])) == "needs p_A and p_B"
     (change,) = detector.observe(recording).observables
     assert change.chance > 0.01
-    with pytest.raises(InputError, match="stroke time"):
+    with refusal("stroke time"):
         load_plan(place / "judge.toml")  # until it is installed, no detector has its name
 
 

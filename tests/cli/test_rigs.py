@@ -11,7 +11,7 @@ from sealscope.physics.rig import rig_numbers
 from sealscope.physics.solvers.limits import longest_step
 from sealscope.physics.standstill import initial_state
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import LONGEST_STEP, trajectory
+from sealscope.simulation.integrate import LONGEST_STEP, integrate_run
 
 SIZES = ("--stroke", "400", "--displacement", "6")
 
@@ -89,7 +89,7 @@ def test_areas_go_with_any_packaged_rig():
 def test_a_new_single_rod_runs(call, tmp_path):
     path = tmp_path / "small.toml"
     call("rigs", "new", "small", "--area-A", "700", "--area-B", "500", *SIZES, "-o", path)
-    run = trajectory(Experiment.of(rig=path, command="5 sin(2t)", duration=4.0), ())
+    run = integrate_run(Experiment.of(rig=path, command="5 sin(2t)", duration=4.0), ())
     assert run.error < 100.0
     assert run["x"].max() - run["x"].min() > 0.01
 

@@ -111,7 +111,9 @@ def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path)
     file, first = tmp_path / "press.toml", [days / f"day_{k}.nc" for k in (1, 2, 3)]
     assert call("commission", *first, "-o", file, "--rig", "thesis", "--limit", "3 mL/min").status == 0
     stated = call("trend", days, "--machine", file)
-    assert stated.status == 0 and stated.out == call("trend", days, "--rig", "thesis", "--limit", "3 mL/min").out
+    options = "--rig", "thesis", "--limit", "3 mL/min"
+    assert stated.status == 0 and stated.out == call("trend", days, *options, "--healthy", 3).out
+    assert call("trend", days, "--machine", file, "--healthy", 1).out == call("trend", days, *options).out
     assert "--limit must not stand beside" in call("trend", days, "--machine", file, "--limit", "5 mL/min").refused()
     assert (
         "--set must not stand beside --machine"

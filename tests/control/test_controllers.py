@@ -13,11 +13,12 @@ import pytest
 import sealscope as ss
 from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, PositionPI, controller_named
 from sealscope.control.leak_observer import conductance as estimate_of
-from sealscope.control.leak_observer import observer_of, update_observer
-from sealscope.errors import InputError
+from sealscope.control.leak_observer import make_observer, update_observer
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
+
+from ..refusals import refusal
 
 RIG = load_rig("thesis-closed-loop")
 #: What the controllers do not know: friction up and stiffness down by 20 %; and a load of 2 kN.
@@ -37,7 +38,7 @@ def followed(controller, command: str, duration: float, lpm: float = 0.0, **opti
     experiment = Experiment.of(
         rig=RIG, command=command, duration=duration, controller=controller, leak=leak, set=OFF, **options
     )
-    run = trajectory(experiment, experiment.leaks)
+    run = integrate_run(experiment, experiment.leaks)
     return run, np.broadcast_to(experiment.target.value_at(run.t), run.t.shape) - run["x"]
 
 
@@ -60,7 +61,7 @@ def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     balance = FaultTolerant.from_rig(RIG).balance
-    (observer,), rate, G = observer_of(balance, 500.0), 500.0, 3e-13
+    (observer,), rate, G = make_observer(balance, 500.0), 500.0, 3e-13
     t = np.arange(10_000) / rate
     x, p = 0.05 * np.sin(1.5 * t), 1e6 + sign * 0.3e6 * np.sin(0.7 * t)
     high, low = np.maximum(2.5e6 + 0.0 * p, p), p
@@ -77,7 +78,7 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
 
 def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlier_is_not():
     balance = FaultTolerant.from_rig(RIG).balance
-    (observer,), rate = observer_of(balance, 500.0), 500.0
+    (observer,), rate = make_observer(balance, 500.0), 500.0
     G = np.repeat([0.0, 2.6e-12], 5000)
     theta = np.cumsum(G * 3e6) / rate / balance.D
     theta[2500:2600] += 1.0  # a slip of the encoder across the end of a block
@@ -179,7 +180,7 @@ def test_a_single_rod_is_served_as_well(lpm, load):
             leak=f"G = {G}" if lpm else None,
             set={"F_pr": 120.0, "F_cfr": 6e-5, "F_v": 2400.0, "K_oil": 800e6, "F_l": load},
         )  # fmt: skip
-        run = trajectory(experiment, experiment.leaks)
+        run = integrate_run(experiment, experiment.leaks)
         runs[name] = run, rms((experiment.target.value_at(run.t) - run["x"])[run.t > 8.0])
     (fixed, missed), (tolerant, left) = runs.values()
     if lpm == 0.0:
@@ -254,24 +255,23 @@ def test_controllers_have_names_and_a_user_s_own_too():
 
 
 @pytest.mark.parametrize(
-    ("name", "rule"),
+    ("name", "words"),
     [
-        ("flatnes", r"controller must be one of pi, .*got 'flatnes'.*flatness"),
-        ("none.py:Own", r"a controller's file must exist, got none.py"),
-        ("json:dumps", r"a controller must have rate, delay and start, got json:dumps without rate|could not be made"),
-        ("no_such_module:Own", r"controller no_such_module:Own could not be made: ModuleNotFoundError"),
+        ("flatnes", "controller, 'flatnes'"),
+        ("none.py:Own", "none.py"),
+        ("json:dumps", "json:dumps"),
+        ("no_such_module:Own", "no_such_module:Own, ModuleNotFoundError"),
     ],
 )
-def test_a_wrong_name_is_one_line(name, rule):
-    with pytest.raises(InputError, match=rule) as refused:
+def test_a_wrong_name_is_one_line(name, words):
+    with refusal(*words.split(", ")):
         controller_named(name, RIG)
-    assert "\n" not in str(refused.value)
 
 
 def test_numbers_that_cannot_be():
-    with pytest.raises(InputError, match="displacement of the drive must be > 0, got 0"):
+    with refusal("displacement", "0"):
         replace(Drive.from_rig(RIG), displacement=0.0)
-    with pytest.raises(InputError, match="v_max of the controller must be > 0, got 0"):
+    with refusal("v_max", "0"):
         replace(Flatness.from_rig(RIG), v_max=0.0)
-    with pytest.raises(InputError, match="known of the controller must be >= 0, got -1"):
+    with refusal("known", "-1.0"):
         FaultTolerant.from_rig(RIG, known=-1.0)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from sealscope.control import FaultTolerant, PositionPI, margins
-from sealscope.control.margins import margins_of, open_loop
-from sealscope.errors import InputError
+from sealscope.control.margins import compute_margins, open_loop
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
+
+from ..refusals import refusal
 
 RIG = load_rig("thesis-closed-loop")
 PI = PositionPI.from_rig(RIG)
@@ -28,7 +29,7 @@ def test_the_gain_margin_is_where_the_loop_begins_to_swing(share, grows):
         rig=RIG, command="position step 0.002 mm at 0.1 s", duration=3.0, controller=louder,
         set={"sensors.x.resolution": "1e-9[m]"},
     )  # fmt: skip
-    run = trajectory(experiment, (), step=1e-4)
+    run = integrate_run(experiment, (), step=1e-4)
     late = np.ptp(run["x"][run.t > 2.0])
     assert late > 20e-6 if grows else late < 0.2e-6
 
@@ -65,7 +66,7 @@ def test_phase_and_delay_margin_are_the_least_of_all_crossings():
     tau = 0.5 * math.pi / w
     f = np.geomspace(0.1, 200.0, 20_000)
     s = 2j * math.pi * f
-    found = margins_of(f, k * np.exp(-s * tau) / (s * (1.0 + 2.0 * zeta * s / w + (s / w) ** 2)))
+    found = compute_margins(f, k * np.exp(-s * tau) / (s * (1.0 + 2.0 * zeta * s / w + (s / w) ** 2)))
     r = np.sort(np.roots([1.0, 4.0 * zeta**2 - 2.0, 1.0, -((k / w) ** 2)]).real)
     omega = w * np.sqrt(r)
     ahead = 0.5 * math.pi - omega * tau - np.arctan2(2.0 * zeta * np.sqrt(r), 1.0 - r)
@@ -105,5 +106,5 @@ def test_tolerance_costs_no_margin_without_a_leak_and_little_with_one_where_the_
 
 
 def test_a_speed_beyond_the_drive_is_refused():
-    with pytest.raises(InputError, match="speed must be one that the drive can give, got 5 m/s"):
+    with refusal("speed", "5 m/s"):
         margins(RIG, PI, 5.0)

@@ -12,7 +12,7 @@ from sealscope.diagnosis.detectors import registry
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import record
-from sealscope.simulation.integrate import oversampling, sized_run
+from sealscope.simulation.integrate import oversampling, run_with_sized_leaks
 
 THROTTLED = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
 Records = Callable[..., Recording]
@@ -26,14 +26,18 @@ def rms_change_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def records() -> Records:
-    """One record of a case; equal cases share their trajectory and differ in the noise of `seed` alone."""
+    """One record of a case; equal cases share their trajectory and differ in the noise of `seed` alone.
+
+    Equal records are one object, with which what is computed of it is kept.
+    """
 
     @lru_cache(maxsize=4)
     def case(command: str, leak: str | None, duration: float, throttled: bool):  # type: ignore[no-untyped-def]
         experiment = Experiment.of(command=command, leak=leak, duration=duration, set=THROTTLED if throttled else None)
-        _, path = sized_run(experiment)
+        _, path = run_with_sized_leaks(experiment)
         return experiment, path, experiment.command.volts(experiment.sample_times()), oversampling(experiment)
 
+    @lru_cache(maxsize=16)
     def make(
         seed: int,
         *,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.learnt import Healthy
+from sealscope.diagnosis.healthy import Healthy
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
 

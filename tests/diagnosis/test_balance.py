@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.inference.balance import BlockStream, blocks_of
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, zero_of
+from sealscope.diagnosis.inference.balance import BlockStream, recorded_blocks
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_offset, information
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.terms import equations
 from sealscope.parameters import load_rig
@@ -39,9 +39,10 @@ def changed(recording: Recording, **changes: Callable[[Mapping[str, np.ndarray]]
 
 
 def judged(recording: Recording) -> tuple[StepTest, Blocks]:
-    made = blocks_of(recording, RIG)
+    made = recorded_blocks(recording, RIG)
     assert made is not None
-    blocks, _, columns = made
+    regime = made.regime(made.odds)
+    blocks, columns = regime.blocks, regime.columns
     test = step_test(information(blocks, columns, columns[0].leak))
     assert test is not None
     return test, blocks
@@ -134,12 +135,12 @@ def test_a_shifted_zero_leaves_score_and_size(side: str, shift: float, load: flo
     assert moved.fitted[0] == pytest.approx(test.fitted[0], rel=0.05)
     assert moved.onsets[moved.best] == pytest.approx(test.onsets[test.best], abs=1.0)
     added = shift if side == "p_A" else -shift
-    columns = tuple(Columns(balance) for balance in equations(RIG, frozenset(recording.channels)))
-    zeros = [zero_of(own, columns) for own in (apart, blocks)]
+    columns = tuple(ColumnRoles(balance) for balance in equations(RIG, frozenset(recording.channels)))
+    zeros = [estimate_offset(own, columns) for own in (apart, blocks)]
     assert zeros[0] - zeros[1] == pytest.approx(added, abs=2e4 + 0.03 * abs(added))
     # what a leak passes: coefficient times mean size of the pressure difference about its zero
     flows = [
-        own.fitted[0] * float(of.driving(zero).mean())
+        own.fitted[0] * float(of.mean_pressure(zero).mean())
         for own, of, zero in zip((moved, test), (apart, blocks), zeros, strict=True)
     ]
     assert flows[0] == pytest.approx(flows[1], rel=0.05)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.rms_change.blocks import cut_blocks, whole_levels
+from sealscope.diagnosis.rms_change.blocks import cut_blocks, measure_levels
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import details
@@ -92,7 +92,7 @@ def test_log_rms_is_that_of_the_details() -> None:
             column = blocks.names.index(f"{quantity} of {chamber}")
             np.testing.assert_allclose(np.exp(blocks.log_rms[:, column]), direct, rtol=1e-9)
             inside = values[result.inside()]
-            assert whole_levels(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
+            assert measure_levels(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
 
 
 def test_each_phases_own_level_is_taken_out() -> None:
@@ -127,7 +127,7 @@ def test_a_reading_that_does_not_move_is_named() -> None:
     p_B = np.array(recording["p_B"])
     p_B[20000:23000] = p_B.min()
     held = Recording(recording.t, {**recording.channels, "p_B": p_B}, recording.units, RATE)
-    still = cut_blocks(held).still
+    still = cut_blocks(held).frozen
     assert still is not None
     assert still.startswith("p_B does not move from 14")
-    assert cut_blocks(recording).still is None
+    assert cut_blocks(recording).frozen is None

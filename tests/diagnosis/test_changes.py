@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import Case, DecisionContext, OtherEvent
+from sealscope.diagnosis.decision.case import Case, OtherEvent
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.changes.levels import level_tests, levels
+from sealscope.diagnosis.inference.changes.levels import estimate_levels, level_tests
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
@@ -39,7 +39,7 @@ def machine(**changed: np.ndarray) -> Recording:
 def other_event(recording: Recording) -> OtherEvent | None:
     """Return the event that the signals alone name, as beside a detector that sees nothing."""
     report = observe_signals(recording)
-    return Case(report, report.observables, HealthyNull(), DecisionContext(false_alarm_probability=CHANCE)).other_event
+    return Case(report, report.observables, HealthyNull(), CHANCE).other_event
 
 
 def onset_of(event: OtherEvent) -> float:
@@ -48,7 +48,7 @@ def onset_of(event: OtherEvent) -> float:
 
 
 def test_the_levels_of_both_directions() -> None:
-    made = levels(machine())
+    made = estimate_levels(machine())
     assert made is not None
     assert made[1].mean(axis=0) == pytest.approx([5.012e5, 5.012e5, 1e5, -1e5], rel=0.02)
 

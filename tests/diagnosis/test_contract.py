@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.detectors import observation
-from sealscope.diagnosis.detectors.detector import checked
+from sealscope.diagnosis.detectors.detector import validate_report
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.rms_change.detector import RmsChange
@@ -100,6 +100,8 @@ def every_detector(monkeypatch: pytest.MonkeyPatch) -> None:
 
 #: Detectors that only say whether something changed, and not when.
 UNDATED = ("ringing energy",)
+#: What is examined by the slow tests only: a recording, and whether beside a baseline.
+OTHER_CASES = (("healthy", False), ("leaky", True))
 #: Detectors to which the size of a pressure means something.
 PHYSICAL = ("volume balance", "pressure response")
 COURSE = ("t", "lpm", "low", "high")
@@ -181,7 +183,7 @@ def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-u
     assert alike(first_examined(detector, leaky), examined(detector, leaky))
 
 
-@pytest.mark.parametrize("case", ["leaky", "healthy"])
+@pytest.mark.parametrize("case", ["leaky", pytest.param("healthy", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
 def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
     detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
@@ -205,11 +207,10 @@ def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
 
 
 def test_never_sees_the_flow_meter_or_where_the_data_come_from(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    plain = first_examined(detector, leaky)
-    assert alike(examined(detector, with_channels(leaky, q_leak=np.linspace(0.0, 1.0, len(leaky)))), plain)
-    disclosed = replace(leaky, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
-    assert alike(examined(detector, disclosed), plain)
-    assert alike(examined(detector, leaky.only(name for name in leaky.channels if name != "q_leak")), plain)
+    metered = with_channels(leaky, q_leak=np.linspace(0.0, 1.0, len(leaky)))
+    disclosed = replace(metered, provenance={"experiment": {"leak": "none"}}, history=("no leak",))
+    assert alike(examined(detector, disclosed), first_examined(detector, leaky))
+    assert alike(examined(detector, leaky.only(set(leaky.channels) - {"q_leak"})), first_examined(detector, leaky))
 
 
 def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
@@ -225,7 +226,7 @@ def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> Non
     assert later.onset_interval_s == pytest.approx([one + 1000.0 for one in here.onset_interval_s], abs=1e-6)
 
 
-@pytest.mark.parametrize("names", [["x"], ["theta"], ["x", "theta", "omega"], ["p_1", "p_2"]])
+@pytest.mark.parametrize("names", [["x"], ["x", "theta", "omega", "p_1", "p_2"]])
 def test_holes_in_other_channels_are_no_fault(detector, names: list[str], leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     """Only the pressures and the command are promised to be whole."""
     holes = np.arange(len(leaky)) % 7919 == 100
@@ -243,7 +244,7 @@ def test_a_smaller_false_alarm_probability_asks_for_more(detector, leaky: Record
 
 
 def test_reports_hold_numbers_alone(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
-    report = checked(detector.observe(leaky, ()), detector.name)
+    report = validate_report(detector.observe(leaky, ()), detector.name)
     assert report.observables and not report.lack
     for observable in report.observables:
         assert observable.name and 0.0 <= observable.chance <= 1.0 and np.isfinite(observable.score)
@@ -263,8 +264,10 @@ def test_noise_alone_never_is_a_leak(leaky: Recording) -> None:
     assert {observable.data for observable in report.observables if " d1 " in observable.name} == {"noise of details"}
 
 
-@pytest.mark.parametrize("case", ["leaky", "healthy"])
-@pytest.mark.parametrize("with_baseline", [False, True])
+@pytest.mark.parametrize(
+    ("case", "with_baseline"),
+    [("leaky", False), ("healthy", True), *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHER_CASES)],
+)
 def test_the_chance_agrees_with_score_and_threshold(
     detector,  # type: ignore[no-untyped-def]
     case: str,

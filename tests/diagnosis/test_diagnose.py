@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from importlib import import_module
+
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.detector import make_observable
-from sealscope.diagnosis.diagnose import Examination
+from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
+
+module = import_module("sealscope.diagnosis.diagnose")
 
 observed: list[tuple[tuple[str, ...], int]] = []
 rigs: list[Rig] = []
@@ -46,7 +52,7 @@ def test_once_for_each_set_of_channels(recording: Recording) -> None:
     for _ in range(3):
         assert whole.evidence("looker").chance == 0.25
     assert len(observed) == 1
-    few = whole.through(["u", "p_A", "p_B", "omega"])
+    few = whole.with_channels(["u", "p_A", "p_B", "omega"])
     assert few.evidence("looker") == few.evidence("looker")
     assert [channels for channels, _ in observed] == [("u", "x", "p_A", "p_B", "q_leak"), ("u", "p_A", "p_B")]
 
@@ -54,7 +60,7 @@ def test_once_for_each_set_of_channels(recording: Recording) -> None:
 def test_with_a_baseline_every_view_is_another(recording: Recording) -> None:
     whole = Examination(recording, [recording, recording.only(["u"])], false_alarm_probability=0.05)
     whole.evidence("looker")
-    whole.through(["u", "p_A", "p_B"]).evidence("looker")
+    whole.with_channels(["u", "p_A", "p_B"]).evidence("looker")
     assert observed == [(("u", "x", "p_A", "p_B", "q_leak"), 1), (("u", "p_A", "p_B"), 1)]
 
 
@@ -101,6 +107,23 @@ def test_what_stands_in_for_a_judge_is_not_asked(recording: Recording, monkeypat
     ):
         known = {"looker": Looker, "pressure response": Pressures, "volume balance": volumes}
         monkeypatch.setattr(registry, "DETECTORS", known)
-        fused = Examination(recording, false_alarm_probability=0.05).fused()
+        fused = Examination(recording, false_alarm_probability=0.05).decide_by_all()
         assert [part.detector for part in fused.parts] == asked
         assert fused.detector == asked[0]
+
+
+def test_no_part_of_a_diagnosis_spreads_small_matrices_over_threads(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = {}
+    for name in ("inspect_recording", "decide"):
+        whole = getattr(module, name)
+
+        def count_threads(*inputs: object, name: str = name, whole: Callable[..., object] = whole) -> object:
+            threads[name] = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+            return whole(*inputs)
+
+        monkeypatch.setattr(module, name, count_threads)
+    with threadpool_limits(limits=2):
+        diagnose(recording)
+    assert threads == {name: {1} for name in ("inspect_recording", "decide")}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.rows.distribution import PARTS, distribution
+from sealscope.diagnosis.inference.rows.distribution import PARTS, sorted_part_means
 
 RATE, SECONDS, NOISE = 500.0, 3.0, 7e3
 
@@ -21,20 +21,22 @@ def test_ringing_counts_and_noise_does_not(amplitude: float, frequency: float, n
     t = np.arange(0.0, SECONDS, 1.0 / RATE)
     clean = amplitude * np.sin(2.0 * np.pi * frequency * t) * np.exp(-(t % 1.0) / 0.3)
     recorded = clean + noise * np.random.default_rng(1).standard_normal(len(t))
-    assert mean_size(distribution(recorded, RATE)) == pytest.approx(np.abs(clean).mean(), rel=0.03, abs=0.25 * noise)
+    assert mean_size(sorted_part_means(recorded, RATE)) == pytest.approx(
+        np.abs(clean).mean(), rel=0.03, abs=0.25 * noise
+    )
 
 
 def test_noise_alone_leaves_little_of_itself() -> None:
     noise = np.random.default_rng(2).standard_normal(int(SECONDS * RATE))
-    assert mean_size(distribution(noise, RATE)) < 0.4 * np.abs(noise).mean()
+    assert mean_size(sorted_part_means(noise, RATE)) < 0.4 * np.abs(noise).mean()
 
 
 def test_parts_rise_and_keep_the_mean_and_a_zero() -> None:
     pressure = 1e5 * np.random.default_rng(3).standard_normal(992).cumsum()  # whole strides of 62 samples
-    parts = distribution(pressure, RATE)
+    parts = sorted_part_means(pressure, RATE)
     assert parts.shape == (PARTS,)
     assert (np.diff(parts) >= 0.0).all()
-    np.testing.assert_allclose(distribution(pressure + 3e5, RATE), parts + 3e5, rtol=1e-9)
+    np.testing.assert_allclose(sorted_part_means(pressure + 3e5, RATE), parts + 3e5, rtol=1e-9)
 
 
 @pytest.mark.parametrize("missing", [slice(0), slice(100, 107), slice(None, None, 50), slice(None)])
@@ -43,6 +45,6 @@ def test_missing_samples_and_low_rates_are_no_trouble(missing: slice, rate: floa
     pressure = np.full(int(SECONDS * rate), 1e6)
     pressure[missing] = np.nan
     expected = 0.0 if np.isnan(pressure).all() else 1e6
-    got = distribution(pressure, rate)
+    got = sorted_part_means(pressure, rate)
     assert np.isfinite(got).all()
     assert expected == 0.0 or rate < 100.0 or got == pytest.approx(np.full(PARTS, expected))

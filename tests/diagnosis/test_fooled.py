@@ -54,7 +54,7 @@ def test_what_changed_in_the_readings_is_no_leak(kind: str, healthy: Recording) 
     diagnosis = diagnose(make(healthy.only(CHAMBERS)))
     assert diagnosis.verdict != "leak"
     assert diagnosis.cause == "sensor fault"
-    words = {event.name: event.words for event in load_events()}
+    words = {event.name: event.description for event in load_events()}
     assert words[name] in diagnosis.reason or words["logger"] in diagnosis.reason
 
 

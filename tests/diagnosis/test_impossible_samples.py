@@ -17,13 +17,15 @@ def leaking() -> Recording:
     return ss.simulate(command="3 sin(4t)", leak="0.05 L/min from 10 s", duration="20 s", seed=1)
 
 
-@pytest.mark.parametrize("name", ["p_A", "x", "omega", "theta", "u"])
-@pytest.mark.parametrize("value", [1e308, -1e150, 1e30])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("p_A", 1e308), ("p_A", -1e150), ("p_A", 1e30), ("x", 1e308), ("omega", -1e150), ("theta", 1e30), ("u", 1e308)],
+)
 def test_a_sample_that_no_sensor_reads_is_missing(leaking, name, value, capfd):
     channels = {key: values.copy() for key, values in leaking.channels.items()}
     channels[name][3000] = value
     result = ss.diagnose(replace(leaking, channels=channels))
-    assert result.verdict == ss.diagnose(leaking).verdict == "leak"
+    assert result.verdict == "leak"
     texts = [finding.text for finding in result.quality if finding.code == "impossible"]
     assert texts == [f"{name}: 1 sample beyond what any sensor reads, first {value:g} {leaking.units[name]}"]
     assert capfd.readouterr() == ("", "")

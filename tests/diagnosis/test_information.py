@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, information, solve
-from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, weighted
-from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, rows
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, information, solve
+from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, block_gram_matrices
+from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 
 FIELDS = tuple(Blocks.__dataclass_fields__)
 STROKE, OIL, ZERO, TESTED, OTHER, LEFT = range(6)
@@ -19,11 +19,11 @@ def nothing(_: object) -> np.ndarray:
     raise AssertionError("rows are given, no channel is read")
 
 
-def columns() -> Columns:
+def columns() -> ColumnRoles:
     """A balance of three terms that drift, the leak, and a term that is no nuisance."""
-    kinds = (("stroke", "compliance", True), ("oil", "air", True), ("bias", "bias", True), (LEAK, "leak", True))
-    terms = [Term(name, "", "", nothing, "sensor fault", drift, own) for name, drift, own in kinds]
-    return Columns(Equation("test", nothing, (*terms, Term("other", "", "", nothing, "sensor fault", "", False))))
+    kinds = {"stroke": "compliance", "oil": "air", "bias": "bias", LEAK: "leak", "other": ""}
+    terms = [Term(name, "", nothing, "sensor fault", drift) for name, drift in kinds.items()]
+    return ColumnRoles(Equation("test", nothing, tuple(terms)))
 
 
 def recorded(count: int, each: int = 24, noise: float = 0.05, seed: int = 0) -> np.ndarray:
@@ -66,7 +66,7 @@ def oracle(values: np.ndarray, seconds: float = 3.0) -> tuple[np.ndarray, np.nda
     drifting = np.hstack([flat[:, [k]] * shapes for k in others])
     free = np.where(block[:, None] == np.arange(count), flat[:, [TESTED]], 0.0)
     level = np.linalg.lstsq(flat[:, others], flat[:, LEFT], rcond=None)[0]
-    width = np.abs(level) * np.array([priors("inference")["drift"][name] for name in ("compliance", "air", "bias")])
+    width = np.abs(level) * np.array([INFERENCE.drift.compliance, INFERENCE.drift.air, INFERENCE.drift.bias])
     width *= length / 60.0
     assert own.nuisance == (STROKE, OIL, ZERO, TESTED)
     variance = float(np.var(flat[:, LEFT]))
@@ -114,7 +114,7 @@ def test_two_equations_of_one_coefficient_add() -> None:
 @pytest.mark.parametrize("most", [1, 2, 3, 7, 16, 17, 100])
 def test_sums_add(most: int) -> None:
     whole = blocks(recorded(17))
-    merged = whole.merged(most)
+    merged = whole.merge(most)
     assert len(merged) <= most or len(merged) == len(whole)
     np.testing.assert_allclose(merged.gram.sum(axis=0), whole.gram.sum(axis=0), rtol=1e-12)
     assert merged.rows.sum() == whole.rows.sum()
@@ -142,10 +142,10 @@ def test_what_says_nothing_is_left_at_zero() -> None:
     assert made.precision.shape == without.precision.shape
 
 
-def leak_of(values: np.ndarray) -> float:
+def case_leaks(values: np.ndarray) -> float:
     """One coefficient of the leak, from the weighted sums of blocks that are closed one after the other."""
     weighting = Weighting((columns(),))
-    total = sum(weighting.close([block], np.array([len(block)]))[0, 0] for block in values)
+    total = sum(weighting.compute_gram_matrices([block], np.array([len(block)]))[0, 0] for block in values)
     chosen = [STROKE, OIL, ZERO, TESTED]
     return float(solve(total[np.ix_(chosen, chosen)], total[chosen, LEFT])[-1])
 
@@ -160,12 +160,12 @@ def steady(seed: int, noise: float = 0.05) -> np.ndarray:
 
 def test_a_spike_moves_the_estimate_by_a_bounded_amount() -> None:
     """Huber's influence is bounded: a spike 1000 times larger moves the leak no further, and little at all."""
-    clean = leak_of(steady(0))
+    clean = case_leaks(steady(0))
     moved = []
     for size in (1.0, 1e3, 1e6):
         values = steady(0)
         values[4, 11, LEFT] += size
-        moved.append(abs(leak_of(values) - clean))
+        moved.append(abs(case_leaks(values) - clean))
     error = 0.05 / np.sqrt(values.shape[0] * values.shape[1])
     assert max(moved) < 2.0 * error
     assert moved[2] == pytest.approx(moved[1], abs=0.01 * error)
@@ -175,7 +175,7 @@ def test_weights_cost_five_percent_of_normal_errors() -> None:
     robust, plain = [], []
     for seed in range(60):
         flat = steady(seed).reshape(-1, 6)
-        robust.append(leak_of(flat[None]) - 0.4)
+        robust.append(case_leaks(flat[None]) - 0.4)
         plain.append(np.linalg.lstsq(flat[:, :4], flat[:, LEFT], rcond=None)[0][-1] - 0.4)
     assert abs(np.mean(robust)) < 4.0 * np.std(robust) / np.sqrt(len(robust))
     assert 0.85 < np.mean(np.square(plain)) / np.mean(np.square(robust)) < 1.03
@@ -185,7 +185,7 @@ def test_overlap_is_the_ratio_of_variances_of_means() -> None:
     """White noise of a rate: the mean of many rows varies more than that of as many independent ones."""
     random = np.random.default_rng(1)
     rate = 200.0
-    made = rows([random.standard_normal(round(4000.0 * rate)) / rate], rate).values[:, 0]
+    made = weak_form_rows([random.standard_normal(round(4000.0 * rate)) / rate], rate).values[:, 0]
     each = 200
     means = made[: len(made) // each * each].reshape(-1, each).mean(axis=1)
     assert np.var(means) * each / np.var(made) == pytest.approx(OVERLAP, rel=0.3)
@@ -215,7 +215,7 @@ def test_compiled_sums_are_those_of_a_dense_iteration(each: int) -> None:
     values[1, 3, LEFT] += 5.0
     flat = values.reshape(-1, 6)
     ends, known = each * np.arange(1, 4), np.zeros((3, 3))
-    gram = weighted(flat, ends, np.array([ZERO, TESTED]), np.array([STROKE, OIL, LEFT]), known, 1.0)
+    gram = block_gram_matrices(flat, ends, np.array([ZERO, TESTED]), np.array([STROKE, OIL, LEFT]), known, 1.0)
     root = np.sqrt(by_iteration(values)).reshape(3, each, 1)
     expected = np.einsum("kri,krj->kij", values * root, values * root)
     assert gram == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
@@ -230,9 +230,9 @@ def test_what_is_known_weighs_a_block_that_cannot_tell_alone() -> None:
     values = steady(1)
     before, known = values[:9].reshape(-1, 6), np.zeros((3, 3))
     fast, own = np.array([ZERO, TESTED]), np.array([STROKE, OIL, LEFT])
-    weighted(before, 24 * np.arange(1, 10), fast, own, known, 1.0)
+    block_gram_matrices(before, 24 * np.arange(1, 10), fast, own, known, 1.0)
     block = values[9, :5].copy()
     block[2, LEFT] += 1.0
-    alone = weighted(block, np.array([5]), fast, own, np.zeros((3, 3)), 0.0)[0, ZERO, ZERO]
-    beside = weighted(block, np.array([5]), fast, own, known, 0.0)[0, ZERO, ZERO]
+    alone = block_gram_matrices(block, np.array([5]), fast, own, np.zeros((3, 3)), 0.0)[0, ZERO, ZERO]
+    beside = block_gram_matrices(block, np.array([5]), fast, own, known, 0.0)[0, ZERO, ZERO]
     assert beside < alone

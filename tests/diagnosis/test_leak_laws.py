@@ -15,7 +15,7 @@ from .judging import judge
 ONSET = 36.3
 
 
-@pytest.mark.parametrize("command", ["3 sin(4t)", "5 sin(2t)"])
+@pytest.mark.parametrize("command", ["3 sin(4t)", pytest.param("5 sin(2t)", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("lpm", [0.0042, pytest.param(0.015, marks=pytest.mark.slow), 0.1])
 @pytest.mark.parametrize("law", ["laminar", "orifice"])
 def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
@@ -40,14 +40,14 @@ def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
 @pytest.mark.parametrize(
     "command, lpm",
     [
-        ("3 sin(4t)", 0.5),
+        pytest.param("3 sin(4t)", 0.5, marks=pytest.mark.slow),
         pytest.param("3 sin(4t)", 0.2, marks=pytest.mark.slow),
         pytest.param("5 sin(2t)", 0.5, marks=pytest.mark.slow),
         pytest.param("8 sin(t)", 0.5, marks=pytest.mark.slow),
         ("8 sin(t)", 1.0),
     ],
 )
-def test_half_of_the_blocks_leak_much(command: str, lpm: float, law: str) -> None:
+def test_a_leak_of_much_of_the_flow_is_found_sized_and_dated(command: str, lpm: float, law: str) -> None:
     """The blocks with the leak take part, also where little of the pump's flow still moves the piston.
 
     Leaks of over half the flow were `cannot tell` or a slipping encoder, because position and angle go together by

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
-from sealscope.diagnosis.inference.onset import FEWEST, Information, NullLaw, StepTest, course, step_test
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, NullLaw, StepTest, fit_history, step_test
 
 SPACING = 3.0
 
@@ -218,12 +218,12 @@ def test_onset_interval_and_bound_hold(count: int, walk: float, size: float) -> 
     assert bounded >= binom.ppf(0.001, draws, 0.95)
 
 
-def test_course_is_the_conditional_mean_of_the_blocks() -> None:
+def test_history_is_the_conditional_mean_of_the_blocks() -> None:
     random = np.random.default_rng(8)
     made = drawn(random, precision_of(random, 15), 20.0)
     walk, noise = 0.3, 1.4
     test = replace(judged(made), walk=(walk, 0.0), noise=(noise, 1.0))
-    given = course(made, test, step=False)
+    given = fit_history(made, test, with_step=False)
     index = np.arange(15)
     # level and slope are free: what the walk's precision says of them is projected out
     wandering = np.linalg.inv(walk * noise * (np.minimum.outer(index, index) + 1.0))
@@ -237,7 +237,7 @@ def test_course_is_the_conditional_mean_of_the_blocks() -> None:
 
 def test_too_few_blocks_have_no_test() -> None:
     random = np.random.default_rng(6)
-    assert step_test(drawn(random, precision_of(random, FEWEST - 1))) is None
+    assert step_test(drawn(random, precision_of(random, MIN_BLOCKS - 1))) is None
     silent = drawn(random, precision_of(random, 10))
     assert step_test(silent._replace(precision=0.0 * silent.precision, vector=0.0 * silent.vector)) is None
 
@@ -263,3 +263,9 @@ def test_what_is_believed_of_slope_and_walk_keeps_the_false_alarms_and_finds_mor
             free += size > 0.0 and judged(own._replace(slope=np.inf, walk=np.inf)).chance < 0.05
     assert binom.sf(false - 1, draws, 0.05) > 1e-3
     assert result > 1.3 * free
+
+
+def test_numbers_that_cannot_be_computed_with_show_no_step() -> None:
+    precision = np.eye(20)
+    precision[3, 3] = np.inf
+    assert step_test(Information(np.arange(20.0), precision, np.zeros(20), slope=1.0, walk=1.0)) is None

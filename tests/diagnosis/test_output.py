@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.severity import Severity
-from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
+
+from ..refusals import refusal
+from ..wording import says
 
 jsonschema = pytest.importorskip("jsonschema")
 DOCS = Path(__file__).parents[2] / "docs"
@@ -94,13 +96,13 @@ def test_a_part_analysed_is_told(leaky: Recording) -> None:
     assert codes["gaps_bridged"].count == 1
     assert codes["missing"].channel == "p_A"
     assert result.share < 0.984
-    assert f"this rests on {100 * result.share:.3g} % of the recording" in result.reason
+    assert says(result.reason, "doubt.share", percent=100 * result.share)
     check(result)
 
 
 @pytest.mark.parametrize("probability", [0.0, -0.1, 1e-5, 0.21, 1.0, math.nan, math.inf])
 def test_a_probability_no_threshold_can_be_set_for(probability: float, healthy: Recording) -> None:
-    with pytest.raises(InputError, match=r"^false-alarm probability must be 0\.0001 to 0\.2, got "):
+    with refusal("0.0001", "0.2"):
         diagnose(healthy, false_alarm_probability=probability)
 
 

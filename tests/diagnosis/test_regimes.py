@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.balance import recorded_blocks
+from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.inference.terms import find_rests
+from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
@@ -21,25 +26,41 @@ RIG = load_rig("thesis")
 RATE, AREA, DISPLACEMENT = 100.0, 633e-6, 4.9e-6 / (2.0 * np.pi)
 PUMP, STORED, LOAD = 4e-13, 1.7e-13, 8e6
 CYCLE = 12.0
+#: Loads through a cycle, over `LOAD`; the fourth and fifth while it rests.
+LOADS = (-0.05, 0.05, 0.1, 1.0, 1.0, -0.05, -0.05)
 
 
-def press(seed: int, leak: float = 0.0, since: float = 0.0, shut: bool = True, seconds: float = 96.0) -> Recording:
+@cache
+def press(
+    seed: int,
+    leak: float = 0.0,
+    since: float = 0.0,
+    shut: bool = True,
+    seconds: float = 96.0,
+    start: float = 0.0,
+    pump: float = PUMP,
+    servo: bool = False,
+    loads: tuple[float, ...] = LOADS,
+    speed_noise: float = 0.01,
+) -> Recording:
     """Record a press that moves out and loads, holds with the pump at rest, and comes back.
 
-    A dx = D omega dt - S d(p_A - p_B) - (G_pump [moves or open] + G) (p_A - p_B) dt.
+    A dx = D omega dt - S d(p_A - p_B) - (G_pump [moves or open] + G) (p_A - p_B) dt. Before `start` [s] it is off, its
+    valves shut under the load of a hold. A `servo` makes good what leaks, also during a hold.
     """
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds * RATE)) / RATE
-    phase = t % CYCLE
+    phase = np.where(t < start, 6.0, (t - start + (9.0 if start else 0.0)) % CYCLE)
     moves = (phase < 2.5) | (phase > 9.5)
     stroke = np.interp(phase, [0.0, 0.4, 2.1, 2.5, 9.5, 9.9, 11.6, 12.0], [0.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0])
-    force = np.interp(phase, [0.0, 0.4, 1.5, 2.4, 9.6, 10.0, 12.0], [-0.05, 0.05, 0.1, 1.0, 1.0, -0.05, -0.05])
+    force = np.interp(phase, [0.0, 0.4, 1.5, 2.4, 9.6, 10.0, 12.0], loads)
     omega, dp = 60.0 * stroke, LOAD * force * (1.0 + 0.1 * np.sin(0.7 * t))
-    passes = PUMP * (moves if shut else np.ones(t.size)) + leak * (t >= since)
+    passes = pump * (moves if shut else t >= start) + leak * (t >= since)
+    omega += passes * dp * (t >= start) / DISPLACEMENT if servo else 0.0
     rate = DISPLACEMENT * omega - STORED * np.gradient(dp) * RATE - passes * dp
     x = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))]) / (RATE * AREA)
     channels = {
-        "omega": omega + 0.01 * random.standard_normal(t.size),
+        "omega": omega + speed_noise * random.standard_normal(t.size),
         "x": x + 2e-6 * random.standard_normal(t.size),
         "p_A": 5e5 + 0.5 * dp + 2e3 * random.standard_normal(t.size),
         "p_B": 5e5 - 0.5 * dp + 2e3 * random.standard_normal(t.size) + LOAD,
@@ -49,10 +70,17 @@ def press(seed: int, leak: float = 0.0, since: float = 0.0, shut: bool = True, s
 
 
 @cache
-def balance(seed: int, **what: float) -> RecordedBalance:
-    own = VolumeBalance(RIG).balance(press(seed, **what))
-    assert own is not None
-    return own
+def balance(seed: int, odds: float = 0.0, **options: Any) -> RecordedBalance:
+    judged = VolumeBalance(RIG).balance(press(seed, **options), odds)
+    assert judged is not None
+    return judged
+
+
+@cache
+def summaries() -> list[dict[str, Any]]:
+    """Learn four healthy recordings."""
+    learnt = [VolumeBalance(RIG).learn(press(seed)) for seed in range(4)]
+    return [summary for summary in learnt if summary is not None]
 
 
 def test_a_valve_that_shuts_is_told_from_one_that_stays_open() -> None:
@@ -64,10 +92,10 @@ def test_a_valve_that_shuts_is_told_from_one_that_stays_open() -> None:
 
 
 def test_behind_a_shut_valve_the_leak_is_the_pistons_alone() -> None:
-    assert balance(0).level.high < 0.05 * PUMP
-    own = VolumeBalance(RIG).balance(press(0, leak=2e-13), odds=10.0)
-    assert own is not None and own.shut
-    assert own.level.value == pytest.approx(2e-13, rel=0.01)
+    assert balance(0).conductance.high < 0.05 * PUMP
+    own = balance(0, odds=10.0, leak=2e-13)
+    assert own.shut
+    assert own.conductance.value == pytest.approx(2e-13, rel=0.01)
 
 
 @pytest.mark.parametrize("shut", [True, False])
@@ -79,23 +107,76 @@ def test_rests_are_no_step_and_hide_none(shut: bool) -> None:
         assert leaking.onset().low < 50.0 < leaking.onset().high
 
 
+def test_a_machine_that_is_switched_on_does_not_leak_from_then_on() -> None:
+    for seed in range(3):
+        healthy = balance(seed, shut=False, start=20.0).test
+        leaking = balance(seed, shut=False, start=20.0, leak=0.5e-13, since=60.0).test
+        assert healthy is not None and leaking is not None
+        assert healthy.chance > 0.01 and leaking.chance < 1e-4
+        assert leaking.onset().low < 60.0 < leaking.onset().high
+
+
 def test_healthy_recordings_tell_which_it_is_for_a_leaking_one() -> None:
     detector = VolumeBalance(RIG)
-    lessons = [detector.learn(press(seed)) for seed in range(4)]
-    known = [lesson for lesson in lessons if lesson is not None]
-    assert sum(lesson["shut_odds"] for lesson in known) > 4.0
+    odds = sum(summary["shut_odds"] for summary in summaries())
+    assert odds > 4.0
     leaking = press(7, leak=1e-13)
-    own = detector.balance(leaking, sum(lesson["shut_odds"] for lesson in known))
-    assert own is not None and own.shut
+    assert balance(7, odds=odds, leak=1e-13).shut
     healthy = [press(seed) for seed in range(4)]
     assert judge(detector, leaking, healthy).verdict == "leak"
 
 
+def test_a_hold_behind_valves_tells_a_leak_from_a_pump_that_differs_from_day_to_day() -> None:
+    """While the machine is on, a servo holds the load and the pump's leakage is in the balance, at rest too."""
+    detector = VolumeBalance(RIG)
+    healthy = [
+        press(seed, shut=False, start=20.0, pump=pump, servo=True) for seed, pump in enumerate((3e-13, 5e-13, 4e-13))
+    ]
+    summaries = [detector.learn(recording) for recording in healthy]
+    assert all(
+        summary is not None and summary["held_odds"] > INFERENCE.rest.locked > summary["shut_odds"]
+        for summary in summaries
+    )
+    for leak in (0.0, 5e-14):
+        judged = press(7, shut=False, start=20.0, pump=4.4e-13, servo=True, leak=leak)
+        evidence = judge(detector, judged, healthy)
+        assert evidence.verdict == ("leak" if leak else "no leak")
+        assert evidence.cause == ("piston leak" if leak else None)
+
+
+def test_holds_without_a_load_or_with_a_pump_that_makes_good_a_leakage_measure_none() -> None:
+    """Equal pressures show no leak, and a pump that turns slower than its noise keeps up a load."""
+    loaded = balance(0, odds=10.0)
+    unloaded = balance(0, odds=10.0, loads=(-0.5, 0.5, 1.0, 0.01, 0.01, -0.5, -0.5))
+    kept_up = balance(0, odds=10.0, shut=False, servo=True, pump=5e-14, speed_noise=1.0)
+    assert loaded.locked and unloaded.locked and kept_up.locked
+    assert loaded.chambers is not None and unloaded.chambers is None and kept_up.chambers is None
+
+
 @pytest.mark.parametrize("leak", [0.0, 1e-13])
 def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
-    own = VolumeBalance(RIG).balance(press(3, leak=leak), odds=10.0)
-    assert own is not None and own.chambers is not None
+    own = balance(3, odds=10.0, leak=leak)
+    assert own.chambers is not None
     assert own.chambers.leaks.piston == pytest.approx(leak, rel=0.35, abs=2e-15)
+
+
+@pytest.mark.parametrize("leak", [0.0, 2e-14])
+def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
+    healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
+    judged = balance(7, odds=10.0, leak=leak)
+    held, wide = BalanceLeak(VolumeBalance.name, judged, healthy), Rise(leak, 5e-14, np.inf)
+    held.__dict__["_motion_rise"] = wide
+    assert leak * judged.mean_pressure() < held.bound_flow
+    assert held.bound_flow < 0.7 * wide.bound() * judged.mean_pressure()
+
+
+def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
+    healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
+    for leak, since in ((0.0, 0.0), (1e-13, 0.0), (1e-13, 50.0)):
+        judged = balance(7, odds=10.0, leak=leak, since=since)
+        onset = BalanceLeak(VolumeBalance.name, judged, healthy).rise_onset
+        assert (onset is None) == (since == 0.0)
+        assert onset is None or onset.low <= since <= onset.high
 
 
 def test_a_reversal_is_no_rest_and_a_missing_sample_neither() -> None:

@@ -14,8 +14,8 @@ from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.response import Follower
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import cycle
-from sealscope.recordings.cycle import cycle_of
-from sealscope.recordings.recording import Array, Recording, remembered
+from sealscope.recordings.cycle import estimate_period
+from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.simulation.simulate import simulate
 
 from .judging import judge
@@ -38,11 +38,11 @@ def test_asked_once_for_a_recording_a_detector_and_a_rig() -> None:
         load_rig("thesis"),
         load_rig("thesis").with_overrides({"pump.q_b": 5e-6}),
     )
-    assert [remembered(first, ("one", rig), find) for _ in range(3)] == [1, 1, 1]
-    assert remembered(second, ("one", rig), find) == 2
-    assert remembered(first, ("another", rig), find) == 3
+    assert [compute_once(first, ("one", rig), find) for _ in range(3)] == [1, 1, 1]
+    assert compute_once(second, ("one", rig), find) == 2
+    assert compute_once(first, ("another", rig), find) == 3
     assert other is not rig
-    assert remembered(first, ("one", other), find) == 4
+    assert compute_once(first, ("one", other), find) == 4
     assert asked[:3] == [first, second, first]
 
 
@@ -57,9 +57,9 @@ def test_views_share_what_depends_on_the_channels_they_keep() -> None:
 
     view = recording.only(["p_A", "p_B"])
     views = (recording, view, view.only(["p_B", "p_A"]))
-    assert [remembered(one, "pair", find, ("p_A", "p_B")) for one in views] == [1, 1, 1]
-    assert [remembered(one, "all", find) for one in (recording, view, recording)] == [2, 3, 2]
-    assert remembered(recording.between(0.0, 9.0), "pair", find, ("p_A", "p_B")) == 4
+    assert [compute_once(one, "pair", find, ("p_A", "p_B")) for one in views] == [1, 1, 1]
+    assert [compute_once(one, "all", find) for one in (recording, view, recording)] == [2, 3, 2]
+    assert compute_once(recording.between(0.0, 9.0), "pair", find, ("p_A", "p_B")) == 4
     assert asked == [("u", "p_A", "p_B"), ("u", "p_A", "p_B"), ("p_A", "p_B"), ("u", "p_A", "p_B")]
 
 
@@ -67,7 +67,7 @@ def test_a_view_without_a_channel_does_not_share_what_depends_on_it() -> None:
     t = np.arange(4.0)
     recording = Recording(t, {"x": t, "p_A": t}, {"x": "m", "p_A": "Pa"}, 1.0)
     views = (recording, recording.only(["p_A"]))
-    assert [remembered(own, "balance", lambda of: tuple(of.channels), ("x", "p_A")) for own in views] == [
+    assert [compute_once(own, "balance", lambda of: tuple(of.channels), ("x", "p_A")) for own in views] == [
         ("x", "p_A"),
         ("p_A",),
     ]
@@ -80,17 +80,17 @@ def test_the_cycle_is_computed_once_a_diagnosis(monkeypatch: pytest.MonkeyPatch,
     lengths: list[float | None] = []
 
     def counted(signal: Array, rate: float) -> float | None:
-        lengths.append(cycle_of(signal, rate))
+        lengths.append(estimate_period(signal, rate))
         return lengths[-1]
 
-    monkeypatch.setattr(cycle, "cycle_of", counted)
+    monkeypatch.setattr(cycle, "estimate_period", counted)
     diagnose(recording)
     assert lengths == [pytest.approx(np.pi / 2, rel=2e-3)]
 
 
 def test_nothing_is_kept_of_a_recording_that_is_gone() -> None:
     recording = _recording()
-    held = weakref.ref(recording), weakref.ref(remembered(recording, "itself", lambda one: one.only(one.channels)))
+    held = weakref.ref(recording), weakref.ref(compute_once(recording, "itself", lambda one: one.only(one.channels)))
     assert held[1]() is not None
     del recording
     gc.collect()

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.inference.onset import Information, step_test
-from sealscope.diagnosis.inference.pressures.response import (
+from sealscope.diagnosis.inference.onset import WITHIN_95, Information
+from sealscope.diagnosis.inference.pressures.reduced_rig import (
     C_C,
     F_C,
     F_V,
@@ -21,12 +21,12 @@ from sealscope.diagnosis.inference.pressures.response import (
     SIDE,
     G,
     Machine,
-    evidence,
-    priors_of,
-    response,
+    response_priors,
 )
+from sealscope.diagnosis.inference.pressures.response import fit_response, measure_leak
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE
 
 
 def step_of(information: Information, onset: float) -> tuple[float, float]:
@@ -37,7 +37,7 @@ def step_of(information: Information, onset: float) -> tuple[float, float]:
 
 
 THESIS = load_rig("thesis")
-BELIEFS = priors_of(THESIS)
+BELIEFS = response_priors(THESIS)
 RATE, UNITS = 500.0, {"u": "V", "p_A": "Pa", "p_B": "Pa"}
 
 
@@ -49,7 +49,7 @@ def test_steady_sliding_balances_friction_pressure_and_flow(
     theta, sense = BELIEFS.centre.copy(), -1.0 if backward else 1.0
     theta[[G, SIDE, F_V]] = conductance, side, 2e3  # so much that nothing rings by itself
     machine = Machine.from_rig(THESIS, RATE)  # the speed loop settles within 100 s
-    dp = float(np.mean(machine.run(np.full(60_001, sense * volts), theta[None], np.zeros((8, 1)))[0][0, -200:]))
+    dp = float(np.mean(machine.simulate(np.full(60_001, sense * volts), theta[None], np.zeros((8, 1)))[0][0, -200:]))
     m = machine.numbers
     v = (m.q_b / (2.0 * math.pi) * sense * theta[GAIN] * volts - conductance * dp) / m.A_A
     friction = sense * theta[F_C] * (1.0 + (theta[K_BRK] - 1.0) * math.exp(-theta[C_C] * abs(v))) + theta[F_V] * v
@@ -67,11 +67,11 @@ def test_a_path_that_made_the_record_is_followed() -> None:
         theta[F_C] *= 1.0 + 0.02 * (k / blocks - 0.5)
         theta[G] += step * (k >= blocks // 2)
         own = slice(max(k * length - 1, 0), (k + 1) * length)
-        shown, states = machine.run(u[own] if k else np.append(u[0], u[own]), theta[None], states)
+        shown, states = machine.simulate(u[own] if k else np.append(u[0], u[own]), theta[None], states)
         parts.append(shown[0])
     dp = np.concatenate(parts) + np.random.default_rng(3).normal(0.0, 4e3, t.size)
     recording = Recording(t, {"u": u, "p_A": 3e5 + 0.5 * dp, "p_B": 3e5 - 0.5 * dp}, UNITS, RATE)
-    own = response(recording, THESIS)
+    own = fit_response(recording, THESIS)
     assert own is not None
     assert np.sqrt(own.variance) == pytest.approx(4e3, rel=0.03)
     followed = own.theta + own.mean.reshape(blocks, -1) * own.priors.unit
@@ -90,16 +90,16 @@ def test_a_leak_of_a_simulated_rig_is_found_where_it_began_and_its_interval_hold
     leaking: tuple[ss.Recording, float],
 ) -> None:
     recording, lpm = leaking
-    own = evidence(recording, THESIS)
-    test = step_test(own.information)
+    leak = measure_leak(recording, THESIS)
+    test, flow = leak.step, leak.step_flow
     assert test.chance < 1e-3
     assert test.onset().low <= 40.0 <= test.onset().high
-    low, high = own.flow(*test.fitted)[1]
-    assert low <= lpm <= high
+    half = WITHIN_95 * math.hypot(flow.deviation, leak.size_deviation * flow.value)
+    assert flow.value - half <= lpm * LITRE_PER_MINUTE <= flow.value + half
 
 
 def test_information_is_symmetric_and_no_less_than_none(leaking: tuple[ss.Recording, float]) -> None:
-    information = evidence(leaking[0], THESIS).information
+    information = measure_leak(leaking[0], THESIS).information
     precision = information.precision
     np.testing.assert_allclose(precision, precision.T)
     assert np.linalg.eigvalsh(precision)[0] > -1e-6 * np.linalg.eigvalsh(precision)[-1]

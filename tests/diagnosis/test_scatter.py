@@ -8,28 +8,35 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns
-from sealscope.diagnosis.inference.scatter import Mixture, Population, RecordingSums, Rise, conditions_beyond, rise
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
+from sealscope.diagnosis.inference.scatter import (
+    Mixture,
+    Population,
+    RecordingSums,
+    Rise,
+    find_unusual_conditions,
+    rise,
+)
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 
 PRESSURE, FLOW = 1e5, 1e-5
 #: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
-PRIORS = priors("inference")["scatter"]["leak"] * FLOW / PRESSURE
+PRIORS = INFERENCE.scatter.leak * FLOW / PRESSURE
 
 
 def nothing(_: object) -> np.ndarray:
     raise AssertionError("sums are given, no channel is read")
 
 
-COLUMNS = Columns(
+COLUMNS = ColumnRoles(
     Equation(
         "test",
         nothing,
         (
-            Term("oil", "", "", nothing, "air in the oil", "compliance"),
-            Term("bias", "", "", nothing, "sensor fault", "bias"),
-            Term(LEAK, "", "", nothing, "piston or pump leak", "leak"),
+            Term("oil", "", nothing, "air in the oil", "compliance"),
+            Term("bias", "", nothing, "sensor fault", "bias"),
+            Term(LEAK, "", nothing, "piston or pump leak", "leak"),
         ),
     )
 )
@@ -86,11 +93,13 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
 
 
 @pytest.mark.parametrize("draws", [16, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.long])])
-@pytest.mark.parametrize("days", [(1, 1, 1, 2), (1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2)])
+@pytest.mark.parametrize(
+    "days", [(1, 1, 1, 2), pytest.param((1, 1, 2, 2, 3, 3, 3, 4), marks=pytest.mark.slow), (1, 1, 2, 2, 2, 2)]
+)
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
     random = np.random.default_rng(len(days))
-    viscosity = 0.5 * np.log(priors("inference")["oil"]["warmest"]) / np.sqrt(2.0)
+    viscosity = 0.5 * np.log(INFERENCE.oil.warmest) / np.sqrt(2.0)
     chances = []
     for _ in range(draws):
         *healthy, judged = fleet(random, days, viscosity, PRIORS)
@@ -111,7 +120,7 @@ def test_recordings_without_a_date_are_of_one_day() -> None:
 def test_a_known_temperature_of_the_oil_takes_off_what_it_makes_of_the_level() -> None:
     """Twice the leakage in oil that is 17 K warmer is no leak, and as much at the same temperature is."""
     random, level = np.random.default_rng(5), 20.0 * PRIORS
-    twice = np.exp(priors("inference")["oil"]["per_kelvin"] * 17.3)
+    twice = np.exp(INFERENCE.oil.per_kelvin * 17.3)
     healthy = [RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * 1, 40.0) for _ in range(4)]
 
     def risen(day: int, warm: float) -> Rise:
@@ -138,12 +147,12 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
 
 def believed_scatter(random: np.random.Generator) -> float:
     """A machine's scatter, drawn from what is believed of it: any of its decades."""
-    believed = priors("inference")["scatter"]
-    ends = np.log([believed[name] * FLOW / PRESSURE for name in ("finest", "largest")])
+    believed = INFERENCE.scatter
+    ends = np.log([believed.finest * FLOW / PRESSURE, believed.largest * FLOW / PRESSURE])
     return float(np.exp(random.uniform(*ends)))
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 6])
+@pytest.mark.parametrize("count", [1, *(pytest.param(count, marks=pytest.mark.slow) for count in (2, 3)), 6])
 def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) -> None:
     random = np.random.default_rng(count)
     made = [risen(random, count, believed_scatter(random)) for _ in range(80)]
@@ -195,7 +204,7 @@ def machine(random: np.random.Generator, count: int, differs: float) -> Rise:
 
 def test_a_machine_that_repeats_itself_is_judged_closer_and_another_not_falsely() -> None:
     random = np.random.default_rng(7)
-    believed = COLUMNS.between[0]
+    believed = COLUMNS.between_deviation[0]
     same, usual, other = ([machine(random, 8, share * believed) for _ in range(60)] for share in (1e-3, 1.0, 10.0))
     closer, wider = (float(np.median([own.deviation for own in made])) for made in (same, other))
     assert closer < 0.5 * wider
@@ -325,16 +334,65 @@ def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool, draws: int) ->
     assert far > 2.0 * near
 
 
+def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: bool) -> Rise:
+    """The rise beyond six days of unlogged oil, on a day with oil of half the mean viscosity.
+
+    `error`: standard error of the logarithm of a viscous pressure drop; `shows`: it goes with the viscosity.
+    """
+    thinning = [*random.normal(0.0, 0.4, 6), 0.7]
+
+    def day(number: int, thinner: float) -> RecordingSums:
+        level = 20.0 * PRIORS * np.exp(thinner) + (leak if number == 6 else 0.0)
+        drop = -thinner / INFERENCE.oil.per_drop if shows else random.normal(0.0, 0.3)
+        sums = RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * number)
+        return sums._replace(viscous_drop=np.array([drop + error * random.standard_normal(), error]))
+
+    *healthy, judged = (day(number, thinner) for number, thinner in enumerate(thinning))
+    return rise(judged, healthy, (COLUMNS,))
+
+
+def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_logged() -> None:
+    random, leak = np.random.default_rng(12), 20.0 * PRIORS
+    precise, vague, useless = (
+        [oily_days(random, 0.0, error, shows=shows) for _ in range(9)]
+        for error, shows in ((0.02, True), (1.0, True), (0.02, False))
+    )
+    assert np.median([own.chance for own in precise]) > 0.1
+    assert np.median([own.deviation for own in precise]) < 0.5 * np.median([own.deviation for own in vague])
+    assert sum(own.chance < 0.0075 for own in (*vague, *useless)) <= 1
+    found, doubted = (
+        np.median([oily_days(random, leak, error, shows=True).chance for _ in range(9)]) for error in (0.02, 1.0)
+    )
+    assert found < 0.01 and found < 0.2 * doubted
+
+
 def test_conditions_that_no_healthy_recording_had_are_named() -> None:
     random = np.random.default_rng(10)
     own = RecordingSums.from_blocks(recording(random, 20.0 * PRIORS), (COLUMNS,), DAY, 40.0)
     healthy = [own, own._replace(oil_degC=46.0, pressure=1.1 * PRESSURE)]
-    assert not conditions_beyond(own, healthy)
-    warmer = conditions_beyond(own._replace(oil_degC=60.0, pressure=1.87 * PRESSURE), healthy)
+    assert not find_unusual_conditions(own, healthy)
+    warmer = find_unusual_conditions(own._replace(oil_degC=60.0, pressure=1.87 * PRESSURE), healthy)
     assert [(of.name, of.low, of.high) for of in warmer] == [
         ("load", PRESSURE, pytest.approx(1.1 * PRESSURE)),
         ("oil", 40.0, 46.0),
     ]
-    assert warmer[0].excess == pytest.approx(np.log(1.7))
+    assert warmer[0].log_excess == pytest.approx(np.log(1.7))
     loaded = own._replace(pressure=1.87 * PRESSURE)
     assert rise(loaded, healthy, (COLUMNS,)).deviation > rise(own, healthy, (COLUMNS,)).deviation
+
+
+def test_a_rise_that_is_expected_within_a_factor_is_one_over_its_logarithm() -> None:
+    """The likelihood is averaged over the log-normal prior of the rise, by quadrature elsewhere."""
+    shown = Rise(3.0, 0.05, 12.0)
+    levels = np.exp(np.log(2.0) + 0.5 * np.linspace(-6.0, 6.0, 60_001))
+    prior = np.exp(-0.5 * (np.log(levels / 2.0) / 0.5) ** 2) / (0.5 * levels * np.sqrt(2.0 * np.pi))
+    ratios = np.exp([shown.log_ratio(level) for level in levels[::20]])
+    expected = np.log(np.trapezoid(ratios * prior[::20], levels[::20]))
+    assert shown.log_ratio(2.0, log_deviation=0.5) == pytest.approx(expected, abs=0.1)
+    assert shown.log_ratio(0.02, log_deviation=0.5) < shown.log_ratio(2.0, log_deviation=0.5) - 20.0
+
+
+def test_a_rise_of_infinite_freedom_is_normal() -> None:
+    """Infinity times zero was no number, and no explanation had a probability."""
+    assert Rise(3.0, 1.0, np.inf).log_ratio(3.0) == pytest.approx(4.5)
+    assert Rise(3.0, 1.0, 1e9).log_ratio(3.0) == pytest.approx(4.5, rel=1e-6)

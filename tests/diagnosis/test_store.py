@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.circuit.store import lost_oil
+from sealscope.diagnosis.inference.circuit.store import oil_loss_tests
 from sealscope.diagnosis.inference.terms import Signals
 from sealscope.parameters import Rig, load_rig
 from sealscope.units import P_ATM
@@ -35,7 +35,7 @@ def signals(rig: Rig, lost: float) -> Signals:
 def test_what_is_lost_is_known_to_some_thousandths_of_a_litre(rig: Rig) -> None:
     """The size of a step at its onset is what was lost, over the pressure that drove it."""
     lost = 0.01 / 6e4
-    test = lost_oil(signals(rig, lost), rig, CYCLE, 0.0)["external leak A"]
+    test = oil_loss_tests(signals(rig, lost), rig, CYCLE, 0.0)["external leak A"]
     assert test.chance < 0.01
     assert abs(test.onset().value - 60.0) < 8.0
     at = int(np.abs(test.onsets - 60.0).argmin())
@@ -44,9 +44,9 @@ def test_what_is_lost_is_known_to_some_thousandths_of_a_litre(rig: Rig) -> None:
 
 
 def test_what_stays_in_the_circuit_is_not_lost(rig: Rig) -> None:
-    for test in lost_oil(signals(rig, 0.0), rig, CYCLE, 0.0).values():
+    for test in oil_loss_tests(signals(rig, 0.0), rig, CYCLE, 0.0).values():
         assert test.chance > 0.01
 
 
 def test_without_an_accumulator_nothing_is_told(rig: Rig) -> None:
-    assert lost_oil(signals(rig, 1e-7), load_rig("thesis"), CYCLE, 0.0) == {}
+    assert oil_loss_tests(signals(rig, 1e-7), load_rig("thesis"), CYCLE, 0.0) == {}

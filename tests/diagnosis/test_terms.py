@@ -11,16 +11,18 @@ import pytest
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.balance import BlockStream, blocks_of, commanded
-from sealscope.diagnosis.inference.blocks import information, zero_of
+from sealscope.diagnosis.inference.balance import BlockStream, derive_drive_signals, recorded_blocks
+from sealscope.diagnosis.inference.blocks import estimate_offset, information
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.terms import equations
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
+
+from ..wording import says
 
 RATE, DURATION, ONSET = 200.0, 60.0, 30.0
 LEAK = 5e-12
@@ -36,9 +38,10 @@ def recording(channels: Mapping[str, Array]) -> Recording:
 
 def step_of(channels: Mapping[str, Array], rig: Rig) -> StepTest:
     """Return the test of a step of the leak."""
-    made = blocks_of(recording(channels), rig)
+    made = recorded_blocks(recording(channels), rig)
     assert made is not None
-    blocks, _, columns = made
+    regime = made.regime(made.odds)
+    blocks, columns = regime.blocks, regime.columns
     test = step_test(information(blocks, columns, columns[0].leak))
     assert test is not None
     return test
@@ -111,13 +114,14 @@ def test_connections_change_nothing(rig: Rig, leaking: dict[str, Array]) -> None
 def test_the_zero_of_a_pressure_changes_neither_leak_nor_chance(rig: Rig, leaking: dict[str, Array]) -> None:
     """p_A reads too much by one prior width: the leak is the same, and its flow's change tells the zero."""
     read = {name: leaking[name] for name in ("x", "p_A", "p_B", "theta")}
-    width = priors("inference")["zero"]["pressure"]
+    width = INFERENCE.zero.pressure
     shifted = {**read, "p_A": read["p_A"] + width}
     assert step_of(shifted, rig).fitted[0] == pytest.approx(LEAK, rel=0.05)
-    blocks, _, columns = blocks_of(recording(shifted), rig) or pytest.fail("no blocks")
-    assert zero_of(blocks, columns) == pytest.approx(width, rel=0.1)
+    regime = (recorded_blocks(recording(shifted), rig) or pytest.fail("no blocks")).open
+    blocks, columns = regime.blocks, regime.columns
+    assert estimate_offset(blocks, columns) == pytest.approx(width, rel=0.1)
     mean = np.abs(np.diff([leaking["p_B"], leaking["p_A"]], axis=0)).mean()
-    assert blocks.driving(zero_of(blocks, columns)).mean() == pytest.approx(mean, rel=0.05)
+    assert blocks.mean_pressure(estimate_offset(blocks, columns)).mean() == pytest.approx(mean, rel=0.05)
 
 
 @pytest.mark.parametrize("loaded", [False, True])
@@ -125,7 +129,7 @@ def test_a_missing_command_is_held_and_its_speed_is_missing(rig: Rig, leaking: d
     read = {name: leaking[name] for name in ("u", "x", "p_A", "p_B")}
     holed, held = read["u"].copy(), read["u"].copy()
     holed[1000:1010], held[1000:1010] = np.nan, held[999]
-    speed, oracle = (commanded({**read, "u": u}, rig, RATE, loaded=loaded)["omega"] for u in (holed, held))
+    speed, oracle = (derive_drive_signals({**read, "u": u}, rig, RATE, loaded=loaded)["omega"] for u in (holed, held))
     assert np.isnan(speed[1000:1010]).all()
     rest = np.delete(np.arange(len(holed)), slice(1000, 1010))
     np.testing.assert_allclose(speed[rest], oracle[rest], rtol=1e-12)
@@ -168,7 +172,7 @@ def test_port_pressures_that_are_the_chambers_leave_the_leak_whole(rig: Rig, lea
 def test_a_stream_is_oriented_as_the_recording_is(rig: Rig, leaking: dict[str, Array]) -> None:
     """Pieces of any size give the same blocks, from a command and with the encoder's sense unknown."""
     read = {"u": -leaking["u"], "x": leaking["x"], "p_A": leaking["p_A"], "p_B": leaking["p_B"]}
-    balances, read = equations(rig, frozenset(read)), commanded(read, rig, RATE)
+    balances, read = equations(rig, frozenset(read)), derive_drive_signals(read, rig, RATE)
     whole = BlockStream(balances, RATE).push(read, last=True)
     stream, parts = BlockStream(balances, RATE), []
     for piece in np.array_split(np.arange(len(read["u"])), 7):
@@ -200,7 +204,7 @@ def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: 
     assert diagnosis.verdict == "leak"
     low, high = diagnosis.leak_interval_lpm or pytest.fail("no interval")
     assert low <= 0.05 <= high
-    assert ("p_A - p_B reads" in diagnosis.reason) and (("too much" in diagnosis.reason) == (bar > 0.0))
+    assert says(diagnosis.reason, "remark.zero too high" if bar > 0.0 else "remark.zero too low")
 
 
 @pytest.mark.parametrize("samples", [-2, 0, 2])

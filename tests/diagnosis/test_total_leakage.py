@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, total_leakage
@@ -98,7 +98,7 @@ def test_only_what_is_known_to_be_healthy_becomes_a_baseline() -> None:
             "lpm", "interval_lpm", "pressure_Pa", "findable_lpm", "healthy_lpm", "pump_share", "findable_share"
         }  # fmt: skip
         assert total_leakage(diagnosis) is not None
-        assert "pump and piston together" in diagnosis_text(diagnosis)
+        assert " ".join(total_leakage(diagnosis).split()) in " ".join(diagnosis_text(diagnosis).split())
 
 
 def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
@@ -108,7 +108,14 @@ def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
     assert evidence.verdict == "cannot tell"
 
 
-@pytest.mark.parametrize(("command", "load"), [("5 sin(2t)", "0 N"), ("5 sin(2t)", "-3000 N"), ("3 sin(4t)", "2000 N")])
+@pytest.mark.parametrize(
+    ("command", "load"),
+    [
+        pytest.param("5 sin(2t)", "0 N", marks=pytest.mark.slow),
+        ("5 sin(2t)", "-3000 N"),
+        pytest.param("3 sin(4t)", "2000 N", marks=pytest.mark.slow),
+    ],
+)
 def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load: str) -> None:
     """An angle has no zero of the flow: what drifts over a cycle is what pump and piston pass together."""
     own = load_rig("single-rod-eha")
@@ -131,6 +138,6 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
 def test_a_size_alone_says_nothing_of_what_a_healthy_pump_leaks(stated: dict[str, str]) -> None:
     """The pump of another rig is none of this machine's: with a size alone a worn or a large pump was a leak."""
     pump_leaks = machine(1, G=20 * PUMP)
-    result = diagnose(pump_leaks, rig=unstated().with_overrides(stated))
+    result = diagnose(pump_leaks, rig=unstated_rig().with_overrides(stated))
     assert result.verdict == "no leak" and result.total_leakage.healthy_lpm is None
     assert diagnose(pump_leaks, rig="thesis").verdict == "leak"

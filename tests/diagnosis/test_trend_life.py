@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.trend.reading import LeakReading, reading_of
+from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.recordings.recording import Recording
@@ -53,7 +53,7 @@ def simulated(day: int) -> Recording:
 
 @pytest.fixture(scope="module")
 def readings() -> list[LeakReading]:
-    return [reading_of(simulated(day), "thesis", f"day_{day}.csv") for day in range(90)]
+    return [estimate_reading(simulated(day), "thesis", f"day_{day}.csv") for day in range(90)]
 
 
 def day_of(trend: Trend, episode: int) -> float:
@@ -96,12 +96,13 @@ def test_without_the_temperature_the_summer_looks_like_wear(readings: list[LeakR
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real strokes are not beside this checkout")
-@pytest.mark.parametrize("session", ["act_1_healthy", "act_4_seal_defect"])
+@pytest.mark.parametrize("session", [pytest.param("act_1_healthy", marks=pytest.mark.slow), "act_4_seal_defect"])
 def test_real_strokes_of_a_specimen_raise_no_alarm(session: str) -> None:
     """Thirty strokes in seven minutes: counts and no command, so the ringing alone, which never says `leak`."""
     files = sorted((REAL / session).glob("*.txt"))
     strokes = [ss.read(file, rate=1000.0, map={"p_A": "PG_1", "p_B": "PG_2"}) for file in files]
-    trend = trend_of([reading_of(own, file=file.name) for own, file in zip(strokes, files, strict=True)], healthy=5)
+    readings = [estimate_reading(own, file=file.name) for own, file in zip(strokes, files, strict=True)]
+    trend = trend_of(readings, healthy=5)
     assert trend.basis == "ringing" and trend.verdict == "cannot tell" and trend.alarm is None
     assert len(trend.rows) >= 28 and trend.unit == "%"
     assert "The damping of the pressures" in render_trend_page(trend) or "ringing" in render_trend_page(trend)

@@ -135,6 +135,7 @@ def test_a_leak_worth_finding_is_two_percent_of_the_pumps_flow_however_long_the_
     assert evidence.verdict == "no leak"
 
 
+@pytest.mark.slow
 def test_under_a_weight_that_is_held_a_leak_inside_is_none_to_the_outside() -> None:
     """What swings alone showed a steady flow of 0.02 L/min to the outside beside it: `no leak` for 14 of 96 leaks."""
     drawn = draw("load", 100, rig="thesis-closed-loop", duration=120.0, family="resting, loop closed")
@@ -241,7 +242,7 @@ def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:
     assert low < 0.03 < high
 
 
-@pytest.mark.parametrize("side", ["A", "B"])
+@pytest.mark.parametrize("side", ["A", pytest.param("B", marks=pytest.mark.slow)])
 def test_a_rod_seal_of_either_side_is_no_piston_leak_where_check_valves_make_up(side: str) -> None:
     fault = f"rod seal {side} 0.05 L/min from 20 s"
     recording = ss.simulate(rig="thesis-closed-loop", command="3 sin(4t)", duration="40 s", seed=1, fault=fault)

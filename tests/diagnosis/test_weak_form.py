@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import spherical_jn
 
-from sealscope.diagnosis.inference.rows.weak_form import SPAN, STRIDE, rows, stride_samples
+from sealscope.diagnosis.inference.rows.weak_form import SPAN, STRIDE, stride_samples, weak_form_rows
 
 RATES = (80.0, 160.0, 320.0, 640.0)  # whole samples a stride
 
@@ -30,8 +30,8 @@ def product_row(a: float, b: float, time: np.ndarray, rate: float) -> np.ndarray
 def product_rows(a: float, b: float, rate: float, start: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     t = start + np.arange(round(6.0 * rate)) / rate
     f, g = np.sin(a * t), np.sin(b * t)
-    made = rows([0.5 * (f[1:] + f[:-1]) * np.diff(g)], rate, start)
-    return made.time, made.values[:, 0]
+    made = weak_form_rows([0.5 * (f[1:] + f[:-1]) * np.diff(g)], rate)
+    return start + made.time, made.values[:, 0]
 
 
 @pytest.mark.parametrize(("a", "b"), [(3.0, 2.0), (1.0, 9.0), (12.0, 4.0), (5.0, 5.0)])
@@ -55,7 +55,7 @@ def test_any_rate_serves(rate: float) -> None:
 @pytest.mark.parametrize("rate", [50.0, 97.0, 500.0])
 def test_a_constant_rate_is_itself(rate: float) -> None:
     t = np.arange(400) / rate
-    assert rows([np.diff(4.0 - 3.0 * t)], rate).values == pytest.approx(-3.0, rel=1e-12)
+    assert weak_form_rows([np.diff(4.0 - 3.0 * t)], rate).values == pytest.approx(-3.0, rel=1e-12)
 
 
 def test_noise_of_a_channel_weighs_as_the_derivative_of_the_test_function() -> None:
@@ -63,7 +63,7 @@ def test_noise_of_a_channel_weighs_as_the_derivative_of_the_test_function() -> N
     random = np.random.default_rng(0)
     for rate in (160.0, 640.0):
         noise = random.standard_normal(round(1500.0 * rate))
-        made = rows([np.diff(noise)], rate).values[:, 0]
+        made = weak_form_rows([np.diff(noise)], rate).values[:, 0]
         s = np.linspace(-1.0, 1.0, 20001)
         slope = -8.0 * s * (1.0 - s * s) ** 3 * 315.0 / 256.0
         expected = np.trapezoid(slope**2, s) / half_width(rate) ** 3 / rate
@@ -76,7 +76,7 @@ def test_a_missing_sample_costs_the_rows_that_rest_on_it_and_no_other() -> None:
     g = np.sin(3.0 * t)
     lost = g.copy()
     lost[at] = np.nan
-    whole, gap = rows([np.diff(g), np.diff(t)], rate), rows([np.diff(lost), np.diff(t)], rate)
+    whole, gap = weak_form_rows([np.diff(g), np.diff(t)], rate), weak_form_rows([np.diff(lost), np.diff(t)], rate)
     h = half_width(rate)
     # of the sample the increments on either side are lost, and with them the pieces of a stride that they lie in
     touched = np.abs(whole.time - t[at]) < h + STRIDE
@@ -88,5 +88,5 @@ def test_a_missing_sample_costs_the_rows_that_rest_on_it_and_no_other() -> None:
 
 @pytest.mark.parametrize(("strides", "count"), [(SPAN - 1, 0), (SPAN, 1), (SPAN + 5, 6)])
 def test_rows_fit_into_the_samples(strides: int, count: int) -> None:
-    made = rows([np.ones(strides * stride_samples(100.0))], 100.0)
+    made = weak_form_rows([np.ones(strides * stride_samples(100.0))], 100.0)
     assert made.values.shape == (count, 1) and len(made.time) == len(made.whole) == count

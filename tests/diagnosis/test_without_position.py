@@ -62,7 +62,7 @@ def test_what_is_left_over_a_cycle_is_what_leaks(
     """Whatever side carries the load, and whichever way the shaft is counted."""
     balance = VolumeBalance(RIG).balance(balanced(stroke, side * load, G, wiring=wiring))
     assert balance is not None
-    assert balance.level.value == pytest.approx(G, rel=0.02)
+    assert balance.conductance.value == pytest.approx(G, rel=0.02)
 
 
 @pytest.mark.parametrize("swing", [0.0, 6e5])
@@ -166,8 +166,8 @@ def test_what_a_held_load_loses_shows_by_how_it_gives_way(G: float) -> None:
     assert detector.usable(recording) is None
     balance = detector.balance(recording)
     assert balance is not None
-    assert balance.level.low <= G <= balance.level.high
-    assert (balance.level.high - balance.level.low) * 5e6 < 0.005 * LITRE_PER_MINUTE
+    assert balance.conductance.low <= G <= balance.conductance.high
+    assert (balance.conductance.high - balance.conductance.low) * 5e6 < 0.005 * LITRE_PER_MINUTE
     assert judge(detector, recording).verdict != "leak"
 
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sealscope.evaluation.binomial import (
-    at_least,
     clopper_pearson,
     holm,
     lower_bound,
     proportion,
     sign_test,
+    upper_tail,
 )
 
 # Newcombe, Statistics in Medicine 17 (1998) 857-872, table I: k, n, exact (Clopper-Pearson), 95 %
@@ -77,7 +77,7 @@ def test_twenty_nine_of_twenty_nine_show_ninety_at_ninety_five():
 def test_a_tail_is_a_sum(kn, p):
     k, n = kn[0] % 31, min(kn[1], 30)
     k = min(k, n)
-    assert at_least(k, n, p) == pytest.approx(sum(pmf(n, p)[k:]), rel=1e-9)
+    assert upper_tail(k, n, p) == pytest.approx(sum(pmf(n, p)[k:]), rel=1e-9)
 
 
 @settings(deadline=None)

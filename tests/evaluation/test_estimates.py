@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sealscope.evaluation.estimates import estimate_errors, mean_of, order_ranks, quantile_of
+from sealscope.evaluation.estimates import estimate_errors, estimate_mean, estimate_quantile, order_ranks
 from sealscope.evaluation.table import events_per_hour, poisson_interval
 
 # Garwood, Biometrika 28 (1936) 437-442, as in Pearson and Hartley, Biometrika Tables for Statisticians, table 40: 95 %
@@ -69,18 +69,18 @@ def test_the_ranks_hold_their_confidence_and_no_closer_ones_do(n, order, confide
 
 
 def test_quantiles_bear_values_that_were_never_reached():
-    result = quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.5)
+    result = estimate_quantile([3.0, 1.0, math.inf, 2.0, math.inf], 0.5)
     assert result.value == 3.0
-    assert quantile_of([3.0, 1.0, math.inf, 2.0, math.inf], 0.9).value == math.inf
+    assert estimate_quantile([3.0, 1.0, math.inf, 2.0, math.inf], 0.9).value == math.inf
     assert (result.low, result.high) == (-math.inf, math.inf)
-    many = quantile_of(np.arange(1.0, 51.0), 0.5)
+    many = estimate_quantile(np.arange(1.0, 51.0), 0.5)
     assert (many.value, many.low, many.high) == (25.0, 18.0, 33.0)
 
 
 @settings(deadline=None)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0.05, 0.95))
 def test_a_quantile_follows_its_values(values, order):
-    result, turned = quantile_of(values, order), quantile_of([2 * v + 1 for v in values], order)
+    result, turned = estimate_quantile(values, order), estimate_quantile([2 * v + 1 for v in values], order)
     assert turned.value == 2 * result.value + 1
     assert result.low <= result.value <= result.high
     assert np.mean(np.array(values) <= result.value) >= order - 1e-9
@@ -88,16 +88,16 @@ def test_a_quantile_follows_its_values(values, order):
 
 def test_the_quantile_s_interval_covers():
     rng = np.random.default_rng(2)
-    result = [quantile_of(rng.exponential(size=40), 0.9, 0.9) for _ in range(400)]
+    result = [estimate_quantile(rng.exponential(size=40), 0.9, 0.9) for _ in range(400)]
     assert np.mean([one.low <= math.log(10) <= one.high for one in result]) >= 0.88
 
 
 def test_student_s_sleep():
     """Student, Biometrika 6 (1908) 1-25: hours gained by ten patients, mean 1.58; 95 % interval 0.70 to 2.46."""
-    result = mean_of([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
+    result = estimate_mean([1.2, 2.4, 1.3, 1.3, 0.0, 1.0, 1.8, 0.8, 4.6, 1.4])
     assert (result.value, result.low, result.high) == pytest.approx((1.58, 0.70, 2.46), abs=5e-3)
-    assert (mean_of([2.0]).low, mean_of([2.0]).high) == (-math.inf, math.inf)
-    assert math.isnan(mean_of([]).value)
+    assert (estimate_mean([2.0]).low, estimate_mean([2.0]).high) == (-math.inf, math.inf)
+    assert math.isnan(estimate_mean([]).value)
 
 
 def test_errors_of_an_estimate_by_hand():

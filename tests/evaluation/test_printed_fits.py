@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from sealscope.evaluation.pod import by_size, fit_hit_miss, proven_size
+from sealscope.evaluation.pod import detection_by_size, fit_hit_miss, proven_size
 
 # doses, subjects at each, subjects that responded. SAS/STAT User's Guide, PROBIT procedure, example "Dosage Levels"
 SAS_DOSE = ([1.0, 2, 3, 4, 5, 6, 7], [10, 12, 10, 10, 12, 10, 10], [1, 2, 4, 5, 8, 8, 10])
@@ -86,5 +86,5 @@ def test_twenty_nine_of_twenty_nine():
     """The rule of the inspection standards: 29 finds of 29, 45 of 46 or 59 of 61 show 90 % with 95 % confidence, and
     one trial less does not (Rummel, Mater. Eval. 40 (1982) 922-932)."""
     for result, tested in ((29, 29), (45, 46), (59, 61)):
-        assert proven_size(by_size(*trials([1.0], [tested], [result]))) == 1.0
-        assert proven_size(by_size(*trials([1.0], [tested - 1], [result - 1]))) == math.inf
+        assert proven_size(detection_by_size(*trials([1.0], [tested], [result]))) == 1.0
+        assert proven_size(detection_by_size(*trials([1.0], [tested - 1], [result - 1]))) == math.inf

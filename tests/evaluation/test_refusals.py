@@ -7,8 +7,8 @@ import math
 import pytest
 
 from sealscope.errors import InputError
-from sealscope.evaluation.binomial import at_least, clopper_pearson, holm, sign_test
-from sealscope.evaluation.estimates import estimate_errors, quantile_of
+from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test, upper_tail
+from sealscope.evaluation.estimates import estimate_errors, estimate_quantile
 from sealscope.evaluation.pod import fit_hit_miss
 from sealscope.evaluation.roc import auc, roc_curve
 from sealscope.evaluation.table import CANNOT_TELL, confusion_matrix, events_per_hour, poisson_interval
@@ -19,8 +19,9 @@ from sealscope.evaluation.thresholds import quantile_threshold, records_needed
     ("call", "given"),
     [
         (clopper_pearson, (5, 4)), (clopper_pearson, (-1, 4)), (clopper_pearson, (1, 4, 95.0)),
-        (clopper_pearson, (0, 0)), (at_least, (1, 4, 1.5)), (holm, ([0.1, math.nan],)), (sign_test, (-1, 4)),
-        (poisson_interval, (-1,)), (events_per_hour, (1, 0.0)), (quantile_of, ([], 0.5)), (quantile_of, ([1.0], 1.0)),
+        (clopper_pearson, (0, 0)), (upper_tail, (1, 4, 1.5)), (holm, ([0.1, math.nan],)), (sign_test, (-1, 4)),
+        (poisson_interval, (-1,)), (events_per_hour, (1, 0.0)), (estimate_quantile, ([], 0.5)),
+        (estimate_quantile, ([1.0], 1.0)),
         (estimate_errors, ([1.0], [1.0, 2.0])), (estimate_errors, ([math.nan], [1.0])),
         (fit_hit_miss, ([0.0, 1.0], [0, 1])), (fit_hit_miss, ([1.0, 2.0], [1, 1])), (fit_hit_miss, ([1, 1], [0, 1])),
         (fit_hit_miss, ([1.0, 2.0], [0, 0.5])), (fit_hit_miss, ([1.0, 2.0], [0])),

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.fmu.build import PLATFORMS, compiler, this_platform
-from sealscope.simulation.commands import recorded
+from sealscope.fmu.build import PLATFORMS, find_compiler, this_platform
+from sealscope.simulation.commands import sampled_signal
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
 
 pytestmark = pytest.mark.slow
 fmpy = pytest.importorskip("fmpy", reason="FMPy runs the units: pip install 'sealscope[fmu]'")
@@ -114,13 +114,13 @@ def test_a_unit_runs_as_simulate_does(rig, folder):
     extended = np.r_[t, t[-1] + 1.0], np.r_[u, u[-1]]
     same = Experiment.of(
         rig=rig,
-        command=recorded(*extended),
+        command=sampled_signal(*extended),
         leak="G = 6.1e-13 from 20 s",
         duration=seconds,
         rate=1 / span,
         step=STEPS.get(rig.name, 2.5e-4),
     )
-    path_ = trajectory(same, same.leaks)
+    path_ = integrate_run(same, same.leaks)
     every = round(span * round((path_.t.size - 1) / path_.t[-1]))
     theirs = np.stack([path_[name][::every][: t.size - 1] for name in CHANNELS], axis=1)
     worst = np.abs(ours - theirs).max(axis=0)
@@ -180,7 +180,7 @@ def test_a_tuned_parameter_is_the_parameter_of_the_rig(folder):
     same = Experiment.of(
         set={"F_v": 900.0, "q_b": 6e-6, "cylinder.V": 3e-4}, command="step 3 at 0 s", duration=1.1, step=5e-4, rate=1000
     )
-    theirs = trajectory(same, ())
+    theirs = integrate_run(same, ())
     row = int(np.argmin(np.abs(theirs.t - 1.0)))
     expected = [theirs[name][row] for name in ("p_A", "x", "theta")]
     assert ours == pytest.approx(expected, rel=1e-6)
@@ -301,7 +301,9 @@ def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, f
 
 
 @pytest.mark.long
-@pytest.mark.skipif(not compiler()[1], reason="other systems need the compiler of pip install 'sealscope[fmu]'")
+@pytest.mark.skipif(
+    not find_compiler().cross_compiles, reason="other systems need the compiler of pip install 'sealscope[fmu]'"
+)
 @pytest.mark.parametrize("write", [partial(ss.write_fmu, step=5e-4), ss.write_sensor_fmu])
 def test_units_are_built_for_other_systems(write, folder):
     import zipfile

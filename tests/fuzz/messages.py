@@ -16,8 +16,8 @@ import cbor2
 import numpy as np
 
 from sealscope.monitor.settings import ActuatorSettings
-from sealscope.monitor.sources.message_limits import DEEPEST, FLOAT_ARRAYS, MessageLimit, check_cbor
-from sealscope.monitor.sources.source_block import UNFORESEEN, RefusedMessage, decoded
+from sealscope.monitor.sources.message_limits import FLOAT_ARRAYS, MAX_DEPTH, MessageLimit, check_cbor
+from sealscope.monitor.sources.source_block import UNFORESEEN, RefusedMessage, decode_message
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import (
     BIRTH_SEQUENCE,
@@ -28,7 +28,7 @@ from sealscope.monitor.sparkplug import (
     UINT64,
     SparkplugMetric,
     SparkplugPayload,
-    encoded,
+    encode_payload,
 )
 
 from .mutations import change_tree, changed_bytes
@@ -83,7 +83,7 @@ def messages(folder: Path) -> Use:
 
         def work() -> None:
             try:
-                decoded(message, draw.choice((None, "press 1")))
+                decode_message(message, draw.choice((None, "press 1")))
             except RefusedMessage as error:
                 _refused(error)
 
@@ -146,7 +146,7 @@ def item(draw: random.Random, depth: int = 0) -> bytes:
 
 def _check_plain(value: Any, depth: int = 0) -> None:
     """Assert that a decoder made of a message nothing but what a message may hold."""
-    assert depth <= DEEPEST
+    assert depth <= MAX_DEPTH
     if isinstance(value, dict):
         assert all(type(key) is str for key in value)
         for own in value.values():
@@ -181,7 +181,7 @@ def cbor(folder: Path) -> Use:
 
         def work() -> None:
             try:
-                decoded(message, draw.choice((None, "press 1")))
+                decode_message(message, draw.choice((None, "press 1")))
             except RefusedMessage as error:
                 _refused(error)
 
@@ -221,7 +221,7 @@ def sparkplug(folder: Path) -> Use:
     def use(draw: random.Random) -> bool:
         metrics = tuple(metric(draw) for _ in range(draw.choice((0, 1, 1, 2, 5))))
         payload = SparkplugPayload(draw.choice((None, 1, 2**63)), metrics, draw.choice((None, 0, 1, 255, 256, 2**40)))
-        whole = encoded(payload)
+        whole = encode_payload(payload)
         message = changed_bytes(whole, draw) if whole and draw.random() < 0.3 else whole
         kind = draw.choice(KINDS)
         place = draw.choice(

@@ -21,28 +21,28 @@ from typing import Any
 import numpy as np
 
 import sealscope
-from sealscope.campaigns.cases.case import CampaignCase, cases_of
-from sealscope.campaigns.cases.recordings import recorded_rows
+from sealscope.campaigns.cases.case import CampaignCase, list_cases
+from sealscope.campaigns.cases.recordings import judge_recordings
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.execution.run import run
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.reader import load_plan, plan_names
-from sealscope.campaigns.results import simulated_result, write_result
+from sealscope.campaigns.results import judge_simulated_campaign, write_result
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.errors import SealscopeError
 from sealscope.parameters import load_rig, parse_overrides, rig_names
 from sealscope.recordings import split_map_option
-from sealscope.recordings.formats.columns import Label, Wanted, check_call, choose_columns
+from sealscope.recordings.formats.columns import Label, Request, check_request, choose_columns
 from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.leaks import parse_leak
-from sealscope.storage.plain_state import array_of, plain_array
-from sealscope.storage.plain_values import as_type
-from sealscope.storage.rows import LOCK, ROWS, read_rows, stored
+from sealscope.storage.plain_state import plain_array, restore_array
+from sealscope.storage.plain_values import convert_type
+from sealscope.storage.rows import LOCK, ROWS, read_rows, store_rows
 from sealscope.thesis.engine.build import ItemRow
 from sealscope.thesis.engine.products import Claim, Figure, Number, ThesisTable
 from sealscope.units import parse_quantity, parse_unit
@@ -117,15 +117,15 @@ def _fault(text: str) -> None:
     fault = parse_fault(text)
     if fault is not None:
         with np.errstate(all="ignore"):
-            fault.commanded(parse_command("3 sin(4t)")).volts(T)
+            fault.change_command(parse_command("3 sin(4t)")).volts(T)
         fault.effects(load_rig("thesis"))
         str(fault)
 
 
 def _columns(text: str) -> None:
     channel, column = split_map_option(text)
-    check_call({channel: column}, None)
-    choose_columns([Label.parse(text) for text in LABELS], Wanted({channel: column}, 500.0))
+    check_request({channel: column}, None)
+    choose_columns([Label.parse(text) for text in LABELS], Request({channel: column}, 500.0))
 
 
 def _experiment(key: str, text: str) -> None:
@@ -195,7 +195,7 @@ _NAN = re.compile(r"\b(nan|inf)\b", re.IGNORECASE)
 
 
 def altered(taught: bytes, draw: random.Random) -> tuple[bytes, dict[str, str]]:
-    """A file of lessons with one of them changed, and the checksums that changed: those before and after."""
+    """A file of healthy summaries with one of them changed, and the checksums that changed: those before and after."""
     head, *rows = taught.splitlines(keepends=True)
     at = draw.randrange(len(rows))
     before, _, data = rows[at].strip().partition(b" ")
@@ -207,7 +207,7 @@ def altered(taught: bytes, draw: random.Random) -> tuple[bytes, dict[str, str]]:
             value for value, _ in nodes({"": tree}) if isinstance(value, dict) and value.keys() == {"shape", "f8"}
         ]
         place = draw.choice(arrays)
-        values = array_of(place, "drawn").ravel().copy()
+        values = restore_array(place, "drawn").ravel().copy()
         chosen = slice(None) if draw.random() < 0.5 else draw.randrange(len(values))
         values[chosen] = (
             draw.choice((0.0, -1.0, 1e300, 1e99, np.nan, np.inf, 1e-300))
@@ -224,9 +224,9 @@ def altered(taught: bytes, draw: random.Random) -> tuple[bytes, dict[str, str]]:
 def machines(folder: Path) -> Use:
     """Files of a commissioned machine, changed, or links to folders and pipes; one that is taken judges a recording.
 
-    Its lessons are changed in their bytes, or in their values with the right checksums.
+    Its summaries are changed in their bytes, or in their values with the right checksums.
     """
-    healthy, path, lessons = folder / "healthy", folder / "given.toml", folder / "given.lessons"
+    healthy, path, summaries = folder / "healthy", folder / "given.toml", folder / "given.healthy"
     healthy.mkdir()
     for seed in (1, 2, 3):
         sealscope.write(sealscope.simulate(duration="6 s", seed=seed), healthy / f"run{seed}.nc")
@@ -234,7 +234,7 @@ def machines(folder: Path) -> Use:
     alarms = (JudgedAlarm("press 1-1", "valid", 1.7e9, 1.69e9, 0.002), JudgedAlarm("press 1-2", "invalid", 1e9, 1e9))
     bare = replace(whole, rig=None, channel_map={"p_A": "PG_1[bar]"}, alarms=alarms)
     texts = [sealscope.write_machine(own, folder / "whole.toml").read_text() for own in (whole, bare)]
-    judged, taught = sealscope.simulate(duration="6 s", seed=4), (folder / "whole.lessons").read_bytes()
+    judged, taught = sealscope.simulate(duration="6 s", seed=4), (folder / "whole.healthy").read_bytes()
 
     def read() -> None:
         machine = sealscope.read_machine(path)
@@ -245,7 +245,7 @@ def machines(folder: Path) -> Use:
 
     def use(draw: random.Random) -> bool:
         path.unlink(missing_ok=True)
-        lessons.write_bytes(taught)
+        summaries.write_bytes(taught)
         match draw.randrange(20):
             case 0:
                 path.symlink_to(draw.choice((healthy, path)))
@@ -257,7 +257,7 @@ def machines(folder: Path) -> Use:
                     data, checksums = (
                         (changed_bytes(taught, draw), {}) if draw.random() < 0.2 else altered(taught, draw)
                     )
-                    lessons.write_bytes(data)
+                    summaries.write_bytes(data)
                     for before, after in checksums.items():
                         text = text.replace(before, after)
                 path.write_bytes(changed_toml(text, draw) if draw.random() < 0.6 else text.encode())
@@ -290,10 +290,10 @@ def plans(folder: Path) -> Use:
     def read(path: Path) -> None:
         plan = load_plan(path)
         if isinstance(plan, SimulatedPlan) and plan.size <= 3000:
-            store.made_from(plan)
-            cases_of(plan)
+            store.collect_row_inputs(plan)
+            list_cases(plan)
         if isinstance(plan, RecordedPlan):
-            taken(lambda: recorded_rows(plan, empty))
+            taken(lambda: judge_recordings(plan, empty))
 
     return _toml([place.read_text() for place in places], read, folder)
 
@@ -331,7 +331,7 @@ def campaigns(folder: Path) -> Use:
     plan = load_plan(plan_file)
     assert isinstance(plan, SimulatedPlan)
     assert run(plan, whole, jobs=1).failed == 0
-    write_result(simulated_result(plan, whole), whole)
+    write_result(judge_simulated_campaign(plan, whole), whole)
     outside.mkdir()
     (outside / "diary.txt").write_text("kept\n")
     names = [ROWS, ROWS, ROWS, store.HEAD, LOCK]
@@ -361,9 +361,9 @@ def campaigns(folder: Path) -> Use:
                 path.write_bytes(b"\n".join(lines) + b"\n" * (draw.random() < 0.9))
 
     def work() -> None:
-        store.progress_of(plan, given)
+        store.read_progress(plan, given)
         run(plan, given, jobs=1, task=_unmade)
-        result = simulated_result(plan, given)
+        result = judge_simulated_campaign(plan, given)
         write_result(result, given)
         campaign_text(result)
         write_campaign_page(result, given / PAGE, [])
@@ -391,7 +391,7 @@ def _products() -> tuple[Any, ...]:
 def kept(folder: Path) -> Use:
     """The rows of a reproduction, changed in their bytes or in their structure."""
     row = ItemRow("fig-1", "k", _products(), ("figures/a.svg",))
-    list(stored(folder, (of for of in [row]), "a reproduction"))
+    list(store_rows(folder, (of for of in [row]), "a reproduction"))
     path = folder / ROWS
     whole = path.read_bytes()
 
@@ -402,7 +402,7 @@ def kept(folder: Path) -> Use:
             tree = json.loads(whole)
             change_tree(tree, draw)
             path.write_text(json.dumps(tree) + "\n")
-        return taken(lambda: read_rows(folder, lambda tree: as_type(ItemRow, tree), "a reproduction", json.loads))
+        return taken(lambda: read_rows(folder, lambda tree: convert_type(ItemRow, tree), "a reproduction", json.loads))
 
     return use
 

@@ -17,10 +17,10 @@ FEW = {
     "machines": 40,
     "profiles": 120,
     "plans": 60,
-    "campaign folders": 15,
+    "campaign folders": 8,
     "kept files": 60,
 }
-FEW |= {"machines": 25, "monitor messages": 400, "CBOR messages": 2500, "Sparkplug messages": 400}
+FEW |= {"machines": 12, "monitor messages": 200, "CBOR messages": 1500, "Sparkplug messages": 300}
 MANY = {
     "options": 6000,
     "rigs": 2000,

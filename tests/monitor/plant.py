@@ -9,7 +9,6 @@ import random
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from sealscope.recordings import write
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step
+from ..waiting import until
 
 Rows = dict[str, list[tuple[Any, ...]]]
 SETTINGS = """
@@ -137,14 +137,6 @@ def write_files(folder: Path, recording: Recording, seconds: float, began: float
         write(part.only(CHANNELS), file)
         at = began + float(part.t[-1])
         os.utime(file, (at, at))
-
-
-def until(true: Callable[[], object], seconds: float = 120.0) -> None:
-    """Wait until something is true."""
-    deadline = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < deadline, "it did not come true"
-        time.sleep(0.02)
 
 
 def kill_often(settings: MonitorSettings, lines: Path, kills: int, seed: int) -> int:

@@ -20,11 +20,11 @@ from sealscope.monitor.alarms import MARKS, AlarmJudge
 from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.events import EventLines
 from sealscope.monitor.settings import WatchSettings
-from sealscope.storage.plain_state import restored
+from sealscope.storage.plain_state import restore
 
 SETTINGS = WatchSettings(warning_lpm=0.002, error_lpm=0.01, debounce_blocks=2, return_share=0.5)
 LEAK = WatchedLeak(
-    10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 1e-15, "step", "pump leak", "it rises", 50.0, 28.0
+    10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), 1e-13, 5e-13, 1e-15, 1e5, "step", "pump leak", "it rises", 50.0, 28.0
 )
 
 
@@ -35,7 +35,7 @@ def through(
     happened = []
     for number, lpm in enumerate(flows):
         interval = None if lpm is None else (lpm, lpm)
-        change = judge.take(
+        change = judge.update(
             BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, settings
         )
         if change is not None and change[1]:
@@ -48,7 +48,7 @@ def test_one_block_is_no_alarm_two_are():
     assert through(judge, [0.003, 0.001, 0.003, 0.001]) == []
     assert through(judge, [0.003, 0.003]) == ["raised"]
     assert judge.alarm is not None
-    assert (judge.alarm.level, judge.alarm.plain()["diagnostic_number"]) == ("warning", 4101)
+    assert (judge.alarm.level, judge.alarm.as_dict()["diagnostic_number"]) == ("warning", 4101)
     assert "case drain" in judge.alarm.next_check
 
 
@@ -58,7 +58,7 @@ def test_stronger_evidence_is_rarer_by_chance():
     def chance(test: str, score: float) -> float:
         leak = replace(LEAK, test=test, score=score, threshold=4.0)
         block, judge = BlockEstimate(1, 3.0, "alarm"), AlarmJudge("a")
-        alarm, _ = judge.take(block, leak, 1, WatchSettings(false_alarms_per_1000_h=2.0, debounce_blocks=1))
+        alarm, _ = judge.update(block, leak, 1, WatchSettings(false_alarms_per_1000_h=2.0, debounce_blocks=1))
         return alarm.by_chance_per_1000_h
 
     assert chance("step", 4.0) == chance("level", 4.0) == 2.0
@@ -74,14 +74,14 @@ def test_it_returns_well_below_its_threshold():
     assert through(judge, [0.0009]) == ["returned"]
     assert judge.alarm is not None and (judge.alarm.state, judge.alarm.active) == ("new", False)
     assert judge.alarm.status_word == 4
-    assert judge.marked("acknowledged", 100.0).state == "closed"
+    assert judge.apply_mark("acknowledged", 100.0).state == "closed"
     assert judge.alarm is None
 
 
 def test_what_rises_again_before_anybody_saw_it_is_the_same_alarm():
     judge = AlarmJudge("a")
     through(judge, [0.003] * 2)
-    judge.marked("shelved", 3.0, until=1e4)
+    judge.apply_mark("shelved", 3.0, until=1e4)
     assert through(judge, [0.0] * 2 + [0.003] * 2) == ["returned", "raised"]
     assert judge.alarm is not None
     assert (judge.alarm.id, judge.alarm.active, judge.alarm.shelved, judge.raised) == ("a-1", True, True, 1)
@@ -91,21 +91,21 @@ def test_a_clock_that_is_set_back_shelves_no_longer():
     judge = AlarmJudge("a")
     block = BlockEstimate(1, 1e6, "alarm", 0.003, None, 0.003, None)
     for _ in range(2):
-        judge.take(block, LEAK, 1, SETTINGS)
-    judge.marked("shelved", 1e6, until=1e6 + 3600.0)
-    shelved = [judge.take(replace(block, t=t), LEAK, 1, SETTINGS)[0].shelved for t in (100.0, 3600.0, 3800.0)]
+        judge.update(block, LEAK, 1, SETTINGS)
+    judge.apply_mark("shelved", 1e6, until=1e6 + 3600.0)
+    shelved = [judge.update(replace(block, t=t), LEAK, 1, SETTINGS)[0].shelved for t in (100.0, 3600.0, 3800.0)]
     assert shelved == [True, True, False]
 
 
 def test_an_error_must_be_seen_again_and_becomes_a_warning_below():
     judge = AlarmJudge("a")
     through(judge, [0.003] * 2)
-    assert judge.marked("acknowledged", 5.0).state == "acknowledged"
+    assert judge.apply_mark("acknowledged", 5.0).state == "acknowledged"
     assert through(judge, [0.02] * 2) == ["error"]
     assert judge.alarm is not None
     assert (judge.alarm.state, judge.alarm.status_word) == ("new", 6)
     assert through(judge, [0.004] * 2) == ["warning"]
-    judge.marked("acknowledged", 50.0)
+    judge.apply_mark("acknowledged", 50.0)
     assert through(judge, [0.0] * 2) == ["returned"]
     assert judge.alarm is None
 
@@ -128,16 +128,16 @@ def test_without_litres_a_leak_is_a_warning():
 def test_a_valid_alarm_stays_so_until_its_cause_is_over_or_repaired():
     judge = AlarmJudge("a")
     through(judge, [0.003] * 2)
-    assert (judge.marked("valid", 5.0).state, judge.alarm.active) == ("valid", True)
+    assert (judge.apply_mark("valid", 5.0).state, judge.alarm.active) == ("valid", True)
     with pytest.raises(InputError):
-        judge.marked("acknowledged", 6.0)
+        judge.apply_mark("acknowledged", 6.0)
     assert through(judge, [0.02] * 2) == ["error"]
-    assert (judge.alarm.state, judge.alarm.plain()["machine_state"]["name"]) == ("valid", "failure")
-    repaired = judge.marked("repaired", 20.0)
+    assert (judge.alarm.state, judge.alarm.as_dict()["machine_state"]["name"]) == ("valid", "failure")
+    repaired = judge.apply_mark("repaired", 20.0)
     assert (repaired.state, repaired.mark, repaired.status_word, judge.alarm) == ("closed", "repaired", 0, None)
     assert judge.over_s == 20.0
     through(judge, [0.003] * 2)
-    judge.marked("valid", 30.0)
+    judge.apply_mark("valid", 30.0)
     assert through(judge, [0.0] * 20, None) == []  # the detector began anew, and says nothing of the leak
     assert through(judge, [0.0] * 2) == ["returned"]
     assert (judge.alarm, judge.raised) == (None, 2)
@@ -148,12 +148,12 @@ def test_an_invalid_alarm_has_a_reason():
     through(judge, [0.003] * 2)
     for reason in ("", "  "):
         with pytest.raises(InputError):
-            judge.marked("invalid", 5.0, reason=reason)
+            judge.apply_mark("invalid", 5.0, reason=reason)
     assert judge.alarm.state == "new"
-    invalid = judge.marked("invalid", 5.0, reason="the bypass was open")
+    invalid = judge.apply_mark("invalid", 5.0, reason="the bypass was open")
     assert (invalid.state, invalid.mark, invalid.reason) == ("invalid", "invalid", "the bypass was open")
     assert (invalid.active, judge.alarm) == (False, None)
-    assert invalid.plain()["machine_state"]["name"] == "good"
+    assert invalid.as_dict()["machine_state"]["name"] == "good"
 
 
 @settings(max_examples=40, deadline=None)
@@ -161,14 +161,14 @@ def test_an_invalid_alarm_has_a_reason():
 def test_its_state_is_plain_and_what_is_over_is_gone(steps: list[tuple[float, str]]):
     judge, over = AlarmJudge("a"), 0
     for lpm, mark in steps:
-        again = restored(AlarmJudge, json.loads(json.dumps(judge.state())), "alarm")
+        again = restore(AlarmJudge, json.loads(json.dumps(judge.state())), "alarm")
         assert again == judge
         through(judge, [lpm])
         if judge.alarm is not None and mark:
             with suppress(InputError):
-                over += judge.marked(mark, 1.0, reason="why").over
+                over += judge.apply_mark(mark, 1.0, reason="why").is_over
     assert judge.raised >= over
-    assert judge.alarm is None or not judge.alarm.over
+    assert judge.alarm is None or not judge.alarm.is_over
 
 
 def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
@@ -180,12 +180,12 @@ def test_a_shelved_alarm_keeps_its_changes_to_itself(tmp_path: Path):
         rows = StoredRows()
         rows.add_alarm(judge.alarm, kind, judge.alarm.updated_s)
         with store.writing() as connection:
-            store.keep_rows(connection, rows)
-        lines.pass_on()
+            store.write_rows(connection, rows)
+        lines.deliver()
 
     through(judge, [0.003] * 2)
     kept("raised")
-    judge.marked("shelved", 3.0, until=100.0)
+    judge.apply_mark("shelved", 3.0, until=100.0)
     kept("shelved")
     assert judge.alarm is not None and judge.alarm.status_word == 1
     assert through(judge, [0.02] * 2) == ["error"]

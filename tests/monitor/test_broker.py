@@ -62,10 +62,10 @@ def test_what_comes_while_the_monitor_is_away_is_stored_once(undisturbed, broker
     retained = subscribe.simple("sealscope/press 1/alarm", hostname="127.0.0.1", port=broker.port)
     alarm = json.loads(retained.payload)
     assert (alarm["id"], alarm["state"]) == ("press 1-1", "new")
-    for name, summary in second.service.plain().items():
+    for name, summary in second.service.summaries().items():
         message = subscribe.simple(f"sealscope/{name}/state", hostname="127.0.0.1", port=broker.port)
         assert json.loads(message.payload) == summary["state"]
-    assert alarm["machine_state"] == second.service.plain()["press 1"]["state"]
+    assert alarm["machine_state"] == second.service.summaries()["press 1"]["state"]
 
 
 def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, settings: MonitorSettings):
@@ -83,7 +83,7 @@ def test_a_broker_that_restarts_loses_nothing(undisturbed, broker: Broker, setti
     running.end()
     assert rows_of(running.service.settings.database) == undisturbed
     assert set(running.service.actuators.counters) <= {"blocks stored already"}
-    reached, number, seconds = running.service.supervisor.totals()["broker"]
+    reached, number, seconds = running.service.supervisor.outage_totals()["broker"]
     assert reached
     assert 1 <= number <= len(range(0, len(lines), 30))  # fewer, where it was back before it was tried again
     assert seconds > 0.2 * number
@@ -116,7 +116,7 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
 ):
     """A locked database stops the storing for longer than the broker would wait for a client that is silent."""
     monkeypatch.setattr("sealscope.monitor.mqtt_client.KEEP_ALIVE_S", 2)
-    monkeypatch.setattr("sealscope.monitor.service._WAITING", 8)
+    monkeypatch.setattr("sealscope.monitor.service._QUEUE_BLOCKS", 8)
     lines = LINES.splitlines()
     kept(broker)
     running = Running(settings)
@@ -131,9 +131,9 @@ def test_while_the_database_is_away_the_connection_stays_and_the_broker_keeps_th
         publish.multiple(flood, hostname="127.0.0.1", port=broker.port, protocol=MQTTProtocolVersion.MQTTv5)
         until(lambda: counters.counters.get(dropped, 0) > 1000 and running.service.supervisor.outages())
         time.sleep(4.0)  # over what the broker would wait for
-        assert running.service.waits()[0] >= 8  # and those at hand
+        assert running.service.queue_load().n_blocks >= 8  # and those at hand
         assert [outage["part"] for outage in running.service.supervisor.outages()] == ["database"]
-        assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
+        assert running.service.supervisor.outage_totals()["broker"][:2] == (True, 0)
     finally:
         lock.execute("rollback")
         lock.close()
@@ -147,8 +147,8 @@ def test_a_broker_that_sends_more_than_agreed_is_asked_again(
     undisturbed, broker: Broker, settings: MonitorSettings, monkeypatch
 ):
     """The room is less than what the broker is asked for at a time."""
-    monkeypatch.setattr("sealscope.monitor.sources.broker._ASSURED_ROOM", 20)
-    monkeypatch.setattr("sealscope.monitor.service._WAITING", 1)
+    monkeypatch.setattr("sealscope.monitor.sources.broker._MAX_QOS1_QUEUE", 20)
+    monkeypatch.setattr("sealscope.monitor.service._QUEUE_BLOCKS", 1)
     lines = LINES.splitlines()
     running = Running(settings)
     time.sleep(0.5)
@@ -162,7 +162,7 @@ def test_a_broker_that_sends_more_than_agreed_is_asked_again(
     running.end()
     assert rows_of(settings.database) == undisturbed
     assert running.service.actuators.counters["messages of QoS 1 that found no room and were asked for again"] > 20
-    assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
+    assert running.service.supervisor.outage_totals()["broker"][:2] == (True, 0)
 
 
 def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker, settings: MonitorSettings):
@@ -191,7 +191,7 @@ def test_forged_messages_over_the_broker_are_counted(undisturbed, broker: Broker
     until(lambda: sum(running.service.actuators.counters.values()) >= sum(sent.values()))
     running.end()
     assert running.service.actuators.counters == dict(sent)
-    assert running.service.supervisor.totals()["broker"][:2] == (True, 0)
+    assert running.service.supervisor.outage_totals()["broker"][:2] == (True, 0)
     assert rows_of(settings.database) == undisturbed
 
 

@@ -92,7 +92,7 @@ def test_tls_user_and_password_open_the_broker_and_nothing_less(undisturbed, gua
         assert outage["reason"].startswith(reason)
         assert refused.service.actuators.counters == {}
     let_in = running("open")
-    until(lambda: let_in.service.supervisor.totals().get("broker", (False,))[0])
+    until(lambda: let_in.service.supervisor.outage_totals().get("broker", (False,))[0])
     entry = {
         "hostname": "127.0.0.1",
         "port": guarded.port,

@@ -19,7 +19,7 @@ import cbor2
 import numpy as np
 import pytest
 
-from sealscope.cli.app import arguments_of
+from sealscope.cli.app import normalise_arguments
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings
@@ -29,14 +29,15 @@ from sealscope.monitor.sources.source_block import (
     UNREADABLE_FILE,
     RefusedMessage,
     SourceBlock,
-    decoded,
+    decode_message,
 )
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
-from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, INT64, SparkplugMetric, SparkplugPayload, encoded
+from sealscope.monitor.sparkplug import BIRTH_SEQUENCE, INT64, SparkplugMetric, SparkplugPayload, encode_payload
 from sealscope.monitor.supervisor import PartAway
 from sealscope.recordings import write
 
 from ..recordings.test_packed_files import rows, workbook
+from ..refusals import refusal
 from .plant import CHANNELS, Running, by_broker, served, settings_in, until
 from .servers import MOSQUITTO, Broker
 from .test_broker import send
@@ -54,25 +55,25 @@ def nested(key: str, depth: int) -> bytes:
 def test_a_deep_message_is_refused_whatever_its_depth(key):
     for depth in (100, 500, 990, 1000, 1020, 2000):
         with pytest.raises(RefusedMessage) as raised:
-            decoded(nested(key, depth))
+            decode_message(nested(key, depth))
         assert raised.value.reason in REASONS
         deep: object = 1
         for _ in range(min(depth, 300)):
             deep = [deep]
         with pytest.raises(RefusedMessage):
-            decoded(cbor2.dumps({key: deep, "rate": 50, "t": 0.0}))
+            decode_message(cbor2.dumps({key: deep, "rate": 50, "t": 0.0}))
 
 
 def test_a_death_whose_number_is_an_array_is_stale():
     host = SparkplugHost([ActuatorSettings(name="a", sparkplug="g/n", rate=50.0)], lambda *_: None, lambda _: None)
     birth = SparkplugPayload(1, (SparkplugMetric(BIRTH_SEQUENCE, 3, INT64),), 0)
-    assert host.receive("spBv1.0/g/NBIRTH/n", encoded(birth)) is None
+    assert host.receive("spBv1.0/g/NBIRTH/n", encode_payload(birth)) is None
     for value in (np.arange(3.0), np.empty(0), np.array([3.0])):
         death = SparkplugPayload(1, (SparkplugMetric(BIRTH_SEQUENCE, value, 31),), None)
         with pytest.raises(RefusedMessage) as raised:
-            host.receive("spBv1.0/g/NDEATH/n", encoded(death))
+            host.receive("spBv1.0/g/NDEATH/n", encode_payload(death))
         assert raised.value.reason == STALE_DEATH
-    assert host.receive("spBv1.0/g/NDEATH/n", encoded(birth)) is None
+    assert host.receive("spBv1.0/g/NDEATH/n", encode_payload(birth)) is None
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
@@ -104,7 +105,7 @@ def test_a_message_that_cannot_be_decoded_is_acknowledged_and_kept(tmp_path: Pat
         finally:
             first.end()
         again = Running(settings)
-        until(lambda: again.service.supervisor.totals().get("broker", (False,))[0])
+        until(lambda: again.service.supervisor.outage_totals().get("broker", (False,))[0])
         time.sleep(0.5)
         again.end()
         assert again.service.actuators.counters == {}
@@ -149,7 +150,7 @@ def test_a_file_that_cannot_be_read_is_named_once_and_not_read_again(tmp_path: P
             raise {"b1.csv": MemoryError(), "b2.csv": RuntimeError("the reader crashed")}[path.name]
         return HEALTHY
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_by_map", read)
     settings = settings_in(tmp_path, folder_settings(tmp_path, "press 3"))
     for name in ("b1.csv", "b2.csv", "c.csv"):
         (tmp_path / "press 3" / name).write_text(name)
@@ -178,14 +179,14 @@ def test_a_file_that_fails_is_read_twice_at_most(tmp_path: Path, monkeypatch):
         reads.append(path)
         raise MemoryError
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_by_map", read)
     (tmp_path / "a.csv").write_text("a")
     blocks = watched_folder(tmp_path, 0.05)
-    deadline, handed = time.monotonic() + 20.0, []
-    while not handed and time.monotonic() < deadline:
-        handed = blocks()
-    refused, block = handed
-    assert isinstance(refused, RefusedMessage) and isinstance(block, SourceBlock) and block.samples is None
+    handed: list[SourceBlock | RefusedMessage] = []
+    until(lambda: handed.extend(blocks()) or handed)
+    refused, empty = handed
+    assert isinstance(refused, RefusedMessage)
+    assert isinstance(empty, SourceBlock) and empty.samples is None
     assert len(reads) == 2
 
 
@@ -278,9 +279,9 @@ def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Ser
     server = OddServer((answer, 0.0))
     part = watched.supervisor.part("webhook")
     hook = Webhook(watched.store, server.url, timeout=2.0)
-    assert not part.attempt(hook.pass_on)
+    assert not part.attempt(hook.deliver)
     assert [outage["part"] for outage in watched.supervisor.outages()] == ["webhook"]
-    assert part.attempt(hook.pass_on, at_once=True)
+    assert part.attempt(hook.deliver, at_once=True)
     assert watched.supervisor.outages() == []
     assert watched.store.position("webhook") == watched.store.events_since(0)[-1][0]
     assert server.got == 2
@@ -288,8 +289,8 @@ def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Ser
 
 def test_a_webhook_that_drips_has_one_deadline(watched: Service):
     server = OddServer(DRIP)
-    with pytest.raises(PartAway, match=r"no answer within 0.4 s"):
-        Webhook(watched.store, server.url, timeout=0.4).pass_on()
+    with refusal("0.4 s", error=PartAway):
+        Webhook(watched.store, server.url, timeout=0.4).deliver()
     assert watched.store.position("webhook") == 0
 
 
@@ -335,7 +336,7 @@ def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path:
     from sealscope.monitor.outputs.events import EventLines
     from sealscope.monitor.supervisor import PartAway
 
-    watched.store.keep_position("lines", 0)
+    watched.store.write_position("lines", 0)
     write_, room = os.write, [20, 0, 0, 10**6]
 
     def narrow(file: int, data: bytes) -> int:
@@ -348,8 +349,8 @@ def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path:
         lines = EventLines(watched.store, stream)
         for _ in range(2):
             with pytest.raises(PartAway, match="No space left"):
-                lines.pass_on()
-        lines.pass_on()
+                lines.deliver()
+        lines.deliver()
     written = (tmp_path / "lines").read_text().splitlines()
     assert [json.loads(line) for line in written] == [event for _, event in watched.store.events_since(0)]
 
@@ -358,8 +359,8 @@ def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path:
     "words",
     ["-v monitor m.toml", "monitor -v m.toml", "monitor m.toml -v", "monitor run m.toml -v", "-v monitor run m.toml"],
 )
-def test_v_stands_anywhere(words):
-    assert arguments_of(words.split()) == ["-v", "monitor", "run", "m.toml"]
+def test_the_flag_v_may_stand_anywhere_in_a_call_of_the_monitor(words):
+    assert normalise_arguments(words.split()) == ["-v", "monitor", "run", "m.toml"]
 
 
 @pytest.mark.slow
@@ -420,7 +421,9 @@ def test_a_broker_that_speaks_no_mqtt_is_tried_again(tmp_path: Path, monkeypatch
         until(lambda: len(connections) >= 2, 20.0)
         assert running.thread.is_alive()
         assert (
-            running.service.supervisor.totals()["broker"][1] + running.service.supervisor.totals()["MQTT client"][1] > 0
+            running.service.supervisor.outage_totals()["broker"][1]
+            + running.service.supervisor.outage_totals()["MQTT client"][1]
+            > 0
         )
     finally:
         running.end()
@@ -443,6 +446,6 @@ def test_a_workbook_and_a_bomb_that_end_their_reader_are_named_once(tmp_path: Pa
     def read(*_: object, **__: object) -> None:
         raise AssertionError("it is read again")
 
-    monkeypatch.setattr("sealscope.monitor.sources.folder.read_of_machine", read)
+    monkeypatch.setattr("sealscope.monitor.sources.folder.read_by_map", read)
     again, _ = served(settings)
     assert again.actuators.counters == {} and len(blocks_of(again)) == 4

@@ -24,9 +24,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from sealscope.monitor.service import Service
-from sealscope.monitor.sources.message_limits import MOST_SAMPLES
+from sealscope.monitor.sources.message_limits import MAX_SAMPLES
 from sealscope.monitor.sources.source_block import (
-    LARGEST,
+    MAX_MESSAGE_BYTES,
     NO_CLOCK,
     NO_MAPPING,
     NO_SAMPLES,
@@ -120,8 +120,8 @@ class HostileWire:
 
     def _large(self, number: int) -> tuple[str, bytes]:
         if number % 2:
-            return OVERSIZED, b" " * (LARGEST + 1)
-        return OVERSIZED, json.dumps({**BRIEF, "x": [0] * (MOST_SAMPLES + 1)}).encode()
+            return OVERSIZED, b" " * (MAX_MESSAGE_BYTES + 1)
+        return OVERSIZED, json.dumps({**BRIEF, "x": [0] * (MAX_SAMPLES + 1)}).encode()
 
     def _hostile(self, number: int) -> tuple[str, bytes]:
         kind = self._random.integers(8)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.database.store import MonitorStore
-from sealscope.monitor.page.live import MOST_ACTUATORS, MOST_SAMPLES, LiveSamples, machine_of
+from sealscope.monitor.page.live import MAX_ACTUATORS, MAX_SAMPLES, LiveSamples, describe_rig
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import ActuatorSettings, PageSettings
 from sealscope.recordings.recording import Recording
@@ -42,47 +42,47 @@ SENT = moving(12.0)
 
 def pictured(*blocks: Recording, **options: str) -> dict[str, object]:
     live = LiveSamples()
-    with live.looked_at("press"):
+    with live.viewing("press"):
         for block in blocks:
-            live.take("press", block)
-        picture = live.picture("press", **options)
+            live.push("press", block)
+        picture = live.curves("press", **options)
     json.dumps(picture, allow_nan=False)
     return picture
 
 
 def test_nothing_is_kept_of_what_nobody_looks_at_and_little_of_what_somebody_does():
     live = LiveSamples(lambda name: [SENT])
-    live.take("press", SENT)
+    live.push("press", SENT)
     assert live.version("press") == 0
-    with live.looked_at("press") as first, live.looked_at("press"):
+    with live.viewing("press") as first, live.viewing("press"):
         assert first and live.version("press") == 1  # what is stored is there at once
-        live.take("another", SENT)
+        live.push("another", SENT)
         assert live.version("another") == 0
         fast = Recording(
-            100.0 + np.arange(10 * MOST_SAMPLES) / 1e5, {"p_A": np.ones(10 * MOST_SAMPLES)}, {"p_A": "Pa"}, 1e5
+            100.0 + np.arange(10 * MAX_SAMPLES) / 1e5, {"p_A": np.ones(10 * MAX_SAMPLES)}, {"p_A": "Pa"}, 1e5
         )
-        live.take("press", fast)
-        picture = live.picture("press")
+        live.push("press", fast)
+        picture = live.curves("press")
         assert picture["t"] == fast.t[-1] and len(picture["pressures"]["t"]) <= 800
-        assert picture["pressures"]["t"][0] == pytest.approx(-MOST_SAMPLES / 1e5, abs=1e-4)
-    assert not live.watched
-    watched = [live.looked_at(f"press {k}") for k in range(MOST_ACTUATORS + 1)]
-    assert [each.__enter__() for each in watched] == [True] * MOST_ACTUATORS + [False]
+        assert picture["pressures"]["t"][0] == pytest.approx(-MAX_SAMPLES / 1e5, abs=1e-4)
+    assert not live.viewed
+    watched = [live.viewing(f"press {k}") for k in range(MAX_ACTUATORS + 1)]
+    assert [each.__enter__() for each in watched] == [True] * MAX_ACTUATORS + [False]
     for each in watched:
         each.__exit__(None, None, None)
-    assert not live.watched
+    assert not live.viewed
 
 
 def test_what_is_stored_never_takes_the_place_of_what_comes_meanwhile():
     newer, stored = moving(2.0, start=100.0, x=None), moving(2.0)
 
     def recall(name: str) -> list[Recording]:
-        live.take(name, newer)
+        live.push(name, newer)
         return [stored]
 
     live = LiveSamples(recall)
-    with live.looked_at("press"):
-        assert live.picture("press")["t"] == newer.t[-1]
+    with live.viewing("press"):
+        assert live.curves("press")["t"] == newer.t[-1]
 
 
 @settings(deadline=None, max_examples=8)
@@ -112,7 +112,7 @@ def test_the_picture_is_that_of_the_samples():
     np.testing.assert_allclose(shown["t"], SENT.t[windows.ends - 1] - SENT.t[-1], atol=1e-4)
     for level in range(4):
         np.testing.assert_allclose(np.array(shown[f"d{level + 1}"]) * 1e3, windows.rms[level], atol=0.06)
-    details = pictured(SENT, drawn="details")["details"]
+    details = pictured(SENT, detail_form="details")["details"]
     assert max(details["d4"]) == pytest.approx(DetailStream().update(SENT["p_A"])[3, 225:].max() / 1e3, abs=1e-2)
 
 
@@ -130,10 +130,10 @@ def test_what_is_missing_is_said_and_a_hole_begins_anew():
 
 
 def test_flows_are_those_of_the_rig():
-    machine = machine_of("thesis")
+    machine = describe_rig("thesis")
     assert (machine["rods"], machine["stroke"], machine["valve"]) == ("AB", pytest.approx(600.0), False)
     assert machine["area"] * 100.0 == pytest.approx(633e-6 * 0.1 * 6e4)  # L/min at 100 mm/s
-    assert machine_of("servo-valve")["valve"]
+    assert describe_rig("servo-valve")["valve"]
 
 
 @pytest.fixture
@@ -156,8 +156,8 @@ def test_samples_go_to_who_looks_and_to_nobody_else(page: tuple[PageServer, Live
         assert (answer.status, "error" in json.loads(answer.read())) == (status, True)
     browser.request("GET", "/api/changes?actuator=press%20%3C1%3E&pressure=p_B")
     lines = browser.getresponse()
-    until(lambda: live.watched)
-    live.take("press <1>", SENT)
+    until(lambda: live.viewed)
+    live.push("press <1>", SENT)
     pictures = []
     while not pictures or pictures[-1]["t"] is None:
         line = lines.readline()
@@ -166,4 +166,4 @@ def test_samples_go_to_who_looks_and_to_nobody_else(page: tuple[PageServer, Live
     assert pictures[-1]["t"] == SENT.t[-1] and pictures[-1]["details"]["of"] == "p_B"
     browser.close()
     lines.close()
-    until(lambda: not live.watched)
+    until(lambda: not live.viewed)

@@ -27,42 +27,42 @@ def test_values_that_change_are_gathered_and_others_stay():
     dropped: Counter[str] = Counter()
     clock = [0.0]
     gatherer = ValueGatherer(("x", "theta"), 10.0, 1.0, lambda reason: dropped.update([reason]), lambda: clock[0])
-    assert gatherer.take("x", 100.2, [5.0]) == []  # theta is not known yet
+    assert gatherer.push("x", 100.2, [5.0]) == []  # theta is not known yet
     for k in range(10):
-        assert gatherer.take("theta", 100.4 + 0.1 * k, [1.0 + k]) == []  # x may yet have changed
+        assert gatherer.push("theta", 100.4 + 0.1 * k, [1.0 + k]) == []  # x may yet have changed
     clock[0] = 10.0
-    (block,) = gatherer.take("theta", 101.4, [11.0])  # it has not
+    (block,) = gatherer.push("theta", 101.4, [11.0])  # it has not
     assert block.t.tolist() == pytest.approx([100.4 + 0.1 * k for k in range(10)])
     assert block["x"].tolist() == [5.0] * 10
     assert block["theta"].tolist() == [1.0 + k for k in range(10)]
-    assert gatherer.take("x", 100.5, [7.0]) == []
+    assert gatherer.push("x", 100.5, [7.0]) == []
     assert dropped == {LATE: 1}
-    assert gatherer.take("x", 102.0, [8.0] * 10) == []  # an array
-    (block,) = gatherer.take("theta", 102.3, [21.0])
+    assert gatherer.push("x", 102.0, [8.0] * 10) == []  # an array
+    (block,) = gatherer.push("theta", 102.3, [21.0])
     assert block["x"].tolist() == [5.0] * 6 + [8.0] * 4
     assert block["theta"].tolist() == [11.0] * 9 + [21.0]
-    gatherer.take("x", 1e9, [1.0])  # after a pause
+    gatherer.push("x", 1e9, [1.0])  # after a pause
     clock[0] = 20.0
-    (block,) = gatherer.take("x", 1e9 + 1.0, [math.nan])
+    (block,) = gatherer.push("x", 1e9 + 1.0, [math.nan])
     assert block.t[0] == pytest.approx(1e9)
     assert (block["x"].tolist(), block["theta"].tolist()) == ([1.0] * 10, [21.0] * 10)
-    gatherer.take("x", 50.0, [3.0])  # the clock was set back
-    gatherer.take("theta", 50.0, [4.0])
-    gatherer.take("theta", 51.6, [5.0])
-    (block,) = gatherer.take("x", 51.0, [math.nan])
+    gatherer.push("x", 50.0, [3.0])  # the clock was set back
+    gatherer.push("theta", 50.0, [4.0])
+    gatherer.push("theta", 51.6, [5.0])
+    (block,) = gatherer.push("x", 51.0, [math.nan])
     assert (block.t[0], block["x"].tolist(), block["theta"].tolist()) == (50.0, [3.0] * 10, [4.0] * 10)
-    assert gatherer.take("x", math.inf, [1.0]) == []
-    gatherer.interrupted()
-    assert gatherer.take("x", 1e9 + 9.0, [2.0]) == []
+    assert gatherer.push("x", math.inf, [1.0]) == []
+    gatherer.discard_values()
+    assert gatherer.push("x", 1e9 + 9.0, [2.0]) == []
 
 
 def test_a_channel_that_never_came_fills_no_memory_and_may_come_late():
     gatherer, sizes = ValueGatherer(("x", "theta"), 50.0, 1.0, lambda reason: None), []
     for second in range(200):
-        assert gatherer.take("x", float(second), [float(second)] * 50) == []
+        assert gatherer.push("x", float(second), [float(second)] * 50) == []
         sizes.append(len(pickle.dumps(vars(gatherer)["_channels"])))
     assert max(sizes[100:]) < 1.1 * sizes[70]
-    (block,) = gatherer.take("theta", 199.0, [1.0] * 50)
+    (block,) = gatherer.push("theta", 199.0, [1.0] * 50)
     assert (block.t[0], block["x"][0]) == (199.0, 199.0)
 
 
@@ -74,7 +74,7 @@ def test_values_in_portions_make_the_same_blocks():
         gatherer, blocks = ValueGatherer(("x", "theta"), 50.0, 1.0, lambda reason: None), []
         for start in range(0, 600, size):
             for name, values in signal.items():
-                blocks += gatherer.take(name, 10.0 + start / 50.0, values[start : start + size].tolist())
+                blocks += gatherer.push(name, 10.0 + start / 50.0, values[start : start + size].tolist())
         made.append({name: np.concatenate([block[name] for block in blocks])[:500] for name in signal})
     for other in made:
         for name, values in signal.items():

@@ -16,13 +16,13 @@ from sqlalchemy.exc import OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.testclient import TestClient
 
+from sealscope.monitor.bounded_queue import BoundedQueue, QueueLoad
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings
 from sealscope.monitor.sources.source_block import SourceBlock
 from sealscope.monitor.supervisor import BROKER, DATABASE, Supervisor
-from sealscope.monitor.waiting import Waiting
 
 from .plant import LINES, rows_of, served, settings_in, until
 
@@ -34,7 +34,7 @@ REASON = "connection to server at 10.0.0.9 failed: Connection refused"
 
 def test_an_outage_is_said_once_and_measured(caplog):
     changes: list[int] = []
-    supervisor = Supervisor(changed=lambda: changes.append(1))
+    supervisor = Supervisor(on_change=lambda: changes.append(1))
     database, broker = (supervisor.part(name) for name in (DATABASE, BROKER))
     database.end_outage()
     assert supervisor.outages() == [] == changes
@@ -42,13 +42,13 @@ def test_an_outage_is_said_once_and_measured(caplog):
     broker.begin_outage("still gone")
     (outage,) = supervisor.outages()
     assert (outage["part"], outage["reason"]) == ("broker", "gone")
-    reached, number, seconds = supervisor.totals()["broker"]
+    reached, number, seconds = supervisor.outage_totals()["broker"]
     assert (reached, number, seconds >= 0.0) == (False, 1, True)
     broker.end_outage()
     broker.end_outage()
     broker.begin_outage("again")
-    assert supervisor.totals()["broker"][:2] == (False, 2)
-    assert supervisor.totals()["database"] == (True, 0, 0.0)
+    assert supervisor.outage_totals()["broker"][:2] == (False, 2)
+    assert supervisor.outage_totals()["database"] == (True, 0, 0.0)
     assert len(changes) == 3
     assert [record.message[:30] for record in caplog.records] == [
         "the broker is not reached: gon",
@@ -58,20 +58,20 @@ def test_an_outage_is_said_once_and_measured(caplog):
 
 
 def test_a_queue_holds_so_many_and_so_many_bytes():
-    queue: Waiting[int] = Waiting(3, 100)
+    queue: BoundedQueue[int] = BoundedQueue(3, 100)
     assert queue.put(1, 5000)  # larger than all, but alone
     assert not queue.put(2, 1)
-    assert queue.take(9, 0.0) == [1]
+    assert queue.pop(9, 0.0) == [1]
     assert [queue.put(k, 40) for k in range(3)] == [True, True, False]
     assert queue.put(9, 40, always=True)
-    assert queue.waiting() == (3, 120)
+    assert queue.size() == (3, 120)
     assert not queue.put(3, 0, 0.01)
-    assert queue.take(2, 0.0) == [0, 1]
+    assert queue.pop(2, 0.0) == [0, 1]
     assert queue.put(3, 10)
-    assert queue.take(9, 0.0) == [9, 3]
-    assert queue.take(9, 0.01) == []
+    assert queue.pop(9, 0.0) == [9, 3]
+    assert queue.pop(9, 0.01) == []
     threading.Timer(0.05, lambda: queue.put(4, 1)).start()
-    assert queue.take(1, 5.0) == [4]
+    assert queue.pop(1, 5.0) == [4]
 
 
 @pytest.fixture
@@ -100,7 +100,9 @@ def metrics(page: TestClient) -> tuple[int, dict[str, dict[str, float]]]:
     ],
 )
 def test_without_the_database_the_page_answers_503_in_words(service, monkeypatch, error, reason):
-    page = TestClient(site(service.actuators, PageSettings(), None, lambda: (7, 900, 3)), base_url="http://localhost")
+    page = TestClient(
+        site(service.actuators, PageSettings(), None, lambda: QueueLoad(7, 900, 3)), base_url="http://localhost"
+    )
     status, before = metrics(page)
     assert (status, before["sealscope_reached"]) == (200, {**REACHED, "database": 1.0})
 
@@ -125,7 +127,7 @@ def test_without_the_database_the_page_answers_503_in_words(service, monkeypatch
     assert page.get("/").status_code == 200
 
     monkeypatch.undo()
-    service._pass_on()  # as the running service does twice a second
+    service._write_events()  # as the running service does twice a second
     status, after = metrics(page)
     assert (status, after["sealscope_reached"], after["sealscope_outages"]["database"]) == (
         200,
@@ -152,7 +154,7 @@ def test_errors_of_another_kind_are_no_outage(service, monkeypatch):
 
 def test_a_full_queue_makes_its_source_wait_and_says_so(undisturbed, tmp_path, monkeypatch, caplog):
     """The database is locked for longer than a source waits in silence; nothing is lost."""
-    monkeypatch.setattr("sealscope.monitor.service._WAITING", 4)
+    monkeypatch.setattr("sealscope.monitor.service._QUEUE_BLOCKS", 4)
     monkeypatch.setattr("sealscope.monitor.service._LONG_WAIT_S", 0.2)
     caplog.clear()  # on a busy machine its source may have waited, too
     settings = settings_in(tmp_path)
@@ -164,24 +166,26 @@ def test_a_full_queue_makes_its_source_wait_and_says_so(undisturbed, tmp_path, m
     thread = threading.Thread(target=service.run)
     thread.start()
     try:
-        page = TestClient(site(service.actuators, PageSettings(), None, service.waits), base_url="http://localhost")
+        page = TestClient(
+            site(service.actuators, PageSettings(), None, service.queue_load), base_url="http://localhost"
+        )
         until(lambda: any("a source waits" in record.message for record in caplog.records))
-        assert service.waits()[0] > 4  # those in the queue, and those that are being stored
+        assert service.queue_load().n_blocks > 4  # those in the queue, and those that are being stored
         (outage,) = page.get("/api/fleet").json()["outages"]
         assert (outage["part"], outage["reason"]) == ("database", "database is locked")
         assert metrics(page)[1]["sealscope_reached"]["database"] == 0.0
     finally:
         other.execute("rollback")
         thread.join(60.0)
-    assert service.supervisor.totals()["database"][:2] == (True, 1)
-    assert service.waits()[2] > 0
+    assert service.supervisor.outage_totals()["database"][:2] == (True, 1)
+    assert service.queue_load().n_waits > 0
     assert rows_of(settings.database) == undisturbed
 
 
 def test_a_source_is_no_longer_than_the_service(tmp_path):
     """A source that waits for room ends with the service."""
     service = Service(settings_in(tmp_path), once=True, stdin=io.BytesIO(), stdout=io.StringIO())
-    thread = threading.Thread(target=lambda: [service.hand(SourceBlock("press 1", str(k), None)) for k in range(600)])
+    thread = threading.Thread(target=lambda: [service.submit(SourceBlock("press 1", str(k), None)) for k in range(600)])
     thread.start()
     thread.join(0.3)
     assert thread.is_alive()

@@ -14,9 +14,10 @@ import pytest
 from sealscope.monitor.database.export import ESTIMATE_COLUMNS, export_labels
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.outputs.grafana import dashboard
-from sealscope.monitor.outputs.prometheus import metrics_text
+from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.monitor.supervisor import PartAway
 
+from ..refusals import refusal
 from .plant import WORN, lines_of, served, settings_in
 
 LINES = lines_of({"press 1": WORN}, 150)
@@ -50,8 +51,8 @@ class Receiver:
 def watched(tmp_path_factory):
     folder = tmp_path_factory.mktemp("watched")
     service, _ = served(settings_in(folder), LINES)
-    service.actuators.mark("press 1", "comment", by_whom="ann", text="=looks real")
-    service.actuators.mark("press 1", "repaired", by_whom="ann", text="seal changed")
+    service.actuators.apply_mark("press 1", "comment", by_whom="ann", text="=looks real")
+    service.actuators.apply_mark("press 1", "repaired", by_whom="ann", text="seal changed")
     return service
 
 
@@ -60,7 +61,7 @@ def test_events_are_posted_in_order_until_they_are_taken(watched, caplog):
     hook = Webhook(watched.store, receiver.url, "secret token")
     with caplog.at_level(logging.DEBUG, "sealscope"):
         for _ in range(4):
-            watched.supervisor.part("webhook").attempt(hook.pass_on, at_once=True)
+            watched.supervisor.part("webhook").attempt(hook.deliver, at_once=True)
     posted = [(headers["Idempotency-Key"], body["event"]) for headers, body in receiver.got]
     events = watched.store.events_since(0)
     first = (str(events[0][0]), events[0][1]["event"])
@@ -70,16 +71,16 @@ def test_events_are_posted_in_order_until_they_are_taken(watched, caplog):
     assert receiver.got[-1][1] == events[-1][1]
     assert "status 500" in caplog.text
     assert "secret" not in caplog.text
-    Webhook(watched.store, receiver.url).pass_on()  # after a restart nothing comes twice
+    Webhook(watched.store, receiver.url).deliver()  # after a restart nothing comes twice
     assert len(receiver.got) == len(posted)
 
 
 def test_a_redirect_is_not_followed_and_carries_no_token(watched):
     elsewhere = Receiver()
     receiver = Receiver([307, 307], location=elsewhere.url)
-    watched.store.keep_position("webhook", 0)
-    with pytest.raises(PartAway, match="status 307"):
-        Webhook(watched.store, receiver.url, "secret").pass_on()
+    watched.store.write_position("webhook", 0)
+    with refusal("307", error=PartAway):
+        Webhook(watched.store, receiver.url, "secret").deliver()
     assert len(receiver.got) == 1
     assert elsewhere.got == []
     assert watched.store.position("webhook") == 0  # it waits
@@ -95,9 +96,9 @@ def test_the_service_posts_what_is_left_when_it_ends(tmp_path):
 
 
 def test_the_dashboard_asks_for_metrics_that_there_are(watched):
-    text = metrics_text(watched.actuators.plain(), {"oversized messages": 2}, {"broker": (True, 1, 2.5)})
-    summary = {name: dict(values, counters={"gap": 1}) for name, values in watched.actuators.plain().items()}
-    families = set(re.findall(r"^# TYPE (\S+)", text + metrics_text(summary, {}), re.MULTILINE))
+    text = format_metrics(watched.actuators.summaries(), {"oversized messages": 2}, {"broker": (True, 1, 2.5)})
+    summary = {name: dict(values, counters={"gap": 1}) for name, values in watched.actuators.summaries().items()}
+    families = set(re.findall(r"^# TYPE (\S+)", text + format_metrics(summary, {}), re.MULTILINE))
     board = json.loads(json.dumps(dashboard()))
     asked = {name for panel in board["panels"] for name in re.findall(r"sealscope_\w+", panel["targets"][0]["expr"])}
     assert asked <= families

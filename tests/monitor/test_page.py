@@ -15,14 +15,14 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from sealscope.diagnosis.verdict.states import state_of
-from sealscope.errors import InputError
-from sealscope.monitor.alarms import ranked
+from sealscope.monitor.alarms import rank_actuators
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.recordings.recording import Recording
 
+from ..refusals import refusal
 from .plant import HEALTHY, WORN, lines_of, until
 
 HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
@@ -100,8 +100,8 @@ def test_the_leaking_one_comes_first_with_its_life(page: TestClient):
 
 
 def test_a_course_of_many_blocks_is_means(service: Service):
-    whole = service.store.course("a healthy one")
-    few = service.store.course("a healthy one", most=10)
+    whole = service.store.history("a healthy one")
+    few = service.store.history("a healthy one", max_rows=10)
     assert len(few) <= 11
     assert few[5]["total_lpm"] == pytest.approx(sum(row["total_lpm"] for row in whole[24:29]) / 5, rel=0.05)
 
@@ -164,16 +164,16 @@ def test_the_order_is_severity_new_then_evidence_then_the_sure_leak():
 
     leaks = {"less": row("leak", 1, 0.1), "more": row("leak", 1, 0.2), "bad": row("leak over the limit", 2, 0.0)}
     others = {"quiet": row("watched", 0, 0.0), "gone": row("watched", 4, 0), "silent": row("no data", 0, 0.0)}
-    names = [each["name"] for each in ranked({**others, **leaks}, [])]
+    names = [each["name"] for each in rank_actuators({**others, **leaks}, [])]
     assert names == ["bad", "more", "less", "silent", "gone", "quiet"]
     alarms = [{"actuator": "less", "by_chance_per_1000_h": 1e-6}, {"actuator": "more", "by_chance_per_1000_h": 1e-3}]
-    names = [each["name"] for each in ranked({**others, **leaks}, alarms)]
+    names = [each["name"] for each in rank_actuators({**others, **leaks}, alarms)]
     assert names == ["bad", "less", "more", "silent", "gone", "quiet"]
 
 
 def test_a_port_in_use_is_one_line(service: Service):
     first = PageServer(service.actuators, PageSettings(port=0))
-    with pytest.raises(InputError, match=r"page.port must be free, got .* \(127.0.0.1:\d+\)"):
+    with refusal("page.port", "127.0.0.1"):
         PageServer(service.actuators, PageSettings(port=first.port))
     first.close()
     service.actuators.closed = False
@@ -184,7 +184,7 @@ def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
 
     def shown(samples: Recording, place: str, words: str) -> bool:
         # a page that has just asked for another stream does not see what comes between the two; repeated is ignored
-        live.take(HOSTILE, samples)
+        live.push(HOSTILE, samples)
         return words in (view.text_content(place) or "")
 
     until(lambda: shown(WORN.between(0.0, 60.0), "#live-says", "As of 00:00:59, 50 Hz"))
@@ -197,15 +197,16 @@ def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
     view.wait_for_function(away)
     view.locator("[data-drawn=details]").focus()
     view.keyboard.press("Enter")
-    view.locator("#details-title", has_text="Details d1 to d4").wait_for()
+    until(lambda: shown(WORN.between(60.0, 70.0), "#details-title", "Details d1 to d4"))
+    until(lambda: view.locator("#details canvas").is_visible())
     pressures = WORN.between(70.0, 74.0).only(("p_A", "p_B"))
     until(lambda: shown(pressures, "#twin-missing", "No position is recorded"))
     # the drawing changes with what is said of it, not a frame later
     assert view.get_attribute("#twin-moving", "transform") == "translate(200.00 0)"
     view.locator("#pause").click()
-    until(lambda: not live.watched)  # nothing is sent any more
+    until(lambda: not live.viewed)  # nothing is sent any more
     view.locator("#pause").click()
-    until(lambda: live.watched)
+    until(lambda: live.viewed)
 
 
 @pytest.mark.slow
@@ -317,7 +318,7 @@ def test_silence_and_a_duty_that_is_not_known_have_delays_of_their_own(tmp_path:
         lines = io.BytesIO(lines_of({"a": samples}, 500))
         service = Service(MonitorSettings.model_validate(settings), once=True, stdin=lines, stdout=io.StringIO())
         service.run()
-        return service.plain()["a"]["state"]
+        return service.summaries()["a"]["state"]
 
     t, other = HEALTHY.t, HEALTHY.t > 90.0
     channels = {name: np.where(other, HEALTHY[name][0], HEALTHY[name]) for name in HEALTHY.channels}

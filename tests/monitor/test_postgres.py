@@ -27,6 +27,7 @@ from sealscope.monitor.page.site import site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, WatchSettings
 
+from ..refusals import mentions
 from .plant import LINES, kill_often, rows_of, served, settings_in, until
 from .servers import NO_POSTGRESQL, PostgreSQL
 from .test_alarms import LEAK
@@ -67,17 +68,17 @@ def test_an_event_that_is_stored_late_goes_out(url: str):
     def keep(store: MonitorStore, name: str, *, wait: bool) -> None:
         rows, judge = StoredRows(), AlarmJudge(name)
         block = BlockEstimate(1, 3.0, "alarm", 0.003, None, 0.003, None)
-        rows.add_alarm(judge.take(block, LEAK, 1, WatchSettings(debounce_blocks=1))[0], "raised", 3.0)
+        rows.add_alarm(judge.update(block, LEAK, 1, WatchSettings(debounce_blocks=1))[0], "raised", 3.0)
         with store.writing() as connection:
-            store.keep_rows(connection, rows)
+            store.write_rows(connection, rows)
             if wait:
                 begun.set()
                 time.sleep(1.0)
 
     def pass_on() -> None:
-        stores[0].pass_on("lines", lambda event: passed.append(event["alarm"]["actuator"]) or True)
+        stores[0].deliver("lines", lambda event: passed.append(event["alarm"]["actuator"]) or True)
 
-    stores[0].keep_position("lines", max([number for number, _ in stores[0].events_since(0)], default=0))
+    stores[0].write_position("lines", max([number for number, _ in stores[0].events_since(0)], default=0))
     begun = threading.Event()
     late = threading.Thread(target=keep, args=(stores[0], "late"), kwargs={"wait": True})
     late.start()
@@ -129,15 +130,12 @@ def test_while_postgresql_is_away_the_page_says_so_and_nothing_is_lost(undisturb
                 assert asked("metrics")[0] == 503
             finally:
                 server.start()
-            reached, deadline = 'sealscope_reached{part="database"} 1.0', time.monotonic() + 60.0
-            while time.monotonic() < deadline and (
-                reached not in asked("metrics")[1] or len(rows_of(server.url)["blocks"]) < len(lines)
-            ):
-                time.sleep(0.1)
+            reached = 'sealscope_reached{part="database"} 1.0'
+            until(lambda: reached in asked("metrics")[1] and len(rows_of(server.url)["blocks"]) >= len(lines))
             status, text_ = asked("metrics")
             assert status == 200
             assert reached in text_
-            assert service.waits()[0] == 0
+            assert service.queue_load().n_blocks == 0
             assert 'sealscope_outages_total{part="database"} 1.0' in text_
         finally:
             service.stop()
@@ -161,13 +159,15 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as stream, os.fdopen(writing, "wb", buffering=0) as wire:
         service = Service(settings, stdin=stream, stdout=io.StringIO())
-        page = TestClient(site(service.actuators, PageSettings(), None, service.waits), base_url="http://localhost")
+        page = TestClient(
+            site(service.actuators, PageSettings(), None, service.queue_load), base_url="http://localhost"
+        )
         thread = threading.Thread(target=service.run)
         thread.start()
         lines = LINES.splitlines(keepends=True)
         try:
             wire.write(b"".join(lines[:10]))
-            until(lambda: service.waits()[0] == 0 and page.get("/metrics").status_code == 200)
+            until(lambda: service.queue_load().n_blocks == 0 and page.get("/metrics").status_code == 200)
             before = service.store.engine.connect()
             server.hang()
             try:
@@ -176,8 +176,9 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
                 (outage,) = service.supervisor.outages()
                 assert outage["part"] == "database"
                 assert outage["reason"] in ("connection timeout expired", "PostgreSQL has not answered for 1 s")
-                with pytest.raises(OperationalError, match="PostgreSQL has not answered for 1 s"):
+                with pytest.raises(OperationalError) as caught:
                     before.execute(text("select 1"))
+                assert mentions(str(caught.value.orig), "1 s")
                 answer = page.get("/api/fleet")
                 assert answer.status_code == 503
                 assert answer.json()["error"].startswith("the database does not answer: ")
@@ -185,12 +186,12 @@ def test_a_postgresql_that_hangs_is_said_and_costs_nothing(
                 assert page.get("/metrics").status_code == 503
             finally:
                 server.go_on()
-            until(lambda: not service.supervisor.outages() and service.waits()[0] == 0)
+            until(lambda: not service.supervisor.outages() and service.queue_load().n_blocks == 0)
         finally:
             wire.close()
             thread.join()
             before.close()
-    assert service.supervisor.totals()["database"][0]
+    assert service.supervisor.outage_totals()["database"][0]
     assert "the database is not reached: " in caplog.text
     ours, theirs = rows_of(server.url), undisturbed
     for table in theirs:

@@ -33,7 +33,7 @@ from sealscope.monitor.sources.source_block import (
     RefusedMessage,
 )
 from sealscope.monitor.sources.sparkplug_host import GAPS, SparkplugHost
-from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decoded_payload, encoded
+from sealscope.monitor.sparkplug import SparkplugMetric, SparkplugPayload, decode_payload, encode_payload
 from sealscope.recordings.recording import Recording
 
 from .plant import CHANNELS, HEALTHY, WORN, message, rows_of, settings_in
@@ -52,13 +52,13 @@ def test_bytes_by_hand():
     array += b"\x82\x01\x10" + struct.pack("<2d", 1.5, -2.0)  # field 16, bytes_value
     parts = [metric, null, minus, array]
     wire = b"\x08\x7b" + b"".join(b"\x12" + bytes([len(part)]) + part for part in parts) + b"\x18\xff\x01"
-    payload = decoded_payload(wire)
+    payload = decode_payload(wire)
     assert (payload.timestamp, payload.seq) == (123, 255)
     sequence, empty, below, samples = payload.metrics
     assert sequence == SparkplugMetric("bdSeq", 3, sparkplug.INT64, timestamp=5)
     assert (empty.name, empty.value, below.name, below.alias, below.value) == ("n", None, "m", 7, -5)
     assert (samples.unit, samples.value.tolist()) == ("mm", [1.5, -2.0])
-    assert encoded(payload) == wire
+    assert encode_payload(payload) == wire
 
 
 def test_the_schema_is_the_published_one():
@@ -92,7 +92,7 @@ EVERY_TYPE = [
 
 def test_third_parties_read_what_is_written():
     spb = pytest.importorskip("pysparkplug")
-    wire = encoded(SparkplugPayload(1_700_000_000_000, tuple(EVERY_TYPE), 9))
+    wire = encode_payload(SparkplugPayload(1_700_000_000_000, tuple(EVERY_TYPE), 9))
     theirs = spb.DData.decode(wire)
     assert (theirs.timestamp, theirs.seq) == (1_700_000_000_000, 9)
     for ours, metric in zip(EVERY_TYPE, theirs.metrics, strict=True):
@@ -120,7 +120,7 @@ def test_what_third_parties_write_is_read():
         spb.DataType.DOUBLE_ARRAY: (0.1, 1e300),
     }
     metrics = tuple(spb.Metric(timestamp=5, name=kind.name, datatype=kind, value=of) for kind, of in values.items())
-    payload = decoded_payload(spb.DBirth(timestamp=6, seq=0, metrics=metrics).encode())
+    payload = decode_payload(spb.DBirth(timestamp=6, seq=0, metrics=metrics).encode())
     for metric, (kind, value) in zip(payload.metrics, values.items(), strict=True):
         given = metric.value.tolist() if isinstance(metric.value, np.ndarray) else metric.value
         assert (metric.name, metric.datatype, given) == (
@@ -142,7 +142,7 @@ class Plant:
         self.device, self.seq = device, 255
 
     def _publish(self, topic: str, payload: bytes) -> None:
-        (command,) = decoded_payload(payload).metrics
+        (command,) = decode_payload(payload).metrics
         assert (topic, command.name, command.value) == ("spBv1.0/plant/NCMD/edge", "Node Control/Rebirth", True)
         self.asked.append(topic)
 
@@ -151,7 +151,9 @@ class Plant:
             self.seq = 0 if kind == "NBIRTH" else (self.seq + 1 + skip) % 256
         device = self.device if kind.startswith("D") else None
         topic = sparkplug.topic_of("plant", kind, "edge", device)
-        return self.host.receive(topic, encoded(SparkplugPayload(at, metrics, None if kind == "NDEATH" else self.seq)))
+        return self.host.receive(
+            topic, encode_payload(SparkplugPayload(at, metrics, None if kind == "NDEATH" else self.seq))
+        )
 
     def born(self, *metrics: SparkplugMetric, number: int = 1) -> None:
         assert self.send("NBIRTH", SparkplugMetric("bdSeq", number, sparkplug.INT64)) is None
@@ -186,7 +188,7 @@ def births(**changed: Any) -> list[SparkplugMetric]:
 def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiver], None]:
     """The samples of actuators as a node whose devices they are."""
 
-    def hand(service: BlockReceiver) -> None:
+    def submit(service: BlockReceiver) -> None:
         host = SparkplugHost(service.settings.actuator, lambda *_: None, service.count)
         number = [SparkplugMetric("bdSeq", 0, sparkplug.INT64)]
         messages: list[tuple[str, str | None, list[SparkplugMetric]]] = [("NBIRTH", None, number)]
@@ -201,12 +203,12 @@ def as_source(samples: dict[str, Recording], size: int) -> Callable[[BlockReceiv
                         metrics.append(SparkplugMetric("T_oil", readings["T_oil"], sparkplug.DOUBLE, timestamp=1))
                     messages.append(("DDATA", device, metrics))
         for seq, (kind, device, metrics) in enumerate(messages):
-            wire = encoded(SparkplugPayload(1, tuple(metrics), seq % 256))
+            wire = encode_payload(SparkplugPayload(1, tuple(metrics), seq % 256))
             block = host.receive(sparkplug.topic_of("plant", kind, "edge", device), wire)
             if block is not None:
-                service.hand(block)
+                service.submit(block)
 
-    return hand
+    return submit
 
 
 def test_samples_by_sparkplug_are_samples(undisturbed, tmp_path):
@@ -338,14 +340,14 @@ def test_data_without_sound_samples_are_refused(metrics, reason):
 
 def test_topics_of_others_are_refused():
     plant = Plant()
-    wire = encoded(SparkplugPayload(1, (), 0))
+    wire = encode_payload(SparkplugPayload(1, (), 0))
     for topic in ("spBv1.0/plant/NBIRTH/other", "spBv1.0/plant/DDATA/edge", "spBv1.0/plant/STATE", "spBv1.0/a/b/c/d/e"):
         with pytest.raises(RefusedMessage) as raised:
             plant.host.receive(topic, wire)
         assert raised.value.reason == WRONG_ACTUATOR
     assert plant.host.receive("spBv1.0/plant/NCMD/edge", wire) is None
     assert plant.host.topics == ["spBv1.0/plant/+/edge/#"]
-    plant.host.ask_all()
+    plant.host.request_all_births()
     assert len(plant.asked) == 1
 
 
@@ -372,8 +374,8 @@ def test_times_in_whole_milliseconds_make_no_gap(rate, rounded):
 def test_mutated_payloads_are_blocks_or_refused(count):
     random, plant = np.random.default_rng(count), Plant()
     plant.born(*births())
-    valid = encoded(SparkplugPayload(1, tuple(arrays(HEALTHY.samples(slice(0, 20)), 40)), 2))
-    birth = encoded(SparkplugPayload(1, tuple(births()), 1))
+    valid = encode_payload(SparkplugPayload(1, tuple(arrays(HEALTHY.samples(slice(0, 20)), 40)), 2))
+    birth = encode_payload(SparkplugPayload(1, tuple(births()), 1))
     outcomes: Counter[str] = Counter()
     for _ in range(count):
         kind = ("DDATA", "DDATA", "DBIRTH", "NBIRTH", "NDEATH")[random.integers(5)]

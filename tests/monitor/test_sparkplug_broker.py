@@ -162,7 +162,7 @@ def test_samples_and_alarms_over_sparkplug(
             return any(each.get("Alarm/Event") == event for each in sent)
 
         until(lambda: said("raised"))
-        running.service.actuators.mark("press 1", "acknowledged", by_whom="Ada")
+        running.service.actuators.apply_mark("press 1", "acknowledged", by_whom="Ada")
         until(lambda: said("acknowledged"))
         rebirth = spb.Metric(timestamp=1, name="Node Control/Rebirth", datatype=spb.DataType.BOOLEAN, value=True)
         wire.publish("spBv1.0/Sealscope/NCMD/monitor", spb.NCmd(timestamp=1, metrics=(rebirth,)))

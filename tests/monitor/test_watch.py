@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -12,12 +13,14 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.live.estimates import BlockEstimate, WatchBaseline
+from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.live.estimates import BlockEstimate, WatchBaseline, find_level_rise
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step
+from ..refusals import refusal
 from .plant import moved
 
 #: Conductance of the leak [m^3/(s Pa)], and the seconds from which it is open.
@@ -169,15 +172,17 @@ def test_warm_oil_and_another_duty_are_no_leak():
 
 
 def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
-    place = {"version": 1, "learned_s": 0.0, "hours": 8.0, "lpm": None}
+    place = {"version": 1, "known_s": 0.0, "hours": 8.0, "lpm": None}
     duty = {"duty_low": (0.0, 0.0), "duty_high": (0.0, 0.0)}
-    baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty)
-    rise = baseline.rise(1e5, 6e-13, 1e-15, 1e-6)
+    scatter = {"deviation": 5e-14, "count": 600}
+    baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty, **scatter)
+    onset = Interval(1e5, 0.0, 1e5)
+    rise = find_level_rise(baseline, onset, 6e-13, 1e-15, 1e-6)
     assert rise is not None
     assert rise.size == pytest.approx(4e-13)
     assert rise.size - 1.96 * rise.deviation <= 2e-13  # the oil may be as warm as it gets, or as cold as it was
     assert rise.size + 1.96 * rise.deviation >= 5e-13
-    assert baseline.rise(1e5, 3.9e-13, 1e-15, 1e-6) is None
+    assert find_level_rise(baseline, onset, 3.9e-13, 1e-15, 1e-6) is None
 
 
 def test_a_machine_at_standstill_is_not_judged():
@@ -208,6 +213,17 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
     assert watch.baseline == whole()[0].baseline
 
 
+def test_a_level_on_another_clock_has_its_onset_within_the_interval():
+    """The baseline was learned at later times of the clock than that of the leak."""
+    watch = Watch.from_state(whole()[0].state())
+    watch.dismiss()
+    watch.baseline = replace(watch.baseline, count=10, deviation=1e-14)  # as of longer learning
+    watch.update(moved(machine(1, G=10.0 * LEAK, duration=80.0, rate=50.0), -1000.0), follows=False)
+    assert watch.leak is not None and watch.leak.test == "level"
+    low, high = watch.leak.onset_interval_s
+    assert low <= watch.leak.onset_s <= high < 0.0
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -218,8 +234,8 @@ def test_a_dismissed_leak_is_compared_with_nothing_before():
         {"detector": {}},
         {"samples": None},
         {"leak": {"raised_s": "x"}},
-        {"last": {"shape": [1e12, 6], "f8": ""}},
-        {"group": {"shape": [1, 4], "f8": "AAAA"}},
+        {"compared": {"shape": [1e12, 6], "f8": ""}},
+        {"grouped": "x"},
         {"blocks": None},
     ],
 )
@@ -230,7 +246,7 @@ def test_a_damaged_state_is_refused_in_one_line(damage: dict[str, Any]):
 
 
 def test_wrong_settings_are_refused():
-    with pytest.raises(InputError, match="false_alarms_per_1000_h must be"):
+    with refusal("false_alarms_per_1000_h"):
         ss.watch("thesis", false_alarms_per_1000_h=1e-6)
-    with pytest.raises(InputError, match="learn_hours must be"):
+    with refusal("learn_hours"):
         ss.watch("thesis", learn_hours=0.0)

@@ -12,6 +12,8 @@ import sealscope.parameters
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 
+from ..refusals import mentions, refusal
+
 THESIS = (Path(sealscope.parameters.__file__).parent / "rigs" / "thesis.toml").read_text(encoding="utf-8")
 EXTENDS = '[rig]\nextends = "thesis"\n'
 GOOD = 'V_1 = { value = 50, unit = "cm^3", source = "measured" }\n'
@@ -63,33 +65,33 @@ def test_byte_order_mark_is_no_obstacle(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "rule"),
+    ("entry", "names"),
     [
-        ('V_1 = { value = 50, unit = "cm^3" }', "V_1 must have a source, got none"),
-        ('V_1 = { value = 50, unit = "cm^3", source = "  " }', "V_1 must have a source, got none"),
-        ('V_1 = { value = 50, unit = "cm^3", source = 3 }', "source of V_1 must be a text, got 3"),
-        ('V_1 = { value = 50, source = "x" }', "V_1 must have a unit, such as m^3, got none"),
-        ('V_1 = { unit = "cm^3", source = "x" }', "V_1 must have a value, got none"),
+        ('V_1 = { value = 50, unit = "cm^3" }', "V_1, source"),
+        ('V_1 = { value = 50, unit = "cm^3", source = "  " }', "V_1, source"),
+        ('V_1 = { value = 50, unit = "cm^3", source = 3 }', "source, V_1, 3"),
+        ('V_1 = { value = 50, source = "x" }', "V_1, unit"),
+        ('V_1 = { unit = "cm^3", source = "x" }', "V_1, value"),
         ('V_1 = { value = 50, unit = "cm^3", source = "x", note = "y" }',
-         "V_1 must have value, unit and source only, got note"),
-        ('V_1 = { value = "50", unit = "cm^3", source = "x" }', "V_1 must be a number, got '50'"),
-        ('V_1 = { value = true, unit = "cm^3", source = "x" }', "V_1 must be a number, got True"),
-        ('V_1 = { value = nan, unit = "cm^3", source = "x" }', "V_1 must be finite, got nan"),
-        ('V_1 = { value = 1e308, unit = "Gm^3", source = "x" }', "V_1 must be finite, got 1e+308"),
-        ('V_1 = { value = -3.0, unit = "m^3", source = "x" }', "V_1 must be greater than 0 m^3, got -3.0"),
-        ('V_1 = { value = 3, unit = "kg", source = "x" }', "V_1 must have a unit of volume, such as m^3, got kg"),
-        ('V_1 = 3', "V_1 must be { value = ..., unit = ..., source = ... }, got 3"),
-        ('V1 = { value = 3, unit = "m^3", source = "x" }', "line.V1 is not a parameter; did you mean line.V_1?"),
-        ('V1 = 3', "line.V1 is not a parameter; did you mean line.V_1?"),
+         "V_1, note"),
+        ('V_1 = { value = "50", unit = "cm^3", source = "x" }', "V_1, '50'"),
+        ('V_1 = { value = true, unit = "cm^3", source = "x" }', "V_1, True"),
+        ('V_1 = { value = nan, unit = "cm^3", source = "x" }', "V_1, nan"),
+        ('V_1 = { value = 1e308, unit = "Gm^3", source = "x" }', "V_1, 1e+308"),
+        ('V_1 = { value = -3.0, unit = "m^3", source = "x" }', "V_1, -3.0"),
+        ('V_1 = { value = 3, unit = "kg", source = "x" }', "V_1, kg"),
+        ('V_1 = 3', "V_1, 3"),
+        ('V1 = { value = 3, unit = "m^3", source = "x" }', "line.V1, line.V_1"),
+        ('V1 = 3', "line.V1, line.V_1"),
         ('metering = { value = "meter-in", source = "x" }',
-         "metering must be one of meter-out, literal, got 'meter-in'"),
+         "metering, 'meter-in'"),
         ('metering = { value = "literal", unit = "m", source = "x" }',
-         "metering is a choice and must have no unit, got 'm'"),
+         "metering, 'm'"),
     ],
 )  # fmt: skip
-def test_a_bad_entry_is_told_with_its_file(tmp_path: Path, entry: str, rule: str) -> None:
+def test_a_bad_entry_is_told_with_its_file(tmp_path: Path, entry: str, names: str) -> None:
     path = write(tmp_path, EXTENDS + "[line]\n" + entry + "\n")
-    assert refused(path) == f"{rule} ({path})"
+    assert mentions(refused(path), path, *names.split(", "))
 
 
 @pytest.mark.parametrize("key", ["value", "unit", "source"])
@@ -165,9 +167,9 @@ def test_an_unknown_name_lists_the_rigs() -> None:
 def test_a_rig_is_its_own_rig_and_another_type_is_refused():
     rig = load_rig("thesis")
     assert load_rig(rig) is rig
-    with pytest.raises(InputError, match="rig must be a Rig, the name of a rig or a path, got 5"):
+    with refusal("rig", "5"):
         load_rig(5)
-    with pytest.raises(InputError, match="load_rig has no argument 'rg'; did you mean 'rig'"):
+    with refusal("load_rig", "'rg'", "'rig'"):
         load_rig(rg="thesis")
 
 
@@ -184,7 +186,7 @@ HEAVY = {
 
 
 @pytest.mark.parametrize("kind", HEAVY)
-@pytest.mark.parametrize("load", [ss.load_rig, ss.read_machine])
+@pytest.mark.parametrize("load", [ss.load_rig, pytest.param(ss.read_machine, marks=pytest.mark.slow)])
 def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: Path, kind: str, load) -> None:
     """The first error ends it, and what would become many objects is refused before it is parsed."""
     path = write(tmp_path, HEAVY[kind])
@@ -202,5 +204,5 @@ def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: P
 
 @pytest.mark.parametrize("load", [ss.load_rig, ss.read_machine])
 def test_rigs_and_machines_have_one_limit(tmp_path: Path, load) -> None:
-    with pytest.raises(InputError, match="must be at most 1000000 bytes, got more"):
+    with refusal("1000000 bytes"):
         load(write(tmp_path, "#" * 1_000_001))

@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.parameters import Motor, Rig, load_rig, parse_override, parse_overrides
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.rig import declared
+from sealscope.parameters.rig import declared_fields
+
+from ..refusals import mentions, refusal
 
 RIG = load_rig("thesis")
-NUMBERS = [name for name, field in declared().items() if field.annotation is float]
-CHOICES = [name for name, field in declared().items() if choices_of(field)]
+NUMBERS = [name for name, field in declared_fields().items() if field.annotation is float]
+CHOICES = [name for name, field in declared_fields().items() if choices_of(field)]
 
 
 def message(settings: dict[str, Any], **more: Any) -> str:
@@ -79,49 +81,48 @@ def test_immutable() -> None:
         RIG.motor.R_c = 1.0  # type: ignore[misc]
     with pytest.raises(Exception, match="frozen"):
         RIG.motor = RIG.motor  # type: ignore[misc]
-    with pytest.raises(InputError, match="with_overrides"):
+    with refusal("with_overrides"):
         RIG.motor.model_copy(update={"R_c": -1.0})
     assert RIG.motor.model_copy() == RIG.motor
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    ("settings", "names"),
     [
-        ({"V_1": -3.0}, "V_1 must be greater than 0 m^3, got -3.0 (set by caller)"),
-        ({"F_v": -1}, "F_v must be greater than or equal to 0 N s/m, got -1.0 (set by caller)"),
-        ({"d_line": "7 m"}, "d_line must be less than or equal to 0.5 m, got 7.0 (set by caller)"),
-        ({"closed_A": 1.0}, "closed_A must be less than or equal to 0.99, got 1.0 (set by caller)"),
-        ({"closed_B": "-1%"}, "closed_B must be greater than or equal to 0, got -0.01 (set by caller)"),
-        ({"K_brk": 0.5}, "K_brk must be greater than or equal to 1, got 0.5 (set by caller)"),
-        ({"p_A.noise": -1}, "sensors.p_A.noise must be greater than or equal to 0 Pa, got -1.0 (set by caller)"),
-        ({"bits": 3.5}, "bits must be a valid integer, got 3.5 (set by caller)"),
-        ({"bits": 40}, "bits must be less than or equal to 32 bit, got 40 (set by caller)"),
-        ({"V_1": True}, "V_1 must be a number, got True (set by caller)"),
-        ({"V_1": None}, "V_1 must be a number, got None (set by caller)"),
-        ({"V_1": math.nan}, "V_1 must be finite, got nan (set by caller)"),
-        ({"F_l": math.inf}, "F_l must be finite, got inf (set by caller)"),
-        ({"V_1": "5[Pa]"}, "V_1 must have a unit of volume, such as m^3, got Pa (set by caller)"),
-        ({"q_b": "4.9 cm^3"}, "q_b must have a unit of volume per turn, such as m^3/rev, got cm^3 (set by caller)"),
-        ({"V_1": "big"}, "V_1 must be a number with or without a unit, such as 2[m^3], got 'big' (set by caller)"),
-        ({"volumes": "fix"}, "volumes must be one of fixed, position, got 'fix' (set by caller)"),
-        ({"volumes": ["fixed"]}, "volumes must be one of fixed, position, got ['fixed'] (set by caller)"),
-        ({"V1": 1}, "'V1' is not a parameter; did you mean V_1?"),
-        ({"beta": 1e9}, "'beta' is not a parameter; did you mean fluid.K_oil?"),
-        ({"bulk_modulus": 1e9}, "'bulk_modulus' is not a parameter; did you mean fluid.K_oil?"),
-        ({"moter.R_c": 1}, "'moter.R_c' is not a parameter; did you mean motor.R_c?"),
-        ({"": 1}, "'' is not a parameter"),
-        ({"xyzzy_unknown": 1}, "'xyzzy_unknown' is not a parameter"),
-        ({"V_1": 1e-5, "line.V_1": 2e-5}, "line.V_1 must be set once, got V_1 and line.V_1"),
-        ({"range_hi": 1}, "parameter range_hi is not unique, give one of sensors.p_1.range_hi, sensors.p_2.range_hi, "
-         "sensors.p_A.range_hi, sensors.p_B.range_hi, sensors.q_leak.range_hi"),
-        ({"p_A.range_lo": "4000 psi"}, "sensors.p_A.range_lo must be < range_hi = 2.06843e+07 Pa, got "),
-        ({"sensor_volts_hi": 20}, "sensor_volts_hi must be <= range = 10 V, got 20.0 (set by caller)"),
-        ({"sensor_volts_lo": -20}, "sensor_volts_lo must be >= -range = -10 V, got -20.0 (set by caller)"),
-        ({"sensor_volts_lo": 10}, "sensor_volts_lo must be < sensor_volts_hi = 10 V, got 10.0 (set by caller)"),
+        ({"V_1": -3.0}, "V_1, -3.0, caller"),
+        ({"F_v": -1}, "F_v, -1.0, caller"),
+        ({"d_line": "7 m"}, "d_line, 7.0, caller"),
+        ({"closed_A": 1.0}, "closed_A, 1.0, caller"),
+        ({"closed_B": "-1%"}, "closed_B, -0.01, caller"),
+        ({"K_brk": 0.5}, "K_brk, 0.5, caller"),
+        ({"p_A.noise": -1}, "sensors.p_A.noise, -1.0, caller"),
+        ({"bits": 3.5}, "bits, 3.5, caller"),
+        ({"bits": 40}, "bits, 40, caller"),
+        ({"V_1": True}, "V_1, True, caller"),
+        ({"V_1": None}, "V_1, None, caller"),
+        ({"V_1": math.nan}, "V_1, nan, caller"),
+        ({"F_l": math.inf}, "F_l, inf, caller"),
+        ({"V_1": "5[Pa]"}, "V_1, Pa, caller"),
+        ({"q_b": "4.9 cm^3"}, "q_b, cm^3, caller"),
+        ({"V_1": "big"}, "V_1, 'big', caller"),
+        ({"volumes": "fix"}, "volumes, 'fix', caller"),
+        ({"volumes": ["fixed"]}, "volumes, ['fixed'], caller"),
+        ({"V1": 1}, "'V1', V_1"),
+        ({"beta": 1e9}, "'beta', fluid.K_oil"),
+        ({"bulk_modulus": 1e9}, "'bulk_modulus', fluid.K_oil"),
+        ({"moter.R_c": 1}, "'moter.R_c', motor.R_c"),
+        ({"": 1}, "''"),
+        ({"xyzzy_unknown": 1}, "'xyzzy_unknown'"),
+        ({"V_1": 1e-5, "line.V_1": 2e-5}, "line.V_1, V_1"),
+        ({"range_hi": 1}, "range_hi, sensors.p_1.range_hi, sensors.q_leak.range_hi"),
+        ({"p_A.range_lo": "4000 psi"}, "sensors.p_A.range_lo, range_hi, 2.06843e+07 Pa"),
+        ({"sensor_volts_hi": 20}, "sensor_volts_hi, 20.0, caller"),
+        ({"sensor_volts_lo": -20}, "sensor_volts_lo, -20.0, caller"),
+        ({"sensor_volts_lo": 10}, "sensor_volts_lo, 10.0, caller"),
     ],
 )  # fmt: skip
-def test_each_rule_is_told_in_one_line(settings: dict[str, Any], text: str) -> None:
-    assert message(settings).startswith(text)
+def test_each_rule_is_told_in_one_line(settings: dict[str, Any], names: str) -> None:
+    assert mentions(message(settings), *names.split(", "))
 
 
 def test_dead_volume_must_be_positive_when_volumes_move() -> None:
@@ -136,21 +137,21 @@ def test_dead_volume_must_be_positive_when_volumes_move() -> None:
 def test_parts_made_by_hand_obey_the_same_rules() -> None:
     values = RIG.motor.model_dump()
     assert Motor(**values) == RIG.motor
-    with pytest.raises(InputError, match=r"^R_c must be greater than 0 ohm, got -1.0$"):
+    with refusal("R_c", "0 ohm", "-1.0"):
         Motor(**{**values, "R_c": -1.0})
-    with pytest.raises(InputError, match=r"^R_d is not known$"):
+    with refusal("R_d"):
         Motor(**values, R_d=1.0)
-    with pytest.raises(InputError, match=r"^R_c is missing$"):
+    with refusal("R_c"):
         Motor(**{name: value for name, value in values.items() if name != "R_c"})
     bare = Rig(**{part: getattr(RIG, part) for part in Rig.model_fields})
     assert bare == RIG
-    with pytest.raises(InputError, match="must have sources"):
+    with refusal("sources"):
         bare.table()
 
 
 def _range(name: str) -> tuple[float, float]:
     low, high = -math.inf, math.inf
-    for rule in declared()[name].metadata:
+    for rule in declared_fields()[name].metadata:
         low = max(low, getattr(rule, "gt", low), getattr(rule, "ge", low))
         high = min(high, getattr(rule, "lt", high), getattr(rule, "le", high))
     return low, high
@@ -169,12 +170,12 @@ ACROSS = (
 )
 
 
-@pytest.mark.parametrize("name", NUMBERS)
-def test_every_number_has_a_range(name: str) -> None:
-    low, high = _range(name)
-    assert math.isfinite(low)
-    assert math.isfinite(high)
-    assert low < high
+def test_every_number_has_a_range() -> None:
+    for name in NUMBERS:
+        low, high = _range(name)
+        assert math.isfinite(low), name
+        assert math.isfinite(high), name
+        assert low < high, name
 
 
 @settings(deadline=None, max_examples=200)
@@ -204,7 +205,7 @@ def test_text_and_number_agree(name: str, fraction: float) -> None:
     except InputError:
         return
     assert RIG.with_overrides({name: repr(value)}) == rig
-    assert RIG.with_overrides({name: f"{value!r}[{unit_of(declared()[name])}]"}) == rig
+    assert RIG.with_overrides({name: f"{value!r}[{unit_of(declared_fields()[name])}]"}) == rig
 
 
 #: Choices that go together only.
@@ -213,7 +214,7 @@ VALVE = {"valve.spool": "present", "supply.drive": "constant-speed"}
 
 @pytest.mark.parametrize("name", CHOICES)
 def test_every_word_of_a_choice_is_accepted(name: str) -> None:
-    words = choices_of(declared()[name])
+    words = choices_of(declared_fields()[name])
     assert len(words) > 1
     for word in words:
         others = VALVE if name in VALVE and word in VALVE.values() else {}
@@ -235,10 +236,10 @@ def test_parse_override() -> None:
     assert parse_override("V_1=50[cm^3]") == ("V_1", "50[cm^3]")
     assert parse_override(" motor.R_c = 0.8 ") == ("motor.R_c", "0.8")
     for bad in ("V_1", "=3", "V_1=", "", " = "):
-        with pytest.raises(InputError, match=r"NAME=VALUE\[unit\], got"):
+        with refusal("NAME=VALUE[unit]"):
             parse_override(bad)
     assert parse_overrides(["V_1=1", "V_2=2", "V_1=1"]) == {"V_1": "1", "V_2": "2"}
-    with pytest.raises(InputError, match="V_1 must be set once, got 1 and 2"):
+    with refusal("V_1", "1", "2"):
         parse_overrides(["V_1=1", "V_1=2"])
     assert RIG.with_overrides(dict([parse_override("V_1=50[cm^3]")])).line.V_1 == 5e-5
 

@@ -14,7 +14,7 @@ import pytest
 
 from sealscope.parameters import load_rig, rig_names
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.rig import declared
+from sealscope.parameters.rig import declared_fields
 from sealscope.units import from_si, parse_unit
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -51,7 +51,7 @@ def test_table_4_1(name: str, value: float, unit: str) -> None:
     rig = load_rig("thesis")
     stored = rig[name]
     assert isinstance(stored, float)
-    assert from_si(stored, unit, unit_of(declared()[name])) == pytest.approx(value, rel=1e-15)
+    assert from_si(stored, unit, unit_of(declared_fields()[name])) == pytest.approx(value, rel=1e-15)
     assert "Table 4.1" in rig.entry(name).source
 
 
@@ -119,7 +119,7 @@ def test_every_value_has_a_source_and_a_unit_of_its_dimension() -> None:
         assert row.source.strip()
         assert row.meaning
         if row.unit == "":
-            assert row.value in choices_of(declared()[row.name])
+            assert row.value in choices_of(declared_fields()[row.name])
         elif row.unit != "bit":
             parse_unit(row.unit)
 
@@ -127,7 +127,7 @@ def test_every_value_has_a_source_and_a_unit_of_its_dimension() -> None:
 def test_table_holds_every_declared_parameter_once() -> None:
     rig = load_rig("thesis")
     rows = rig.table()
-    assert [row.name for row in rows] == list(declared())
+    assert [row.name for row in rows] == list(declared_fields())
     assert len({row.name for row in rows}) == len(rows) == 180
     for row in rows:
         assert row.name.endswith(row.symbol)

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.external import pilot_opening, pilot_valve_flow, polytropic_pressure
 from sealscope.physics.standstill import initial_state
 from sealscope.simulation.experiment import Experiment
 from sealscope.units import P_ATM
+
+from ..refusals import refusal
 
 #: Constant volumes: volume flows are balanced.
 FIXED = {"volumes": "fixed", "d_load": 500.0}
@@ -153,28 +154,23 @@ def test_a_closed_circuit_carries_a_load_with_the_oil_it_has(check_rig):
 
 
 def test_a_load_that_nothing_can_hold_is_refused_in_a_line(check_rig):
-    with pytest.raises(
-        InputError, match=r"a load of 2000 N must be carried at standstill .* above vacuum.*p_charge.*make-up"
-    ):
+    with refusal("2000 N", "p_charge"):
         initial_state(check_rig(F_l=2000.0), 0.0)
-    with pytest.raises(
-        InputError, match=r"drive must hold the load of 4e\+04 N at standstill, which takes .* at most 23 A"
-    ):
+    with refusal("4e+04 N", "23 A"):
         initial_state(single_rod(F_l=4e4), 0.0)
 
 
 @pytest.mark.parametrize(
-    ("values", "rule"),
+    ("values", "words"),
     [
-        ({"check_valves": "absent"}, r"relief valves must have an accumulator"),
-        ({"check_valves": "absent", "G_relief": 0.0}, r"single-rod cylinder \(A_A = 3117.25 .* pilot-operated"),
-        ({"check_valves": "present", "G_relief": 0.0}, r"single-rod cylinder .* got makeup.check_valves = present"),
-        ({"V_gas": "0.3 L"}, r"V_gas must be > the oil that the rod displaces .* 0.000384848 m\^3, got 0.0003 m\^3"),
-        ({"V_rod": "800[cm^3]"}, r"V_rod must be < V = 0.0007735 m\^3, got 0.0008 m\^3"),
-        ({"V_rod": "400[cm^3]"}, r"cylinder.V - V_rod must be > A_B L/2"),
+        ({"check_valves": "absent"}, "relief valves, accumulator"),
+        ({"check_valves": "absent", "G_relief": 0.0}, "A_A, 3117.25"),
+        ({"check_valves": "present", "G_relief": 0.0}, "makeup.check_valves"),
+        ({"V_gas": "0.3 L"}, "V_gas, 0.000384848 m^3, 0.0003 m^3"),
+        ({"V_rod": "800[cm^3]"}, "V_rod, 0.0007735 m^3, 0.0008 m^3"),
+        ({"V_rod": "400[cm^3]"}, "cylinder.V, V_rod, A_B, L/2"),
     ],
 )
-def test_an_impossible_circuit_is_one_line(values, rule):
-    with pytest.raises(InputError, match=rule) as refused:
+def test_an_impossible_circuit_is_one_line(values, words):
+    with refusal(*words.split(", ")):
         Experiment.of(rig="single-rod-eha", set=values, duration=1.0)
-    assert "\n" not in str(refused.value)

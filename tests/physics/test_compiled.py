@@ -44,8 +44,8 @@ import numpy as np
 from sealscope.compiled import cache_directory
 from sealscope.physics.solvers.advance import advance
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
-path = trajectory(Experiment.of(duration=0.2), ())
+from sealscope.simulation.integrate import integrate_run
+path = integrate_run(Experiment.of(duration=0.2), ())
 print(float(path["p_A"][-1]), sum(advance.stats.cache_hits.values()), cache_directory())
 """
 
@@ -232,12 +232,12 @@ def test_threads_that_import_kernels_at_once_cache_them_in_the_user_s_folder(tmp
         pytest.skip("compiled code is not cached here")
     monkeypatch.chdir(tmp_path)
 
-    class Slow(numba_private.PatientCache):
+    class Slow(numba_private.TolerantCache):
         def __init__(self, function):
             time.sleep(random.uniform(0.0, 0.01))
             super().__init__(function)
 
-    monkeypatch.setattr(numba_private, "PatientCache", Slow)
+    monkeypatch.setattr(numba_private, "TolerantCache", Slow)
     with ThreadPoolExecutor(4) as threads:
         kernels = list(threads.map(lambda _: compiled.kernel(compiled.source_hash), range(48)))
     assert {Path(kernel._cache.cache_path).parent for kernel in kernels} == {folder}

@@ -10,26 +10,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.friction import (
     bristle_rate,
     karnopp_friction,
     lugre_friction,
+    stribeck_force,
     stribeck_friction,
-    stribeck_level,
     stuck_velocity,
 )
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
+from ..refusals import refusal
+
 F_C, K_BRK, C_C, F_V, V_TH = 25.0, 3.0, 10.0, 300.0, 0.002
 SIGMA_0, SIGMA_1 = 1e6, 1e3
 
 
 def level(v: float) -> float:
-    return stribeck_level(abs(v), F_C, K_BRK, C_C)
+    return stribeck_force(abs(v), F_C, K_BRK, C_C)
 
 
 @pytest.mark.parametrize("v", [-0.3, -0.02, 0.0021, 0.05, 0.4])
@@ -89,7 +90,7 @@ def test_a_stuck_piston_balances_what_pushes_it_and_takes_no_power(v, applied):
 
 
 def test_a_law_needs_a_force_to_go_by():
-    with pytest.raises(InputError, match=r'friction.law = "lugre" must have coulomb_pressure = "sum"'):
+    with refusal("friction.law", "lugre", "coulomb_pressure", "sum"):
         load_rig("thesis").with_overrides({"friction.law": "lugre", "coulomb_pressure": "difference"})
 
 

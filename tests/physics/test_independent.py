@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 from sealscope.parameters import load_rig
 from sealscope.physics.standstill import initial_state
 from sealscope.physics.state import STATES
-from sealscope.simulation.courses import parse_force
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
+from sealscope.simulation.targets_and_loads import parse_force
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_an_independent_program_finds_the_same_over_20_s(check_rig, drive, varia
     if theirs is lines_and_losses:  # valves that move are held for an output; a leak's flow goes with the viscosity
         words = {"command": f"{volts} sin({omega}t)", "leak": "G = 1e-12", "fault": OPERATED, "duration": 20.0}
         experiment = Experiment.of(rig=rig, **words, rate=4000.0, error=5.0)
-        run = trajectory(experiment, experiment.leaks)
+        run = integrate_run(experiment, experiment.leaks)
     else:
         run = drive(rig, 20.01, u=lambda t: volts * np.sin(omega * t), **options)
     start = initial_state(rig, 0.0)[[STATES.index(state) for state in states]]

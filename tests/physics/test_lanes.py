@@ -15,12 +15,12 @@ from sealscope.physics.friction import stribeck_friction
 from sealscope.physics.lanes import (
     SINGLE_WIDTH,
     WIDTH,
-    anywhere,
+    any_lane,
+    broadcast,
     exponential,
     load,
     power_of_two,
     select,
-    spread,
     store,
 )
 from sealscope.physics.motor import winding_current_rate
@@ -33,7 +33,7 @@ def every_operation(x, y):
     z = (x + y) * (x - y) / (2.0 + abs(y)) + 1.5 * x - y / 3.0 + -x
     z = select((x > 0.3) & (y <= 1.0) | (x < -1.0), z, math.copysign(z, y))
     z = min(max(z, -4.0), x + 4.0) + math.sqrt(abs(x)) + math.pow(abs(x), 0.7)
-    if anywhere(y >= 2.5):
+    if any_lane(y >= 2.5):
         z = z + 1.0
     return z * power_of_two(3.0 + 0.0 * x) + exponential(x)
 
@@ -53,7 +53,7 @@ def in_numbers(x, y, out):
 
 def test_every_operation_does_on_lanes_what_it_does_on_numbers():
     x, y = np.random.default_rng(1).normal(0.0, 1.5, (2, 400, WIDTH))
-    y = np.where(np.any(y >= 2.5, axis=1, keepdims=True), np.maximum(y, 2.5), y)  # `anywhere` asks all lanes
+    y = np.where(np.any(y >= 2.5, axis=1, keepdims=True), np.maximum(y, 2.5), y)  # `any_lane` asks all lanes
     lanes, numbers = np.empty_like(x), np.empty_like(x)
     in_lanes(x, y, lanes)
     in_numbers(x, y, numbers)
@@ -77,7 +77,7 @@ def test_lanes_of_single_precision_do_the_same_to_six_digits():
 
 @kernel
 def spread_out(value, out):
-    store(out, 0, spread(value))
+    store(out, 0, broadcast(value))
     store(out, 1, load(out, 0) + 1)
 
 

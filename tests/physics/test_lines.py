@@ -15,27 +15,28 @@ from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson, simpson
 from scipy.optimize import brentq
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.cylinder import opposing_force
-from sealscope.physics.fluid import kinematic_viscosity, thermal_density, thermal_stiffness
+from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio, thermal_stiffness_ratio
 from sealscope.physics.pump import friction_torque, loss_coefficients, turbulent_slip
 from sealscope.physics.restrictors import (
-    behind_shut_off,
-    behind_valve,
     clogged_resistance,
+    compiled_series_coefficient,
     filtered_flow,
     flow_through_filter,
     implicit_orifice_flow,
     orifice_flow,
+    series_coefficient,
 )
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.leaks import from_time
+from sealscope.simulation.leaks import opening_from
 from sealscope.simulation.simulate import simulate_experiment
+
+from ..refusals import refusal
 
 LINES = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %", "p_charge": "2 MPa"}
 LOSSES = {"T_f": 0.09, "C_f": 0.03, "C_h": 60.0, "C_st": 2e-5, "G_pump": 2e-13}
@@ -64,8 +65,8 @@ def test_a_shut_off_valve_s_pressure_drop_adds_to_that_of_the_throttle(c, c_line
         return (Q / c) ** 2 + (Q / (s * c_line)) ** 2 - (Q / c_line) ** 2 - dp
 
     Q = brentq(left, 0.0, c * math.sqrt(dp) * (1 + 1e-9), xtol=1e-20)
-    assert behind_shut_off(c, c_line, s) * math.sqrt(dp) == pytest.approx(Q, rel=1e-9)
-    assert (behind_valve(c, c_line, 1.0), behind_valve(c, c_line, 0.0)) == (c, 0.0)
+    assert series_coefficient(c, c_line, s) * math.sqrt(dp) == pytest.approx(Q, rel=1e-9)
+    assert (compiled_series_coefficient(c, c_line, 1.0), compiled_series_coefficient(c, c_line, 0.0)) == (c, 0.0)
 
 
 @given(dp=st.floats(-2e7, 2e7), R=st.floats(1e6, 1e12))
@@ -97,8 +98,8 @@ def test_viscosity_follows_the_chart():
     """32 and 5.4 mm^2/s at 40 and 100 deg C are 8.5 at 80 deg C (ASTM D341)."""
     T = np.array([313.15, 353.15, 373.15])
     assert np.round(1e6 * kinematic_viscosity(T, 32e-6, 5.4e-6), 1).tolist() == [32.0, 8.5, 5.4]
-    assert thermal_density(np.array([333.15]), 313.15, 7e-4) == pytest.approx(1 - 0.014)
-    assert thermal_stiffness(np.array([333.15]), 313.15) == pytest.approx(10**-0.048)
+    assert thermal_density_ratio(np.array([333.15]), 313.15, 7e-4) == pytest.approx(1 - 0.014)
+    assert thermal_stiffness_ratio(np.array([333.15]), 313.15) == pytest.approx(10**-0.048)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +148,7 @@ def finely(drive):
     """All parts, with fixed volumes and a leak, while line A shuts and opens again, at a step of 10 us."""
     rig = rig_with(**PARTS)
     effects = [effect for text in OPERATED for effect in parse_fault(text).effects(rig)]
-    effects = [replace(effect, shortest=1e-3) for effect in effects]  # outputs have the flows of their steps
+    effects = [replace(effect, min_block=1e-3) for effect in effects]  # outputs have the flows of their steps
     step = 1e-5
     u = {"u": lambda t: 4.0 * np.sin(3.0 * t)}
     return rig, drive(rig, 2.0 + step, **u, G=1e-12, rate=1e5, step=step, effects=effects)
@@ -238,7 +239,7 @@ def test_a_leak_passes_what_the_oil_s_viscosity_lets_it(warmer):
     assert truth.mean_leak_lpm == pytest.approx(0.02, rel=2e-3)
     dp = truth.outputs["p_A"] - truth.outputs["p_B"]
     G = truth.leaks[0].coefficient
-    thick = parse_fault(fault).viscosity(load_rig("thesis"))(np.zeros(1))[0]
+    thick = parse_fault(fault).viscosity_ratio(load_rig("thesis"))(np.zeros(1))[0]
     np.testing.assert_allclose(truth.outputs["q_leak"], G / thick * dp, rtol=1e-9, atol=1e-15)
     assert (thick < 1.0) == (warmer > 0.0)
     o = truth.outputs
@@ -313,32 +314,31 @@ def test_lanes_run_all_parts_as_a_run_by_itself_does(details_of):
 
 
 @pytest.mark.parametrize(
-    ("values", "fault", "rule"),
+    ("values", "fault", "words"),
     [
-        ({"R_A": 1e9}, None, r"a filter must be in a line .*, got line.R_A = 1e\+09 and line.orifices = absent"),
-        ({"open_B": 0.5}, None, r"a shut-off valve must be in a line .* got line.open_B = 0.5"),
-        ({}, "shut-off A to 0 %", r"a shut-off valve must be in a line \(line.orifices = present\), got absent"),
-        ({}, "circulation from 1 s", r"a circulation valve must have line.G_circ > 0, got 0"),
+        ({"R_A": 1e9}, None, "line.R_A, 1e+09, line.orifices, absent"),
+        ({"open_B": 0.5}, None, "line.open_B, 0.5"),
+        ({}, "shut-off A to 0 %", "line.orifices, absent"),
+        ({}, "circulation from 1 s", "line.G_circ, 0"),
         (
             {**LINES, "k_clog_A": 5.0},
             None,
-            r"line.k_clog_A must stand with a filter \(R_A > 0\), got line.k_clog_A = 5",
+            "line.k_clog_A, R_A, 5",
         ),
-        (LINES, "filter B x3", r"a filter that clogs must have line.R_B > 0, got 0"),
-        (LINES, "shut-off B to 120 %", r"must open 0 to 1 .0 % to 100 %., got 1.2"),
-        (LINES, "shut-off B to 0 % from 2 s to 2.1 s within 0.5 s", r"takes 0.5 s must end later .* got 2.1 s"),
-        ({}, "oil +200 K", r"temperature must change by at most 100 K, got 200"),
-        ({"nu_100": "40[mm^2/s]"}, None, r"nu_100 must be < nu_40 = 3.2e-05 m\^2/s"),
+        (LINES, "filter B x3", "line.R_B, 0"),
+        (LINES, "shut-off B to 120 %", "1.2"),
+        (LINES, "shut-off B to 0 % from 2 s to 2.1 s within 0.5 s", "0.5 s, 2.1 s"),
+        ({}, "oil +200 K", "temperature, 100 K, 200"),
+        ({"nu_100": "40[mm^2/s]"}, None, "nu_100, nu_40, 3.2e-05 m^2/s"),
     ],
 )
-def test_an_impossible_line_is_one_line(values, fault, rule):
-    with pytest.raises(InputError, match=rule) as refused:
+def test_an_impossible_line_is_one_line(values, fault, words):
+    with refusal(*words.split(", ")):
         Experiment.of(set=values, fault=fault, duration=3.0)
-    assert "\n" not in str(refused.value)
 
 
 def test_operations_are_read_back_from_their_own_words():
     for fault in (*OPERATED, "filter A x10 growing from 1 s to 3 s", "oil -5 K from 1 s"):
         assert str(parse_fault(str(parse_fault(fault)))) == str(parse_fault(fault))
     assert parse_fault(OPERATED[0]) == Fault("shut-off", 0.0, "A", parse_fault(OPERATED[0]).opening)
-    assert parse_fault("circulation") == Fault("circulation", opening=from_time(0.0))
+    assert parse_fault("circulation") == Fault("circulation", opening=opening_from(0.0))

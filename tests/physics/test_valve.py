@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import simpson
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.external import accumulator_compliance, gas_volume, polytropic_pressure
 from sealscope.physics.standstill import initial_state
 from sealscope.physics.valve import edge_flow
 from sealscope.simulation.experiment import Experiment
 from sealscope.units import P_ATM
+
+from ..refusals import refusal
 
 EDGES = ("o_PA", "o_AT", "o_PB", "o_BT")
 
@@ -176,37 +177,36 @@ def test_where_volumes_move_the_mass_is_kept(drive, amplitude, G, lap, G_ext):
 
 
 @pytest.mark.parametrize(
-    ("values", "rule"),
+    ("values", "words"),
     [
         (
             {"supply.drive": "absent"},
-            r"a servo valve must have a supply.* got .*present and supply.drive = absent",
+            "supply.drive, absent",
         ),
         (
             {"valve.spool": "absent"},
-            r"and a supply a valve.* got valve.spool = absent and .* = constant-speed",
+            "valve.spool, absent, constant-speed",
         ),
         (
             {"o_PA": "-0.6[mm]"},
-            r"valve.o_PA must be within .* stroke, \+-0.0005 m \(valve.x_max\), got -0.0006 m",
+            "valve.o_PA, valve.x_max, +-0.0005 m, -0.0006 m",
         ),
-        ({"x_max": "0.02[mm]", "o_BT": "0.02[mm]"}, r"valve.o_BT must be within the spool's stroke"),
-        ({"orifices": "present"}, r"must have line.orifices = absent, got present"),
-        ({"check_valves": "present"}, r"must have makeup.check_valves = absent, got present"),
-        ({"K_i": 0.0}, r"motor.K_i must be > 0 V/rad where the motor holds the speed of a supply, got 0"),
-        ({"p_pre": "8[MPa]"}, r"supply.p_pre must be < p_set \+ p_return = 7.3e\+06 Pa.* got 8e\+06 Pa"),
+        ({"x_max": "0.02[mm]", "o_BT": "0.02[mm]"}, "valve.o_BT"),
+        ({"orifices": "present"}, "present, line.orifices"),
+        ({"check_valves": "present"}, "present, makeup.check_valves"),
+        ({"K_i": 0.0}, "motor.K_i, 0 V/rad"),
+        ({"p_pre": "8[MPa]"}, "supply.p_pre, p_set, p_return, 7.3e+06 Pa, 8e+06 Pa"),
     ],
 )
-def test_an_impossible_valve_is_one_line(values, rule):
-    with pytest.raises(InputError, match=rule) as refused:
+def test_an_impossible_valve_is_one_line(values, words):
+    with refusal(*words.split(", ")):
         Experiment.of(rig="servo-valve", set=values, duration=1.0)
-    assert "\n" not in str(refused.value)
 
 
 def test_what_the_supply_cannot_hold_is_one_line():
-    with pytest.raises(InputError, match=r"load of 6000 N must be .* supply's 7.54\de\+06 Pa.* raise supply.p_set"):
+    with refusal("6000 N", "supply.p_set"):
         initial_state(valve_rig(F_l=6000.0), 0.0)
-    with pytest.raises(InputError, match=r"the drive must hold the supply .* got at most 23 A and 260 V"):
+    with refusal("23 A", "260 V"):
         initial_state(valve_rig(omega_P="4000[rpm]"), 0.0)
 
 

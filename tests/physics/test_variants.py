@@ -83,7 +83,7 @@ class Account:
         self.rig, self.run, self.G, self.C = rig, run, G, C
         self.p_A, self.p_B, self.p_1, self.p_2 = (run[name] for name in ("p_A", "p_B", "p_1", "p_2"))
         self.throttled = rig.line.orifices == "present"
-        self.valved = rig.valve.spool == "present"
+        self.valved = rig.circuit.valve_controlled
         self.port_1, self.port_2 = (self.p_1, self.p_2) if self.throttled else (self.p_A, self.p_B)
         self.D = rig.pump.q_b / (2 * math.pi)
         self.over_pump = self.p_1 - self.p_2

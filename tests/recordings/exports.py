@@ -303,6 +303,7 @@ EACH: dict[str, Dialect] = {
     "a clock each, TwinCAT Scope, semicolon": Dialect(twincat(comma=True, join=";")),
     "a clock each, two called t": Dialect(pairs("t,p_A [bar],t,p_B [bar],t,x [mm]")),
     "a clock each, with units": Dialect(pairs("t [s],p_A [bar],t [s],p_B [bar],t [s],x [mm]", join=";")),
+    "a clock each, LabVIEW": Dialect(pairs("X_Value,p_A [bar],X_Value,p_B [bar],X_Value,x [mm]", join="\t")),
     "a clock each, numbered": Dialect(pairs("Time,p_A [bar],Time.1,p_B [bar],Time.2,x [mm]", join="\t")),
     "a clock each, X": Dialect(pairs("X [s];p_A [bar];X [s];p_B [bar];X [s];x [mm]".replace(";", ","), join=";")),
     "a clock each, X and Y": Dialect(pairs("p_A X,p_A Y [bar],p_B X,p_B Y [bar],x X,x Y [mm]")),

@@ -7,70 +7,70 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
 from sealscope.recordings.formats import table
 
+from ..refusals import mentions, refusal
 from .refusals import count_bytes, refused
 
 GOOD = "t [s],p_A [bar],note\n0,1,a\n0.002,2,b\n0.004,3,c\n"
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "names"),
     [
-        ("", "a recording must hold data, got an empty file (FILE)"),
-        ("\n  \n", "a recording must have samples, got an empty file (FILE)"),
-        ("t [s],p_A [Pa]\n", "a recording must have samples, got no row of numbers after t [s], p_A [Pa] (FILE)"),
+        ("", "data, empty file"),
+        ("\n  \n", "samples, empty file"),
+        ("t [s],p_A [Pa]\n", "samples, t [s], p_A [Pa]"),
         (
             "p_A [Pa]\n1\n2\n3\n",
-            "a recording must have a time column such as t [s] or be given a rate, got columns p_A [Pa] (FILE)",
+            "time, rate, p_A [Pa]",
         ),
         (
             GOOD.replace("2,b", "two,b"),
-            "a sample must be a number, got 'two' (line 3, column p_A [bar], FILE)",
+            "sample, 'two', line 3, p_A [bar]",
         ),
         (
             GOOD.replace("2,b", "1e5000,b"),
-            "a sample must be a finite number, got '1e5000' (line 3, column p_A [bar], FILE)",
+            "sample, '1e5000', line 3",
         ),
-        (GOOD.replace("2,b", "1_0,b"), "a sample must be a number, got '1_0' (line 3, column p_A [bar], FILE)"),
-        (GOOD.replace("0.002,2,b", "0.002"), "a row must have 3 cells, got 1 (line 3, FILE)"),
-        (GOOD.replace("2,b", "2,b,c,d"), "a row must have 3 cells, got 5 (line 3, FILE)"),
+        (GOOD.replace("2,b", "1_0,b"), "sample, '1_0', line 3"),
+        (GOOD.replace("0.002,2,b", "0.002"), "row, 1, line 3"),
+        (GOOD.replace("2,b", "2,b,c,d"), "row, 5, line 3"),
         (
             GOOD.replace("[bar]", "[mm]"),
-            "p_A must have a unit of pressure, such as Pa, got mm (FILE)",
+            "p_A, mm",
         ),
         (
             GOOD.replace("[bar]", "[wibble]"),
-            "p_A must have a unit of pressure, such as Pa, got wibble, which is no known unit (FILE)",
+            "p_A, wibble",
         ),
-        (GOOD.replace("[s]", "[m]"), "time must have a unit of time, such as s, got m (FILE)"),
+        (GOOD.replace("[s]", "[m]"), "time, m"),
         (
             GOOD.replace("p_A", "Druck"),
-            "a recording must have a channel (u, omega, theta, x, p_1, p_2, p_A, p_B, q_leak, q_comp, q_pump, T_oil) "
-            "or be given a map such as p_A=COLUMN, got columns t [s], Druck [bar], note (FILE)",
+            "channel, map, Druck [bar], note",
         ),
         (
             "t [s],p_A [Pa],p_A [Pa]\n0,1,2\n1,2,3\n",
-            "channel p_A must be one column, got columns 2 and 3: map its number, #2 (FILE)",
+            "p_A, 2, 3, #2",
         ),
-        ("t [s],p_A [Pa]\n0,1\n", "time must increase between some samples (FILE)"),
-        ("t [s],p_A [Pa]\n3,1\n3,1\n3,1\n", "time must increase between some samples (FILE)"),
+        ("t [s],p_A [Pa]\n0,1\n", "time, increase"),
+        ("t [s],p_A [Pa]\n3,1\n3,1\n3,1\n", "time, increase"),
         ("Date,p_A [Pa]\n5/31/24,1\n6/1/24,2\n",
-         "a recording must have a time column such as t [s] or be given a rate, got dates alone in column Date (FILE)"),
+         "time, rate, Date"),
         ("Timestamp,p_A [Pa]\n2024-05-31T10:00:00,1\nyesterday,2\n2024-05-31T10:00:02,3\n",
-         "time must be a stamp such as 2024-05-31T12:00:00.002, got 'yesterday' (line 3, column Timestamp, FILE)"),
+         "time, 'yesterday', line 3, Timestamp"),
         ("# sealscope: {broken\nt [s],p_A [Pa]\n0,1\n1,2\n",
-         "the recording's description must be whole, got damaged JSON (FILE)"),
+         "description, JSON"),
         ('# sealscope: {"format": 99, "rate": 1, "provenance": {}, "history": []}\nt [s],p_A [Pa]\n0,1\n1,2\n',
-         "format must be at most 1, got 99: newer software (FILE)"),
+         "format, 99"),
     ],
 )  # fmt: skip
-def test_text(tmp_path: Path, content: str, message: str) -> None:
+def test_text(tmp_path: Path, content: str, names: str) -> None:
     path = tmp_path / "log.csv"
     path.write_text(content)
-    assert refused(path) == message
+    assert mentions(refused(path), "FILE", *names.split(", "))
 
 
 @pytest.mark.parametrize(
@@ -157,15 +157,15 @@ def test_missing_mapped_column(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "words"),
     [
-        ({"rate": 0.0}, "rate must be > 0 Hz, got 0.0"),
-        ({"rate": float("nan")}, "rate must be > 0 Hz, got nan"),
-        ({"map": {"P_X": "a"}}, "a mapped channel must be one of"),
+        ({"rate": 0.0}, "rate, 0.0"),
+        ({"rate": float("nan")}, "rate, nan"),
+        ({"map": {"P_X": "a"}}, "channel"),
     ],
 )
-def test_wrong_calls(tmp_path: Path, options: dict[str, object], message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_wrong_calls(tmp_path: Path, options: dict[str, object], words: str) -> None:
+    with refusal(*words.split(", ")) as caught:
         read(tmp_path / "log.csv", **options)  # type: ignore[arg-type]
     assert not isinstance(caught.value, UnreadableFile)
 

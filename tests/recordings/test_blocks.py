@@ -66,7 +66,7 @@ def in_blocks(path: Path, size: int, large: bool = False, **given: object) -> tu
     """What reading in blocks of this size gives; a `large` log's plain blocks are read by pyarrow, if installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(text, "_CHUNK", size)
-        patch.setattr(text, "_LARGE", 0 if large else 2**40)
+        patch.setattr(text, "_MIN_ARROW_SIZE", 0 if large else 2**40)
         return outcome(path, **given)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from sealscope.recordings import read
 
+from ..refusals import mentions
 from .dialects import RATE, N, T, deviations
 from .exports import EXPORTS, POSITION, RECORDS, A, twincat
 from .refusals import count_calls, refused
@@ -28,31 +29,31 @@ def test_exports_are_read_to_their_last_digit(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "names"),
     [
         ('{"t": 0, "p_A": 1}\n{"t": 1, "p_A": }\n{"t": 2, "p_A": 3}\n',
-         "JSON must be whole, got: Expecting value (line 2, FILE)"),
-        ('{"t": 0, "p_A [Pa]": 1e999}\n', "a sample must be a finite number, got an infinite one for p_A [Pa] (FILE)"),
-        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 400), "a sample must be a finite number, got an infinite one"),
-        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 9000), "JSON must be plain, got: Exceeds the limit"),
-        ('{"t": 0, "p": ' + "[" * 100_000, "JSON must be plain, got: maximum recursion depth"),
+         "JSON, whole, line 2"),
+        ('{"t": 0, "p_A [Pa]": 1e999}\n', "sample, finite, p_A [Pa]"),
+        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 400), "sample, finite, p_A [Pa]"),
+        ('{"t": 0, "p_A [Pa]": 1%s}\n' % ("0" * 9000), "JSON, plain"),
+        ('{"t": 0, "p": ' + "[" * 100_000, "JSON, plain"),
         ('[{"t": 0, "p_A": {"value": 1, "unit": "bar"}}, {"t": 1, "p_A": {"value": 1, "unit": "psi"}}]',
-         "p_A must have one unit, got bar and psi (row 2, FILE)"),
-        ('{"t": 0}\n3\n', "JSON must hold objects or arrays, got '3' (row 2, FILE)"),
-        ('[["t", "p_A"], [0, 1, 2]]', "a row must have 2 values, got 3 (row 1, FILE)"),
-        ("[]", "a recording must have samples, got empty JSON (FILE)"),
-        ('{"a": {}}', "JSON must hold records or columns of samples, got none (FILE)"),
-        ('{"t": [0, 1], "p_A [Pa]": [1, 2, 3]}', "p_A [Pa] must have as many samples as t (2), got 3 (FILE)"),
-        ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records must have at most 1024 names, got more (FILE)"),
-        ("[" + "[]," * 20_000, "JSON must hold records or columns of samples, got none (FILE)"),
-        ('{"a": "' + "x" * 3_000_000, "JSON must be whole, got: Unterminated string starting at (line 1, FILE)"),
-        ('{"a":[' + "{}," * 400_000 + "0]}", "JSON must hold records or columns of samples, got none (FILE)"),
+         "p_A, bar, psi, row 2"),
+        ('{"t": 0}\n3\n', "JSON, '3', row 2"),
+        ('[["t", "p_A"], [0, 1, 2]]', "2, 3, row 1"),
+        ("[]", "samples, JSON"),
+        ('{"a": {}}', "JSON, records, columns"),
+        ('{"t": [0, 1], "p_A [Pa]": [1, 2, 3]}', "p_A [Pa], 2, 3"),
+        ("\n".join(f'{{"n{k}": 1}}' for k in range(2000)), "records, 1024"),
+        ("[" + "[]," * 20_000, "JSON, records, columns"),
+        ('{"a": "' + "x" * 3_000_000, "JSON, whole, line 1"),
+        ('{"a":[' + "{}," * 400_000 + "0]}", "JSON, records, columns"),
     ],
 )  # fmt: skip
-def test_json_that_is_no_log(content: str, message: str, tmp_path: Path) -> None:
+def test_json_that_is_no_log(content: str, names: str, tmp_path: Path) -> None:
     path = tmp_path / "log.json"
     path.write_text(content)
-    assert refused(path).startswith(message)
+    assert mentions(refused(path), "FILE", *names.split(", "))
 
 
 def test_what_has_brackets_and_is_no_json_is_a_text(tmp_path: Path) -> None:
@@ -206,20 +207,20 @@ def test_a_table_with_a_column_of_names_is_read_as_it_was_where_a_map_names_its_
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "names"),
     [
-        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "a sample must be a number, got 'yesterday'"),
-        ("Name,Time,Value\n" + "".join(f"n{k},{k},1\n" for k in range(5000)), "a long table must have at most 4096"),
-        ("Name,Time,Value\n" + "p_A [Pa],3,1\n" * 9, "time must increase between some samples (FILE)"),
+        ("Name,Time,Value\n" + "p_A,yesterday,1\n" * 3, "sample, 'yesterday'"),
+        ("Name,Time,Value\n" + "".join(f"n{k},{k},1\n" for k in range(5000)), "long table, 4096"),
+        ("Name,Time,Value\n" + "p_A [Pa],3,1\n" * 9, "time, increase"),
         ("Name,Time,Value\n" + "".join(f"p_A [Pa],{k / 50},word\np_B [Pa],{k / 50},1\n" for k in range(99)),
-         "p_A [Pa] must hold numbers, got text (FILE)"),
-        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,,2\n1,1,,2\n", "time must have a number in some row, got none in column t"),
-        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,0,2\n1,1,1,2\n2,1,1,3\n", "the times of p_B [Pa] must increase"),
+         "p_A [Pa], text"),
+        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,,2\n1,1,,2\n", "time, column t"),
+        ("t,p_A [Pa],t,p_B [Pa]\n" + "0,1,0,2\n1,1,1,2\n2,1,1,3\n", "times, p_B"),
     ],
 )  # fmt: skip
-def test_long_tables_and_clocks_that_are_none(content: str, message: str, tmp_path: Path) -> None:
+def test_long_tables_and_clocks_that_are_none(content: str, names: str, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(content)
-    assert refused(tmp_path / "log.csv").startswith(message)
+    assert mentions(refused(tmp_path / "log.csv"), "FILE", *names.split(", "))
 
 
 def with_cells(folder: Path, **cells: str) -> Path:

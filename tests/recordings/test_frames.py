@@ -9,6 +9,8 @@ import sealscope as ss
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 from sealscope.recordings import COUNTS, Recording
 
+from ..refusals import refusal
+
 pandas = pytest.importorskip("pandas")
 RATE = 500.0
 
@@ -112,7 +114,7 @@ def test_frames_that_are_no_recordings(columns: dict, options: dict, message: st
         Recording.from_pandas(pandas.DataFrame(columns), **options)
     assert str(refused.value).startswith(message)
     assert not isinstance(refused.value, UnreadableFile)
-    with pytest.raises(InputError, match=r"frame must be a pandas.DataFrame, got a dict"):
+    with refusal("frame", "dict"):
         Recording.from_pandas(columns)
 
 
@@ -139,7 +141,7 @@ def test_without_the_libraries_the_extra_is_named(monkeypatch: pytest.MonkeyPatc
         ("pandas", lambda: Recording.from_pandas({})),
     ):
         monkeypatch.setitem(sys.modules, library, None)
-        with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
+        with refusal("sealscope[io]", error=MissingExtra):
             call()
 
 

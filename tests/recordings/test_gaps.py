@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording
-from sealscope.recordings.corrections.clock import even_clock
-from sealscope.recordings.corrections.gaps import bridge, holes, touched
+from sealscope.recordings.corrections.clock import resample_evenly
+from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes
 
 RATE, NOISE = 500.0, 1e3
 NEEDED = ("u", "p_A", "p_B")
@@ -65,7 +65,7 @@ def test_rows_that_a_logger_lost_come_back_at_their_times() -> None:
     kept = np.ones(len(whole), dtype=bool)
     kept[[5000, *range(9000, 9700)]] = False
     cut = replace(whole, t=whole.t[kept], channels={name: values[kept] for name, values in whole.channels.items()})
-    recording = bridge(even_clock(cut), NEEDED)
+    recording = bridge(resample_evenly(cut), NEEDED)
     assert recording.bridged is not None
     assert np.array_equal(recording.bridged, ~kept)
     assert np.allclose(recording.t, whole.t, atol=1e-9)
@@ -82,7 +82,7 @@ def test_without_a_cycle_a_line_joins_both_ends() -> None:
     assert np.flatnonzero(recording.bridged).tolist() == [*range(5000, 5010), *range(9000, 9050)]
     line = np.linspace(whole["p_A"][8999], whole["p_A"][9050], 52)[1:-1]
     assert np.allclose(recording["p_A"][9000:9050], line)
-    assert np.flatnonzero(holes(recording)).tolist() == [*range(9000, 9050)]  # longer than a tenth of a test function
+    assert np.flatnonzero(flag_holes(recording)).tolist() == [*range(9000, 9050)]  # over a tenth of a test function
 
 
 def test_a_cycle_is_not_taken_from_another_duty() -> None:
@@ -99,7 +99,7 @@ def test_a_recording_of_short_gaps_is_bridged(share: float) -> None:
     whole = machine()
     recording = bridge(holed(whole, np.random.default_rng(0).random(len(whole)) < share), NEEDED)
     assert np.isfinite(recording["p_A"][10:-10]).all()
-    assert not holes(recording).any()
+    assert not flag_holes(recording).any()
 
 
 def test_infinity_is_a_missing_value() -> None:
@@ -118,7 +118,7 @@ def test_late_and_repeated_rows_are_dropped() -> None:
     whole = machine()
     order = np.arange(len(whole))
     order[8000:8003] = [8002, 8000, 8001]
-    recording = even_clock(cut(whole, np.insert(order, 500, 500)))
+    recording = resample_evenly(cut(whole, np.insert(order, 500, 500)))
     assert np.array_equal(np.flatnonzero(np.isnan(recording["p_A"])), [8000, 8001])
     assert np.allclose(recording.t, whole.t, atol=1e-9)
 
@@ -126,10 +126,10 @@ def test_late_and_repeated_rows_are_dropped() -> None:
 def test_of_two_recordings_in_one_file_the_longer_is_kept() -> None:
     whole = machine()
     at = np.arange(len(whole))
-    leapt = even_clock(replace(whole, t=whole.t + 3600.0 * (at >= 12_000)))
+    leapt = resample_evenly(replace(whole, t=whole.t + 3600.0 * (at >= 12_000)))
     assert leapt.t[0] == pytest.approx(3624.0)
     assert len(leapt) == len(whole) - 12_000
-    set_back = even_clock(replace(whole, t=whole.t - 20.0 * (at >= 12_000)))
+    set_back = resample_evenly(replace(whole, t=whole.t - 20.0 * (at >= 12_000)))
     assert len(set_back) == len(whole) - 12_000
 
 
@@ -141,7 +141,7 @@ def test_an_uneven_clock_is_evened_and_its_holes_are_missing() -> None:
     t = np.cumsum(steps)
     t = t[t < 19.9]
     taken = {name: np.interp(t, whole.t, values) for name, values in whole.channels.items()}
-    even = even_clock(Recording(t, taken, CHANNEL_UNITS, 1.0 / 0.015))
+    even = resample_evenly(Recording(t, taken, CHANNEL_UNITS, 1.0 / 0.015))
     assert np.allclose(np.diff(even.t), 0.015)
     missing = even.t[np.isnan(even["u"])]
     assert missing.min() > t[399] - 1e-9
@@ -154,7 +154,7 @@ def test_many_gaps_cost_no_more_than_one() -> None:
     """A file of bursts: each gap is as long as the recording of its burst, and the rows stay few."""
     whole = machine()
     at = np.arange(len(whole))
-    recording = even_clock(cut(whole, at, t=whole.t + 40.0 * (at // 10)))
+    recording = resample_evenly(cut(whole, at, t=whole.t + 40.0 * (at // 10)))
     assert len(recording) == 10
 
 
@@ -163,6 +163,6 @@ def test_a_block_is_touched_by_more_than_a_hundredth() -> None:
     bridged = np.zeros(len(recording), dtype=bool)
     bridged[[*range(1000, 1010), *range(2000, 2011)]] = True
     recording = replace(recording, bridged=bridged)
-    assert np.flatnonzero(touched(recording, np.arange(0, 30_001, 1000))).tolist() == [2]
+    assert np.flatnonzero(flag_bridged(recording, np.arange(0, 30_001, 1000))).tolist() == [2]
     assert recording.samples(slice(2000, 3000)).bridged is not None
     assert recording.samples(slice(3000, 4000)).bridged is None

@@ -87,13 +87,13 @@ def test_whatever_a_format_library_raises_names_the_file(
         pytest.importorskip("pyarrow")
     write(Recording(T, {"p_A": P}, {"p_A": "Pa"}, 500.0), path)
     module = {"log.csv": "text", "log.h5": "netcdf", "log.parquet": "parquet"}[name]
-    inner = {"text": "_blocks", "netcdf": "_values", "parquet": "_values"}[module]
+    inner = {"text": "_iter_line_blocks", "netcdf": "_read_values", "parquet": "_read_values"}[module]
 
     def fail(*args: object) -> None:
         raise error("odd\nthing")
 
     monkeypatch.setattr(f"sealscope.recordings.formats.{module}.{inner}", fail)
-    monkeypatch.setattr("sealscope.recordings.files.file_apart", lambda work, *arguments, **limits: work(*arguments))
+    monkeypatch.setattr("sealscope.recordings.files.run_on_file", lambda work, *arguments, **limits: work(*arguments))
     kind = {"text": "text", "netcdf": "NetCDF or HDF5", "parquet": "Parquet"}[module]
     with caplog.at_level(logging.DEBUG, "sealscope"):
         assert refused(path) == f"a {kind} file must be whole, got: odd thing (FILE)"

@@ -16,6 +16,8 @@ from sealscope.errors import InputError
 from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
 from sealscope.recordings.cycle import find_cycle
 
+from ..refusals import refusal
+
 FORMATS = ["nc", "csv", "tsv", "parquet"]
 json_values = st.recursive(
     st.none()
@@ -134,22 +136,21 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(
 
 
 @pytest.mark.parametrize(
-    ("recording", "name", "message"),
+    ("recording", "name", "words"),
     [
-        (plain(), "log.xlsx", "must end in"),
-        (plain(), "log", "must end in"),
-        (plain(), "absent/log.csv", "folder of a file to write must exist"),
-        (plain(0), "log.nc", "at least one sample"),
-        (Recording([0, 1], {"load": [1, 2]}, {"load": "N"}, 1.0), "log.csv", "channel to write must be one of"),
-        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "psi"}, 1.0), "log.csv", "must be in Pa or count"),
-        (Recording([0, 1], {"p_A": [1, np.inf]}, {"p_A": "Pa"}, 1.0), "log.csv", "must be finite or missing"),
-        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "Pa"}, 1.0, {"o": object()}), "log.nc", "JSON values only"),
+        (plain(), "log.xlsx", ".nc, .csv"),
+        (plain(), "log", ".nc, .csv"),
+        (plain(), "absent/log.csv", "folder"),
+        (plain(0), "log.nc", "sample"),
+        (Recording([0, 1], {"load": [1, 2]}, {"load": "N"}, 1.0), "log.csv", "channel"),
+        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "psi"}, 1.0), "log.csv", "Pa, count"),
+        (Recording([0, 1], {"p_A": [1, np.inf]}, {"p_A": "Pa"}, 1.0), "log.csv", "finite"),
+        (Recording([0, 1], {"p_A": [1, 2]}, {"p_A": "Pa"}, 1.0, {"o": object()}), "log.nc", "JSON"),
     ],
 )
-def test_refused_before_anything_is_written(tmp_path: Path, recording: Recording, name: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_refused_before_anything_is_written(tmp_path: Path, recording: Recording, name: str, words: str) -> None:
+    with refusal(*words.split(", ")):
         write(recording, tmp_path / name)
-    assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -157,17 +158,17 @@ def test_parquet_without_pyarrow_names_the_extra(tmp_path: Path, monkeypatch: py
     import sys
 
     from sealscope.errors import MissingExtra
-    from sealscope.recordings.apart import CrashedApartError, run_apart
+    from sealscope.recordings.subprocesses import CrashedSubprocessError, run_in_subprocess
 
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
+    with refusal("sealscope[io]", error=MissingExtra):
         write(plain(), tmp_path / "log.parquet")
     (tmp_path / "foreign.parquet").write_bytes(b"PAR1 and more")
-    run_apart(exec, "__import__('sys').modules['pyarrow'] = None", limit=10.0)
+    run_in_subprocess(exec, "__import__('sys').modules['pyarrow'] = None", limit=10.0)
     try:
-        with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[io\]'"):
+        with refusal("sealscope[io]", error=MissingExtra):
             read(tmp_path / "foreign.parquet")
     finally:
-        with pytest.raises(CrashedApartError):
-            run_apart(os.abort, limit=10.0)
+        with pytest.raises(CrashedSubprocessError):
+            run_in_subprocess(os.abort, limit=10.0)
     assert [entry.name for entry in tmp_path.iterdir()] == ["foreign.parquet"]

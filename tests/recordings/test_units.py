@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from sealscope.errors import InputError
 from sealscope.units import LITRE_PER_MINUTE, from_si, parse_quantity, same_dimension, to_si
 
+from ..refusals import refusal
+
 KNOWN = [
     ("234 cm^3", "m^3", 2.34e-4),
     ("2[L/min]", "m^3/s", 2 / 60000),
@@ -81,27 +83,26 @@ def test_agrees_with_pint(unit: str, si_unit: str, pint_unit: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "si_unit", "message"),
+    ("text", "si_unit", "names"),
     [
-        ("2 Hz", "rad/s", "q must have a unit of angular speed, such as rad/s, got Hz (rig.toml)"),
-        ("2 mm", "Pa", "q must have a unit of pressure, such as Pa, got mm (rig.toml)"),
-        ("2 counts", "Pa", "q must have a unit of pressure, such as Pa, got counts (rig.toml)"),
-        ("4 cm^3", "m^3/rev", "q must have a unit of volume per turn, such as m^3/rev, got cm^3 (rig.toml)"),
-        ("3 furlongz", "m", "q must have a unit of length, such as m, got furlongz, which is no known unit (rig.toml)"),
-        ("3 Pa", "1", "q must have no unit, or %, got Pa (rig.toml)"),
-        ("1e5000", "Pa", "q must be a finite number, got 1e5000 (rig.toml)"),
-        ("1e308 MPa", "Pa", "q must be a finite number, got 1e308 MPa (rig.toml)"),
-        ("nan", "Pa", "q must be a finite number, got nan (rig.toml)"),
-        ("soft", "Pa", "q must be a number with or without a unit, such as 2[Pa], got 'soft' (rig.toml)"),
-        ("", "Pa", "q must be a number with or without a unit, such as 2[Pa], got '' (rig.toml)"),
-        ("3 (m", "m", "q must have a unit of length, such as m, got (m, which is no product of units (rig.toml)"),
-        ("3 dBm", "W", "q must have a unit such as W, got dBm, which is not proportional to an SI unit (rig.toml)"),
+        ("2 Hz", "rad/s", "q, Hz, rig.toml"),
+        ("2 mm", "Pa", "q, mm, rig.toml"),
+        ("2 counts", "Pa", "q, counts, rig.toml"),
+        ("4 cm^3", "m^3/rev", "q, cm^3, rig.toml"),
+        ("3 furlongz", "m", "q, furlongz, rig.toml"),
+        ("3 Pa", "1", "q, Pa, rig.toml"),
+        ("1e5000", "Pa", "q, 1e5000, rig.toml"),
+        ("1e308 MPa", "Pa", "q, 1e308 MPa, rig.toml"),
+        ("nan", "Pa", "q, nan, rig.toml"),
+        ("soft", "Pa", "q, 'soft', rig.toml"),
+        ("", "Pa", "q, '', rig.toml"),
+        ("3 (m", "m", "q, (m, rig.toml"),
+        ("3 dBm", "W", "q, dBm, rig.toml"),
     ],
 )
-def test_one_clear_line(text: str, si_unit: str, message: str) -> None:
-    with pytest.raises(InputError) as caught:
+def test_one_clear_line(text: str, si_unit: str, names: str) -> None:
+    with refusal(*names.split(", ")):
         parse_quantity(text, si_unit, name="q", place="rig.toml")
-    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize(
@@ -156,7 +157,7 @@ def test_a_quantity_may_be_a_number_or_a_text(value):
 
 @pytest.mark.parametrize("value", [None, True, [3.0], 3 + 0j, "three"])
 def test_what_is_no_quantity_is_refused_by_name(value):
-    with pytest.raises(InputError, match="duration must be a number with or without a unit"):
+    with refusal("duration"):
         parse_quantity(value, "s", name="duration")
 
 

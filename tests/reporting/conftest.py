@@ -167,6 +167,7 @@ def trend() -> Trend:
                 level=level,
                 error=1.3e-14,
                 states_flow=True,
+                pump=8e-6,
                 area=633e-6,
                 pressure=1.1e5,
                 temperature=None,

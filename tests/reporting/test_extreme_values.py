@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.reporting.charts import Chart, ChartLine, still_chart
+from sealscope.reporting.charts import Chart, ChartLine, render_still
 from sealscope.reporting.page import render_page
 from sealscope.reporting.picture import ticks
 
@@ -50,7 +50,7 @@ def test_a_still_chart_of_extreme_values(name: str) -> None:
     chart = Chart("x", "channels", "x", "m", (ChartLine("x", "a", values),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        still = still_chart(chart, T[:2000], [chart.lines[0].values], (0.0, 4.0))
+        still = render_still(chart, T[:2000], [chart.lines[0].values], (0.0, 4.0))
     (path,) = (shape.path for shape in still.shapes if shape.style == "line a")
     heights = [float(y) for y in re.findall(r"[ML]-?\d+ (-?\d+)", path)]
     assert all(0 <= y <= chart.height for y in heights)

@@ -6,6 +6,8 @@ import re
 
 from sealscope.reporting.index import write_index
 
+from ..wording import says
+
 EVIL = 'a"><script>alert(1)</script>.nc'
 
 
@@ -22,5 +24,5 @@ def test_the_most_severe_stand_first_and_every_name_leads_to_its_page(tmp_path, 
     assert re.findall(r'href="page%20(\d)%20%231\.html"', page) == ["3", "1", "2", "0"]
     assert "<script" not in page
     assert "default-src 'none'" in page
-    assert "Rule out a fault of the data first: clipped (p_1)." in page  # what to do stands beside the verdict
+    assert says(page, "next.rule_out", faults="clipped (p_1)")  # what to do stands beside the verdict
     assert page.count("<strong>leak</strong>") == 2

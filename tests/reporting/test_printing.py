@@ -20,6 +20,8 @@ from sealscope.errors import InputError, MissingExtra
 from sealscope.reporting import printing
 from sealscope.reporting.page import render_card, report
 
+from ..refusals import refusal
+
 PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
 
@@ -83,7 +85,7 @@ def test_weasyprint_gets_drawings_with_styles_of_their_own(tmp_path, monkeypatch
 
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "weasyprint", SimpleNamespace(HTML=HTML))
-    with pytest.raises(InputError, match="to its end"):
+    with refusal("end"):
         report(recording, tmp_path / "page.pdf", make_diagnosis())
     (page,) = pages
     drawings = re.findall(r"<svg\b.*?</svg>", page, re.DOTALL)
@@ -111,7 +113,7 @@ def test_weasyprint_prints_a_page_in_colour(tmp_path: Path, monkeypatch, recordi
 
 def test_without_a_browser_no_card_is_drawn(tmp_path: Path, monkeypatch, recording, make_diagnosis) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(MissingExtra, match=r"^a picture needs Chromium, got none: install it, or write \.html .*\.png"):
+    with refusal("Chromium", ".png", error=MissingExtra):
         report(recording, tmp_path / "card.png", make_diagnosis())
     assert list(tmp_path.iterdir()) == []
 
@@ -123,7 +125,7 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytes
     )
     small.chmod(0o755)
     monkeypatch.setattr(printing, "BROWSERS", (str(small),))
-    with pytest.raises(InputError, match="must make a picture of the size asked for, got status 0: no message"):
+    with refusal("status 0"):
         printing.draw_page(PAGE, tmp_path / "card.png", 1200, 630)
     assert [path.name for path in tmp_path.iterdir()] == ["browser"]
 
@@ -161,7 +163,7 @@ def test_what_a_full_disk_cuts_off_replaces_nothing(kind: str, tmp_path: Path, m
         name = "print-to-pdf" if kind == "pdf" else "screenshot"
         monkeypatch.setattr(printing, "BROWSERS", (_browser_that_copies(tools, name, cut),))
         target.write_text("what was there before")
-        with pytest.raises(InputError, match="a browser must make a "):
+        with refusal("browser"):
             printing.print_page(PAGE, target) if kind == "pdf" else printing.draw_page(PAGE, target, 40, 30)
         assert target.read_text() == "what was there before"
         assert sorted(path.name for path in tmp_path.iterdir()) == [target.name, "tools"]
@@ -194,7 +196,7 @@ def test_a_browser_on_a_full_disk(kind: str, sizes: tuple[int, ...], tmp_path: P
 def test_without_a_printer_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    with pytest.raises(MissingExtra, match=r"a PDF needs Chromium or WeasyPrint, got neither.*page\.pdf"):
+    with refusal("Chromium", "WeasyPrint", "page.pdf", error=MissingExtra):
         printing.print_page(PAGE, tmp_path / "page.pdf")
     assert list(tmp_path.iterdir()) == []
 
@@ -204,6 +206,6 @@ def test_a_browser_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     broken.write_text("#!/bin/sh\necho no display >&2\nexit 3\n")
     broken.chmod(0o755)
     monkeypatch.setattr(printing, "BROWSERS", (str(broken),))
-    with pytest.raises(InputError, match=r"must make a PDF, got status 3: no display"):
+    with refusal("PDF", "status 3", "no display"):
         printing.print_page(PAGE, tmp_path / "page.pdf")
     assert [path.name for path in tmp_path.iterdir()] == ["browser"]

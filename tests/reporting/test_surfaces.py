@@ -12,11 +12,11 @@ from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse, RelativeL
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.monitor.alarms import Alarm
-from sealscope.monitor.outputs.prometheus import metrics_text
+from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.reporting import messages
 from sealscope.reporting.index import write_index
 from sealscope.reporting.page import render_card, render_page
-from sealscope.reporting.schematic import circuit_of
+from sealscope.reporting.schematic import build_circuit
 
 from .pages import Reader
 
@@ -49,7 +49,7 @@ def test_all_surfaces_show_one_state(name, recording, make_diagnosis, tmp_path):
     assert f'<body class="{tone}">' in render_card(recording, diagnosis)
     index = write_index(tmp_path / "index.html", [(tmp_path / "page.html", diagnosis)])
     assert f'<td class="{tone}">' in index.read_text(encoding="utf-8")
-    metrics = metrics_text({"press": {"state": state}}, {})
+    metrics = format_metrics({"press": {"state": state}}, {})
     assert f'sealscope_health{{actuator="press"}} {float(state["health"])}' in metrics
     assert f'sealscope_severity{{actuator="press"}} {float(state["severity"])}' in metrics
 
@@ -60,7 +60,7 @@ def test_an_alarm_of_the_monitor_is_in_the_state_of_a_diagnosis(level, name, mak
         "press-1", "press", level, "new", 90.0, 95.0, 80.0, (79.0, 81.0), 0.01, None, "piston leak", "", "", 1
     )
     state = make_diagnosis(cause="piston leak", **DIAGNOSES[name][0]).state
-    shown = alarm.plain()["machine_state"]
+    shown = alarm.as_dict()["machine_state"]
     assert {key: shown[key] for key in ("name", "symbol", "health", "severity", "condition")} == {
         key: getattr(state, key) for key in ("name", "symbol", "health", "severity", "condition")
     }
@@ -121,8 +121,8 @@ def test_a_baseline_is_proposed_where_the_total_is_like_the_healthy_ones(make_di
 
 def test_what_is_stated_is_printed_and_drawn(recording, make_diagnosis):
     diagnosis = make_diagnosis(machine=MACHINE)
-    assert "7854 mm² at A and 4006 mm² at B as stated" in messages.rests_on(diagnosis)
-    circuit = circuit_of(None, recording, MACHINE)
+    assert "7854 mm² at A and 4006 mm² at B as stated" in messages.flow_basis(diagnosis)
+    circuit = build_circuit(None, recording, MACHINE)
     assert (circuit.cylinder, circuit.rods) == ("single-rod cylinder", "B")
     text = Reader(render_page(recording, diagnosis)).text
     assert "single-rod cylinder, area 7854 mm² at A and 4006 mm² at B, as stated" in text

@@ -10,6 +10,8 @@ from sealscope.recordings.quality import Finding
 from sealscope.reporting import messages
 from sealscope.reporting.messages import diagnosis_text
 
+from ..wording import says
+
 
 @pytest.mark.parametrize(
     ("value", "shown"),
@@ -42,12 +44,12 @@ def test_a_leak_in_words(make_diagnosis):
     first, *rest = text.splitlines()
     flat = " ".join(" ".join(rest).split())
     assert first == "bench/log_17.csv: leak"
-    assert "20.4 s, between 18.5 s and 21.8 s" in flat
-    assert "0.00421 L/min, between 0.0031 and 0.0057 L/min" in flat
-    assert "score 5.44, over the threshold of 3.22" in flat
-    assert "0.1 % (1 in 1000) of leak-free recordings" in flat
+    assert says(flat, "since.interval", onset="20.4 s", low="18.5 s", high="21.8 s")
+    assert says(flat, "how_much.interval", leak="0.00421", low="0.0031", high="0.0057")
+    assert says(flat, "how_sure.score", odds="", score="5.44", relation="over", threshold="3.22")
+    assert says(flat, "how_sure.share", share="0.1 % (1 in 1000)")
     assert "details: leak (score 5.44, threshold 3.22)" in flat
-    assert "Rule out a fault of the data first: clipped (p_1)" in flat
+    assert says(flat, "next.rule_out", faults="clipped (p_1)")
     assert max(map(len, text.splitlines())) <= 100
 
 
@@ -85,15 +87,15 @@ def test_a_method_without_a_score_says_why(no_verdict, make_diagnosis):
 
 def test_a_leak_since_before_the_recording_and_of_unknown_size(make_diagnosis):
     text = diagnosis_text(make_diagnosis(onset_s=None, onset_interval_s=None, leak_lpm=None, leak_interval_lpm=None))
-    assert "not within this recording" in text and "the channels do not allow it" in text
+    assert says(text, "since.whole") and says(text, "how_much.channels")
     refused = make_diagnosis(leak_lpm=None, leak_interval_lpm=None, refuses=frozenset({"leak_lpm"}))
-    assert messages.how_much(refused) == "not stated: see the reason"
+    assert messages.how_much(refused) == messages.say("how_much.reason")
 
 
 def test_all_that_may_be_none_may_be_none(no_verdict):
     text = diagnosis_text(no_verdict)
     assert text.startswith("bench/log_17.csv: cannot tell")
-    assert "no score was formed" in text and "None" not in text and "nan" not in text
+    assert says(text, "how_sure.no_score") and "None" not in text and "nan" not in text
 
 
 def test_control_characters_of_a_file_name_do_not_reach_the_terminal(make_diagnosis):

@@ -11,11 +11,11 @@ import pytest
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.errors import InputError
 from sealscope.reporting.trend.page import render_trend_page, trend_pictures, write_trend_page
 from sealscope.reporting.trend.text import figures, healthy_end, trend_text
 
 from ..diagnosis.test_trend import life
+from ..refusals import refusal
 from .pages import Reader, places
 
 
@@ -80,7 +80,7 @@ def test_without_a_level_there_is_a_page_without_a_chart(tmp_path: Path) -> None
 
 
 def test_another_kind_of_file_is_refused(trend: Trend, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"\.html, \.htm, \.pdf, got .*page\.png"):
+    with refusal(".html", ".htm", ".pdf", "page.png"):
         write_trend_page(tmp_path / "page.png", trend)
     assert list(tmp_path.iterdir()) == []
 
@@ -99,10 +99,11 @@ def test_total_leak_and_limit_have_one_meaning_each() -> None:
     result = trend_of(days, healthy=8, limit="0.01 mL/min")
     assert result.verdict == "leak" and result.wear is not None and result.limit is not None
     shown = figures(result)
-    rise = result.wear.now.value - result.wear.healthy.value
+    rise = result.wear.total.value - result.wear.healthy.value
     assert float(shown["leak"].split()[0]) == pytest.approx(rise, rel=0.2)
     assert result.limit < result.wear.healthy.high
     assert healthy_end(result.wear) == max(result.limit, result.wear.healthy.value)
+    assert "95 of 100" not in shown["healthy"] and "above" in shown["healthy"]
     page = render_trend_page(result)
     assert "healthy recordings of this machine scatter as far" in page
     assert ">Total<" in page and ">Now<" not in page

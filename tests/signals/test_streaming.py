@@ -12,6 +12,8 @@ from sealscope.signals.details import details
 from sealscope.signals.filters import decomposition_filters
 from sealscope.signals.streams import DetailStream
 
+from ..refusals import refusal
+
 
 def slow_stream(x, levels, wavelet="db8"):
     """The causal a trous filters on a signal that was zero before, plain loops, every level late to the deepest one."""
@@ -147,32 +149,32 @@ def test_a_missing_sample_is_forgotten():
 
 
 def test_bad_calls_are_one_clear_line():
-    with pytest.raises(InputError, match="channels must be a whole number >= 1, got 0"):
+    with refusal("channels", "0"):
         DetailStream(0)
-    with pytest.raises(InputError, match="levels must be"):
+    with refusal("levels"):
         DetailStream(1, 0)
-    with pytest.raises(InputError, match="did you mean db8"):
+    with refusal("db8"):
         DetailStream(wavelet="db8x")
-    with pytest.raises(InputError, match=r"block must have shape \(2, n\), got \(5,\)"):
+    with refusal("block", "(5,)"):
         DetailStream(2).update(np.zeros(5))
-    with pytest.raises(InputError, match=r"block must have shape \(2, n\), got \(3, 5\)"):
+    with refusal("block", "(3, 5)"):
         DetailStream(2).update(np.zeros((3, 5)))
-    with pytest.raises(InputError, match=r"block must have shape \(n,\), got \(\)"):
+    with refusal("block", "()"):
         DetailStream().update(1.0)
-    with pytest.raises(InputError, match=r"out must be .* shape \(4, 5\), got float64 \(4, 6\)"):
+    with refusal("out", "(4, 5)", "(4, 6)"):
         DetailStream().update(np.zeros(5), out=np.empty((4, 6)))
-    with pytest.raises(InputError, match="out must be"):
+    with refusal("out"):
         DetailStream().update(np.zeros(5), out=np.empty((5, 4)).T)
     state = DetailStream().state_dict()
-    with pytest.raises(InputError, match="saved state must have 'history'"):
+    with refusal("'history'"):
         DetailStream.from_state({key: value for key, value in state.items() if key != "history"})
-    with pytest.raises(InputError, match=r"history must have shape \(1, 4, 127, 1\), got \(1, 4, 126, 1\)"):
+    with refusal("history", "(1, 4, 126, 1)"):
         DetailStream.from_state({**state, "history": state["history"][:, :, 1:]})
-    with pytest.raises(InputError, match="samples must be a whole number >= 0, got 'many'"):
+    with refusal("samples", "'many'"):
         DetailStream.from_state({**state, "samples": "many"})
-    with pytest.raises(InputError, match=r"saved state must have .*, got list"):
+    with refusal("list"):
         DetailStream.from_state([1, 2])
-    with pytest.raises(InputError, match="rows and columns of a table"):
+    with refusal("table"):
         DetailStream((2, 3, 4))
 
 

@@ -11,15 +11,17 @@ import pytest
 from scipy import stats
 
 from sealscope.compiled import kernel
-from sealscope.errors import InputError, MissingExtra, SimulationFailed
+from sealscope.errors import MissingExtra, SimulationFailed
 from sealscope.parameters import load_rig
 from sealscope.physics.lanes import WIDTH, load, store
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.batch.batch import simulate_batch
-from sealscope.simulation.batch.noise import half_turn_sine, keys, logarithm, normals
+from sealscope.simulation.batch.noise import half_turn_sine, logarithm, noise_keys, normals
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
+
+from ..refusals import refusal
 
 QUIET = {f"sensors.{channel}.{what}": 0.0 for channel in ("p_A", "p_B") for what in ("noise", "drift")}
 QUIET["sensors.common_noise"] = 0.0
@@ -135,7 +137,7 @@ def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig, rms_of):
     for k, one in enumerate(experiments):  # cells are those of all runs of a set
         np.testing.assert_allclose(batch.rms[k], rms_of(simulate_experiment(one).recording, bounds), rtol=1e-4)
     assert np.abs(batch.rms[0, :, 1] / batch.rms[1, :, 1] - 1.0).min() > 0.05
-    with pytest.raises(SimulationFailed, match="step must be"):  # where the pump's oil circulates
+    with refusal("step", error=SimulationFailed):  # where the pump's oil circulates
         stiff = rig.with_overrides({"G_circ": 2e-9})
         simulate_batch([Experiment.of(**options | {"rig": stiff, "allow_unresolved": False}, fault=moves)])
 
@@ -199,7 +201,7 @@ def test_a_leak_of_a_stated_mean_has_it(check_rig):
     np.testing.assert_allclose(batch.mean_leak_lpm, [0.0042, 0.01, 0.05], rtol=2e-3)
     alone = simulate_experiment(experiments[1]).truth
     assert batch.coefficients[1] == pytest.approx(alone.leaks[0].coefficient, rel=3e-3)
-    with pytest.raises(SimulationFailed, match="to resolve the leak of run 0"):
+    with refusal("leak", "run 0", error=SimulationFailed):
         simulate_batch([Experiment.of(leak="1.5 L/min", command="1 sin(4t)", duration=2.0)])
 
 
@@ -235,7 +237,7 @@ def elementary(x, out):
 def test_the_normal_numbers_are_normal_and_independent():
     n = 50_000
     out = np.empty((2 * n, WIDTH))
-    draw_normals(keys(list(range(WIDTH)))[None].copy(), n, out)
+    draw_normals(noise_keys(list(range(WIDTH)))[None].copy(), n, out)
     pvalues = [stats.kstest(out[:, lane], "norm").pvalue for lane in range(WIDTH)]
     assert min(pvalues) > 1e-4
     assert abs(np.mean(out**4) - 3.0) < 0.03
@@ -244,7 +246,7 @@ def test_the_normal_numbers_are_normal_and_independent():
     for lag in (1, 2, 3, 6):
         assert np.abs(np.mean(out[lag:] * out[:-lag])) < 5.0 / np.sqrt(2 * n * WIDTH)
     again = np.empty((2 * n, WIDTH))
-    draw_normals(keys([7] * WIDTH)[None].copy(), n, again)
+    draw_normals(noise_keys([7] * WIDTH)[None].copy(), n, again)
     np.testing.assert_array_equal(again[:, 0], out[:, 7])  # a key's numbers are the same in any lane
 
 
@@ -287,31 +289,31 @@ def test_the_changes_are_those_of_the_thesis_s_statistic(check_rig, rms_of):
 
 
 @pytest.mark.parametrize(
-    ("values", "rule"),
+    ("values", "words"),
     [
-        ({"leak": ["G = 1e-13", "C = 1e-11"]}, r"at most one leak, got 2 \(run 1\)"),
-        ({"fault": "sensor p_A offset -2 psi from 2 s"}, r"no fault of a sensor, got .* \(run 1\)"),
-        ({"set": {"sensors.p_B.drop_rate": 0.1}}, r"sensors\.p_B\.drop_rate = 0, got 0\.1 \(run 1\)"),
-        ({"set": {"motor.integrator": "euler"}}, r"motor\.integrator = state, got euler \(run 1\)"),
-        ({"leak": "0.01 L/min", "fault": "oil +5 K"}, r"no leak while the oil.s temperature changes \(run 1\)"),
-        ({"duration": 5.0}, r"one duration, got 4 and 5 \(run 1\)"),
+        ({"leak": ["G = 1e-13", "C = 1e-11"]}, "leak, 2, run 1"),
+        ({"fault": "sensor p_A offset -2 psi from 2 s"}, "fault, sensor, run 1"),
+        ({"set": {"sensors.p_B.drop_rate": 0.1}}, "sensors.p_B.drop_rate, 0.1, run 1"),
+        ({"set": {"motor.integrator": "euler"}}, "motor.integrator, euler, run 1"),
+        ({"leak": "0.01 L/min", "fault": "oil +5 K"}, "leak, temperature, run 1"),
+        ({"duration": 5.0}, "duration, 4, 5, run 1"),
     ],
 )
-def test_a_run_that_cannot_be_side_by_side_is_refused(values, rule):
-    with pytest.raises(InputError, match=rule):
+def test_a_run_that_cannot_be_side_by_side_is_refused(values, words):
+    with refusal(*words.split(", ")):
         simulate_batch([Experiment.of(duration=4.0), Experiment.of(**{"duration": 4.0, **values})])
 
 
 def test_bad_calls_and_bad_runs_are_refused(check_rig):
-    with pytest.raises(InputError, match="a batch must have experiments, got none"):
+    with refusal("batch", "none"):
         simulate_batch([])
     for bounds in ([0.0], [1.0, 1.0], [0.0, 9.0], [-1.0, 2.0]):
-        with pytest.raises(InputError, match=r"bounds must rise within 0 \.\. 4 s"):
+        with refusal("bounds", "4 s"):
             simulate_batch([Experiment.of(duration=4.0)], bounds=bounds)
     good = Experiment.of(rig=check_rig(), duration=4.0, step=1e-3)
-    with pytest.raises(SimulationFailed, match=r"pressures of run 1 must stay above vacuum"):
+    with refusal("run 1", "pressures", error=SimulationFailed):
         simulate_batch([good, replace(good, command=Experiment.of(command="9 sin(4t)").command, x_0=0.29)])
-    with pytest.raises(SimulationFailed, match=r"step must be <= .* to resolve"):
+    with refusal("step", error=SimulationFailed):
         simulate_batch([replace(good, step=1 / 500)])
 
 
@@ -353,9 +355,9 @@ def test_a_batch_tells_its_numbers_by_name(monkeypatch):
     batch = simulate_batch(runs, bounds=[0.0, 1.5, 2.5, 4.0])
     assert (len(batch), repr(batch)) == (2, "<Batch: 2 runs, segments between 0, 1.5, 2.5, 4 s>")
     np.testing.assert_array_equal(batch.rms_of("p_B", "d3d4"), batch.rms[:, 1, :, 4])
-    with pytest.raises(InputError, match="channel must be one of p_A, p_B, got 'p_C'"):
+    with refusal("channel", "'p_C'", "p_A"):
         batch.changes("p_C", "d3")
-    with pytest.raises(InputError, match="detail must be one of d1, d2, d3, d4, d3d4, got 'd5'"):
+    with refusal("detail", "'d5'", "d1"):
         batch.rms_of("p_A", "d5")
     pytest.importorskip("pandas")
     table = batch.to_pandas()
@@ -363,18 +365,18 @@ def test_a_batch_tells_its_numbers_by_name(monkeypatch):
     assert list(table["stop [s]"]) == [1.5, 2.5, 4.0] * 2
     np.testing.assert_array_equal(table["d3 of p_A [Pa]"], batch.rms_of("p_A", "d3").ravel())
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(MissingExtra, match="a table needs pandas"):
+    with refusal("pandas", error=MissingExtra):
         batch.to_pandas()
 
 
 @pytest.mark.parametrize(
-    ("parts", "rule"),
+    ("parts", "words"),
     [
-        ({"experiments": ["3 sin(4t)"]}, r"a batch must have experiments .*, got '3 sin\(4t\)'"),
-        ({"error": "20[m]"}, "error must have a unit of pressure"),
-        ({"thread": 1}, "simulate_batch has no argument 'thread'; did you mean 'threads'"),
+        ({"experiments": ["3 sin(4t)"]}, "a batch, '3 sin(4t)'"),
+        ({"error": "20[m]"}, "error"),
+        ({"thread": 1}, "simulate_batch, 'thread', 'threads'"),
     ],
 )
-def test_a_wrong_batch_is_refused_by_name(parts, rule):
-    with pytest.raises(InputError, match=rule):
+def test_a_wrong_batch_is_refused_by_name(parts, words):
+    with refusal(*words.split(", ")):
         simulate_batch(**{"experiments": [Experiment.of(duration=1.0)], **parts})

@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import rig_numbers
 from sealscope.simulation.bench.machines import centred_start, draw
 from sealscope.simulation.bench.profile import Profile, load_profile
-from sealscope.simulation.changes import LONGEST_BLOCK, RESOLUTION, Schedule
+from sealscope.simulation.changes import LONGEST_BLOCK, MAX_RELATIVE_CHANGE, Schedule
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
+
+from ..refusals import refusal
 
 PSI = 6894.757293168361
 
@@ -121,7 +122,7 @@ def test_a_drift_of_the_bench_moves_less_than_its_resolution_from_block_to_block
         for field in ("K_oil", "F_v", "G_pump"):
             values = np.array([getattr(one, field) for one in result.numbers])
             assert np.ptp(values) > 0.02 * values[0]
-            assert np.abs(np.diff(values) / values[1:]).max() <= 1.05 * RESOLUTION
+            assert np.abs(np.diff(values) / values[1:]).max() <= 1.05 * MAX_RELATIVE_CHANGE
 
 
 def test_the_same_seed_is_the_same_machine_and_the_same_bytes(bench):
@@ -222,49 +223,45 @@ def test_a_profile_of_one_s_own(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "rule"),
+    ("old", "new", "words"),
     [
         ('unit = "bar"', 'unit = "mm"', "mm"),
-        ('unit = "bar"', "", "oil: there must be a range with its unit or a scale without one"),
-        ("range = [6000, 7000]", "range = [7000, 6000]", "must be .low, high. with low <= high"),
-        ("range = [6000, 7000]", "", "there must be a range with its unit or a scale without one"),
-        ("range = [6000, 7000]", "scale = [0.5, 2]", "there must be a range with its unit or a scale without one"),
-        ('parameters = ["K_oil"]', 'parameters = ["K_ol"]', "'K_ol' is not a parameter; did you mean K_oil"),
-        ('parameters = ["K_oil"]', 'parameters = ["volumes"]', "a choice cannot be drawn"),
-        ('parameters = ["K_oil"]', 'parameters = ["K_oil", "F_v"]', "must have one unit"),
-        ('parameters = ["K_oil"]', 'parameters = ["p_charge"]', "p_charge cannot drift"),
-        ('parameters = ["K_oil"]', "parameters = []", r"nuisance.1..parameters must have at least 1 item"),
-        ('why = "measured"', "", r"nuisance.1..why is missing"),
-        ("size = [1, 2]", "size = [-1, 2]", "must be >= 0"),
-        ('unit = "%" }', 'unit = "%", oil = 2 }', "drift.oil must be less than or equal to 1, got 2"),
-        ('unit = "%" }', 'unit = "%", shapes = ["zigzag"] }', "must be 'linear' or 'wander', got 'zigzag'"),
-        ('unit = "%" }', 'unit = "%", shapes = ["linear"], oil = 1 }', "must have shapes or oil, got both"),
-        ('unit = "%" }', 'unit = "%", speed = 1 }', "drift.speed is not known"),
-        ('["2 sin(3t)"]', '["2 cos(3t)"]', "command must be like"),
-        ('["2 sin(3t)"]', '["step 2"]', "'step 2' has no amplitude"),
-        ("closed = [50]", "closed = [100]", "must be less than or equal to 99, got 100"),
-        ('title = "two nuisances"', "", "profile.title is missing"),
-        ("[profile]", "[profile", "a profile must be TOML"),
+        ('unit = "bar"', "", "oil, range, scale"),
+        ("range = [6000, 7000]", "range = [7000, 6000]", "low, high"),
+        ("range = [6000, 7000]", "", "range, scale"),
+        ("range = [6000, 7000]", "scale = [0.5, 2]", "range, scale"),
+        ('parameters = ["K_oil"]', 'parameters = ["K_ol"]', "'K_ol', K_oil"),
+        ('parameters = ["K_oil"]', 'parameters = ["volumes"]', "volumes"),
+        ('parameters = ["K_oil"]', 'parameters = ["K_oil", "F_v"]', "unit"),
+        ('parameters = ["K_oil"]', 'parameters = ["p_charge"]', "p_charge"),
+        ('parameters = ["K_oil"]', "parameters = []", "nuisance[1].parameters"),
+        ('why = "measured"', "", "nuisance[1].why"),
+        ("size = [1, 2]", "size = [-1, 2]", "size"),
+        ('unit = "%" }', 'unit = "%", oil = 2 }', "drift.oil, 2, 1"),
+        ('unit = "%" }', 'unit = "%", shapes = ["zigzag"] }', "'linear', 'wander', 'zigzag'"),
+        ('unit = "%" }', 'unit = "%", shapes = ["linear"], oil = 1 }', "shapes, oil"),
+        ('unit = "%" }', 'unit = "%", speed = 1 }', "drift.speed"),
+        ('["2 sin(3t)"]', '["2 cos(3t)"]', "command"),
+        ('["2 sin(3t)"]', '["step 2"]', "'step 2'"),
+        ("closed = [50]", "closed = [100]", "100, 99"),
+        ('title = "two nuisances"', "", "profile.title"),
+        ("[profile]", "[profile", "TOML"),
     ],
 )
-def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, old, new, rule):
+def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, old, new, words):
     assert SMALL.count(old) == 1
     path = write(tmp_path, SMALL.replace(old, new))
-    with pytest.raises(InputError, match=rule) as caught:
+    with refusal(*words.split(", "), "mine.toml"):
         load_profile(path)
-    assert "\n" not in str(caught.value)
-    assert "mine.toml" in str(caught.value)
 
 
 def test_an_unknown_or_unreadable_profile_is_refused(tmp_path):
-    with pytest.raises(
-        InputError, match=r"'banch' is no packaged profile \(bench, closed-loop, load, single-rod, unmodelled, valve\)"
-    ):
+    with refusal("'banch'", "bench", "single-rod"):
         load_profile("banch")
-    with pytest.raises(InputError, match="profile must be readable, got: No such file"):
+    with refusal("profile"):
         load_profile(tmp_path / "none.toml")
     twice = SMALL + SMALL[SMALL.index("[[nuisance]]") :].replace('name = "oil"', 'name = "oil again"')
-    with pytest.raises(InputError, match=r"fluid.K_oil must be in one nuisance, got oil and oil again"):
+    with refusal("fluid.K_oil", "oil", "oil again"):
         load_profile(write(tmp_path, twice))
-    with pytest.raises(InputError, match="seed must be >= 0, got -1"):
+    with refusal("seed", "-1"):
         draw("bench", -1)

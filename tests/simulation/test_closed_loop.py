@@ -11,15 +11,17 @@ import pytest
 from sealscope.control import Measured, PositionPI
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.parameters import load_rig
-from sealscope.physics.rig import packed, rig_numbers
+from sealscope.physics.rig import pack_numbers, rig_numbers
 from sealscope.physics.solvers.advance import EXPLICIT, advance
 from sealscope.physics.standstill import initial_state
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
-from sealscope.simulation.courses import parse_force, parse_position
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
 from sealscope.simulation.simulate import simulate_experiment
+from sealscope.simulation.targets_and_loads import parse_force, parse_position
+
+from ..refusals import refusal
 
 #: Friction up and stiffness down by 20 %, and the other way round: what the controller does not know.
 _STIFFER = {"F_pr": 20.0, "F_cfr": 0.8e-6, "F_v": 240.0, "K_oil": 827e6}
@@ -36,7 +38,7 @@ def followed(rig: str, target: str, duration: float, **options):
     experiment = Experiment.of(
         rig=rig, command=target, duration=duration, controller=PositionPI.from_rig(load_rig(rig)), **options
     )
-    run = trajectory(experiment, ())
+    run = integrate_run(experiment, ())
     return run, np.broadcast_to(experiment.target.value_at(run.t), run.t.shape) - run["x"]
 
 
@@ -67,7 +69,7 @@ def test_without_feed_forward_and_integral_it_lags():
         rig="thesis-closed-loop", command="position 50 mm sin(1.57t)", duration=6.0,
         controller=replace(PI, k_i=0.0, drive=replace(PI.drive, shortfall=0.0)),
     )  # fmt: skip
-    run = trajectory(experiment, ())
+    run = integrate_run(experiment, ())
     error = experiment.target.value_at(run.t) - run["x"]
     assert np.sqrt(np.mean(error[run.t > 2.0] ** 2)) > 0.01 * 50e-3
 
@@ -112,7 +114,11 @@ def test_a_voltage_acts_after_its_delay_until_the_next_and_the_encoder_counts():
 
 def step_by_step(experiment, path):
     """Return the rows of a run whose voltages are known, one call of the solver from output to output."""
-    p, y, rows = packed(rig_numbers(experiment.rig)), initial_state(experiment.rig, 0.0, 0.0), np.empty_like(path.rows)
+    p, y, rows = (
+        pack_numbers(rig_numbers(experiment.rig)),
+        initial_state(experiment.rig, 0.0, 0.0),
+        np.empty_like(path.rows),
+    )
     every = round((path.t[1] - path.t[0]) / path.step)
     u, none = np.empty((every, 3)), np.zeros((every, 3))
     for k, volts in enumerate(path.volts):
@@ -125,8 +131,8 @@ def test_a_closed_loop_is_the_same_again_whatever_the_steps():
     options = {"rig": "thesis-closed-loop", "command": "position 20 mm sin(3t)", "duration": 3.0, "seed": 3}
     first, again = (simulate_experiment(Experiment.of(**options)) for _ in range(2))
     np.testing.assert_array_equal(first.recording["p_A"], again.recording["p_A"])
-    fine = trajectory(Experiment.of(**options), (), step=2.5e-5)
-    coarse = trajectory(Experiment.of(**options), ())
+    fine = integrate_run(Experiment.of(**options), (), step=2.5e-5)
+    coarse = integrate_run(Experiment.of(**options), ())
     assert np.abs(fine["x"] - coarse["x"]).max() < 20e-6  # a count that falls to the other side
     np.testing.assert_array_equal(coarse.rows, step_by_step(Experiment.of(**options), coarse))
     assert first.recording.provenance["experiment"]["controller"].startswith("PositionPI(")
@@ -137,7 +143,7 @@ def test_a_load_moves_the_piston_by_the_give_of_oil_and_drive(check_rig):
     values = {"F_pr": 0.0, "F_cfr": 0.0, "F_v": 4000.0, "p_charge": "3 MPa", "K_i": 10.0, "K_brk": 1.0}
     rig = check_rig(**values)
     experiment = Experiment.of(rig=rig, command="0 sin(t)", load="ramp 1 kN from 0.5 s to 0.6 s", duration=3.0)
-    run = trajectory(experiment, ())
+    run = integrate_run(experiment, ())
     D, A = rig.pump.q_b / (2 * math.pi), rig.cylinder.A_A
     dp = 1000.0 / A
     turned = -rig.motor.R_c * D * dp / (rig.motor.C_m * rig.motor.K_i)
@@ -149,7 +155,7 @@ def test_a_load_moves_the_piston_by_the_give_of_oil_and_drive(check_rig):
 
 
 def test_a_load_that_is_there_from_the_start_is_carried_from_the_start(check_rig):
-    run = trajectory(Experiment.of(rig=check_rig(), command="0 sin(t)", load="300 N", duration=1.0), ())
+    run = integrate_run(Experiment.of(rig=check_rig(), command="0 sin(t)", load="300 N", duration=1.0), ())
     A = check_rig().cylinder.A_A
     assert run["p_A"][0] - run["p_B"][0] == pytest.approx(300.0 / A)
     assert np.abs(run["x"]).max() < 1e-12
@@ -207,37 +213,36 @@ def test_a_recorded_position_is_a_target(tmp_path):
     np.testing.assert_allclose(target.value_at(t), 0.01 * np.sin(t), atol=1e-9)
     assert str(target) == f"position file {path}"
     path.write_text("t [s],p_A [Pa]\n0,1\n0.1,2\n0.2,3\n")
-    with pytest.raises(InputError, match="a recorded position must have the channel x"):
+    with refusal("x"):
         parse_position(f"position file {path}")
 
 
 @pytest.mark.parametrize(
-    ("options", "rule"),
+    ("options", "words"),
     [
-        ({"command": "position 3 sin(2t)"}, r"position must have its unit \(mm, cm, m\).*got '3 sin\(2t\)'"),
-        ({"command": "position 50 mm wave"}, r"position must be like .* got '50 mm wave'"),
-        ({"command": "position 400 mm sin(2t)"}, r"position must stay within the stroke, \+-300 mm, got .* mm at t = "),
-        ({"load": "500"}, r"load must have its unit \(N, kN\), such as 'step 100 N', got '500'"),
-        ({"load": 500.0}, r"load must be a text or a Force, got 500.0"),
-        ({"controller": PositionPI.from_rig(load_rig("thesis"))}, r"a controller must have a target to follow"),
+        ({"command": "position 3 sin(2t)"}, "position, '3 sin(2t)'"),
+        ({"command": "position 50 mm wave"}, "position, '50 mm wave'"),
+        ({"command": "position 400 mm sin(2t)"}, "position, +-300 mm"),
+        ({"load": "500"}, "load, 'step 100 N', '500'"),
+        ({"load": 500.0}, "load, 500.0"),
+        ({"controller": PositionPI.from_rig(load_rig("thesis"))}, "controller, target"),
     ],
 )
-def test_a_wrong_target_or_load_is_one_line(options, rule):
-    with pytest.raises(InputError, match=rule) as refused:
+def test_a_wrong_target_or_load_is_one_line(options, words):
+    with refusal(*words.split(", ")):
         Experiment.of(**{"rig": "thesis-closed-loop", "duration": 2.0, **options})
-    assert "\n" not in str(refused.value)
 
 
 def test_rates_and_voltages_that_cannot_be():
     assert outputs_per_sample(500.0, 1000.0, 4) == 4
     assert outputs_per_sample(500.0, 3000.0, 4) == 6
     assert outputs_per_sample(500.0, 100.0, 3) == 3
-    with pytest.raises(InputError, match="rate of the controller must be a whole multiple"):
+    with refusal("rate"):
         outputs_per_sample(500.0, 333.3, 4)
-    with pytest.raises(InputError, match="k_v of the controller must be >= 0, got -1"):
+    with refusal("k_v", "-1.0"):
         PositionPI.from_rig(load_rig("thesis"), k_v=-1.0)
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
-    with pytest.raises(InputError, match="a run of a batch must have a command, got a target"):
+    with refusal("command", "target"):
         simulate_batch([target])
 
     @dataclass(frozen=True)
@@ -248,8 +253,8 @@ def test_rates_and_voltages_that_cannot_be():
         def start(self):
             return lambda measured: math.nan
 
-    with pytest.raises(SimulationFailed, match="the controller must give a finite voltage, got nan at t = 0 s"):
-        trajectory(replace(target, controller=Broken()), ())
+    with refusal("nan", "0 s", error=SimulationFailed):
+        integrate_run(replace(target, controller=Broken()), ())
 
     @dataclass(frozen=True)
     class Raising(Broken):
@@ -257,4 +262,4 @@ def test_rates_and_voltages_that_cannot_be():
             return lambda measured: 1.0 if measured.t < 0.1 else 1.0 / 0.0
 
     with pytest.raises(ZeroDivisionError):
-        trajectory(replace(target, controller=Raising()), ())
+        integrate_run(replace(target, controller=Raising()), ())

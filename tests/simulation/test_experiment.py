@@ -8,30 +8,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError, SimulationFailed
-from sealscope.simulation.commands import Sine, recorded, tabulated
+from sealscope.errors import SimulationFailed
+from sealscope.simulation.commands import Sine, polyline_from_table, sampled_signal
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import trajectory
+from sealscope.simulation.integrate import integrate_run
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.simulate import prove, simulate, simulate_experiment, simulate_with_truth
+
+from ..refusals import refusal
 
 THROTTLED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
 
 
 @pytest.mark.parametrize(
-    ("parts", "rule"),
+    ("parts", "words"),
     [
-        ({"duration": 0.0}, "duration must be > 0 s"),
-        ({"duration": float("nan")}, "duration must be > 0 s"),
-        ({"duration": 1e9}, "must be 1 to 20000000 samples"),
-        ({"seed": -1}, "seed must be >= 0"),
-        ({"x_0": 0.31}, "x_0 must be within the stroke"),
-        ({"x_0": float("nan")}, "x_0 must be within the stroke"),
-        ({"method": "imex"}, "imex needs throttles"),
+        ({"duration": 0.0}, "duration, 0 s"),
+        ({"duration": float("nan")}, "duration, 0 s"),
+        ({"duration": 1e9}, "20000000"),
+        ({"seed": -1}, "seed, 0"),
+        ({"x_0": 0.31}, "x_0"),
+        ({"x_0": float("nan")}, "x_0"),
+        ({"method": "imex"}, "imex, throttles"),
     ],
 )
-def test_an_impossible_experiment_is_refused(parts, rule):
-    with pytest.raises(InputError, match=rule):
+def test_an_impossible_experiment_is_refused(parts, words):
+    with refusal(*words.split(", ")):
         Experiment.of(**parts)
 
 
@@ -47,10 +49,10 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     experiments = [
         Experiment.of(**common),
         Experiment.of(**common, command=Sine(3.0, 4.0 + 1e-9)),
-        Experiment.of(**common, command=recorded(t, u, "log.csv")),
-        Experiment.of(**common, command=recorded(t, nudged, "log.csv")),
-        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=tabulated(t, opening))),
-        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=tabulated(t, distorted))),
+        Experiment.of(**common, command=sampled_signal(t, u, "log.csv")),
+        Experiment.of(**common, command=sampled_signal(t, nudged, "log.csv")),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=polyline_from_table(t, opening))),
+        Experiment.of(**common, leak=Leak(coefficient=1e-13, opening=polyline_from_table(t, distorted))),
         Experiment.of(**common, leak=["G = 1e-13", "C = 1e-10"]),
         Experiment.of(**common, seed=1),
         Experiment.of(**common, step=1e-4),
@@ -63,7 +65,7 @@ def test_the_key_tells_experiments_apart_to_the_last_digit():
     keys = [one.key() for one in experiments]
     assert len(set(keys)) == len(keys)
     assert Experiment.of(**common).key() == keys[0]
-    assert Experiment.of(**common, command=recorded(t.copy(), u.copy(), "log.csv")).key() == keys[2]
+    assert Experiment.of(**common, command=sampled_signal(t.copy(), u.copy(), "log.csv")).key() == keys[2]
 
 
 def test_a_run_is_told_in_its_provenance():
@@ -80,7 +82,7 @@ def test_a_run_is_told_in_its_provenance():
 @pytest.mark.parametrize("values", [{}, THROTTLED], ids=["free", "throttled"])
 def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
     experiment = Experiment.of(duration=4.0, set=values)
-    converged = trajectory(replace(experiment, step=2e-5), ())
+    converged = integrate_run(replace(experiment, step=2e-5), ())
 
     def error(path):
         every = round((path.t[1] - path.t[0]) * 1e6) // round((converged.t[1] - converged.t[0]) * 1e6)
@@ -88,7 +90,7 @@ def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
 
     steps = []
     for allowed in (None, 3.0, 0.1):
-        path = trajectory(replace(experiment, error=allowed), ())
+        path = integrate_run(replace(experiment, error=allowed), ())
         steps.append(path.step)
         assert error(path) < (100.0 if allowed is None else allowed)
     assert steps[0] > steps[1] > steps[2]
@@ -103,9 +105,9 @@ def test_a_smaller_error_is_a_finer_and_a_truer_run(values):
 
 def test_an_error_is_positive_and_stands_alone():
     for wrong in (0.0, -20.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="error must be > 0 Pa, got"):
+        with refusal("error", "0 Pa"):
             simulate_experiment(Experiment.of(duration=1.0, error=wrong))
-    with pytest.raises(InputError, match=r"a stated step or a stated error, not both, got .* 0\.0005 s and error = 20"):
+    with refusal("0.0005 s", "error", "20"):
         Experiment.of(duration=1.0, error=20.0, step=5e-4)
 
 
@@ -123,7 +125,7 @@ def test_the_default_step_proves_itself(values):
 
 def test_an_under_resolved_run_is_refused_and_says_what_moved():
     coarse = {"duration": 20.0, "step": 1.5e-3, "set": {"sample_rate": "400[Hz]"}}
-    with pytest.raises(SimulationFailed, match=r"under-resolved: halving the step of 0\.00125 s \(rk4\) moves "):
+    with refusal("0.00125 s", "rk4", error=SimulationFailed):
         prove(Experiment.of(**coarse))
     proof = prove(Experiment.of(**coarse, allow_unresolved=True))
     assert not proof.resolved
@@ -169,37 +171,37 @@ def test_a_text_means_what_the_number_means():
 
 
 @pytest.mark.parametrize(
-    ("parts", "rule"),
+    ("parts", "words"),
     [
-        ({"comand": "3 sin(4t)"}, r"Experiment\.of has no argument 'comand'; did you mean 'command'\?"),
-        ({"duration": None}, "duration must be a number with or without a unit, such as 2.s., got None"),
-        ({"duration": "20 psi"}, "duration must have a unit of time"),
-        ({"command": 3}, "command must be a text or a Command, got 3"),
-        ({"leak": 0.0042}, "leak must be a text, a Leak or several of them, got 0.0042"),
-        ({"fault": [3]}, "fault must be a text, a Fault or several of them, got 3"),
-        ({"set": "V_1=3"}, "set must map names of parameters to values, got 'V_1=3'"),
-        ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
-        ({"rig": 5}, "rig must be a Rig, the name of a rig or a path, got 5"),
-        ({"leak": "1 L/min from 2 psi"}, "leak must be like"),
-        ({"leak": "1[psi]"}, "a leak must have a unit of volume flow"),
+        ({"comand": "3 sin(4t)"}, "Experiment.of, 'comand', 'command'"),
+        ({"duration": None}, "duration, None"),
+        ({"duration": "20 psi"}, "duration"),
+        ({"command": 3}, "command, 3"),
+        ({"leak": 0.0042}, "leak, 0.0042"),
+        ({"fault": [3]}, "fault, 3"),
+        ({"set": "V_1=3"}, "set, 'V_1=3'"),
+        ({"seed": 1.5}, "seed, 1.5"),
+        ({"rig": 5}, "rig, 5"),
+        ({"leak": "1 L/min from 2 psi"}, "leak"),
+        ({"leak": "1[psi]"}, "leak, unit"),
     ],
 )
-def test_a_wrong_argument_is_refused_by_name(parts, rule):
-    with pytest.raises(InputError, match=rule):
+def test_a_wrong_argument_is_refused_by_name(parts, words):
+    with refusal(*words.split(", ")):
         Experiment.of(**parts)
     if "comand" not in parts:
-        with pytest.raises(InputError, match=rule):
+        with refusal(*words.split(", ")):
             simulate(**parts)
 
 
 def test_simulate_names_itself():
-    with pytest.raises(InputError, match=r"simulate has no argument 'comand'; did you mean 'command'\?"):
+    with refusal("simulate", "'comand'", "'command'"):
         simulate(comand="3 sin(4t)")
-    with pytest.raises(InputError, match="simulate: too many positional arguments"):
+    with refusal("simulate"):
         simulate("3 sin(4t)")
-    with pytest.raises(InputError, match="experiment must be an Experiment"):
+    with refusal("experiment", "Experiment"):
         simulate_experiment("3 sin(4t)")
-    with pytest.raises(InputError, match="simulate_with_truth: too many positional arguments"):
+    with refusal("simulate_with_truth"):
         simulate_with_truth(Experiment.of())
 
 
@@ -213,9 +215,7 @@ COARSE = {"duration": 20.0, "step": 1.5e-3, "set": {"sample_rate": "400[Hz]"}}
 
 
 def test_a_stated_step_is_checked_like_a_chosen_one():
-    with pytest.raises(
-        SimulationFailed, match=r"under-resolved: halving the step of 0\.00125 s \(rk4\) moves .*; take a "
-    ):
+    with refusal("0.00125 s", "rk4", error=SimulationFailed):
         simulate_experiment(Experiment.of(**COARSE))
     solver = simulate_experiment(Experiment.of(**COARSE, allow_unresolved=True)).recording.provenance["solver"]
     assert solver["allow_unresolved"]
@@ -226,7 +226,7 @@ def test_a_stated_step_is_checked_like_a_chosen_one():
 
 def test_the_check_of_a_stated_step_changes_no_byte():
     experiment = Experiment.of(duration=6.0, step=5e-4, leak="G = 6e-13 from 3 s")
-    checked, unchecked = (trajectory(experiment, experiment.leaks, step=step) for step in (None, 5e-4))
+    checked, unchecked = (integrate_run(experiment, experiment.leaks, step=step) for step in (None, 5e-4))
     assert np.isnan(unchecked.error)
     np.testing.assert_array_equal(checked.rows, unchecked.rows)
 
@@ -236,10 +236,10 @@ def test_a_proof_integrates_half_the_step_and_nothing_else_twice(monkeypatch):
 
     def count(*args, step=None, **more):
         counted.append(step)
-        return trajectory(*args, step=step, **more)
+        return integrate_run(*args, step=step, **more)
 
     for module in ("simulate", "integrate"):
-        monkeypatch.setattr(f"sealscope.simulation.{module}.trajectory", count)
+        monkeypatch.setattr(f"sealscope.simulation.{module}.integrate_run", count)
     experiment = Experiment.of(duration=6.0, leak="0.01 L/min from 3 s")
     simulate_experiment(experiment)
     without = len(counted)

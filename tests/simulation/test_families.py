@@ -13,14 +13,16 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.parameters.rig import Rig
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation.batch.run import refuse
+from sealscope.simulation.batch.run import refuse_unbatchable
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.changes import ParameterDrift, linear
+from sealscope.simulation.changes import ParameterDrift, linear_path
 from sealscope.simulation.commands import Alternating, Sine, parse_command
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import at_jittered, lagging
+from sealscope.simulation.instruments import filter_first_order, sample_with_jitter
 from sealscope.simulation.simulate import simulate
+
+from ..refusals import refusal
 
 
 @pytest.fixture(scope="module")
@@ -64,34 +66,32 @@ def test_warming_oil_warms(unmodelled):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "words"),
     [
-        ('[[family]]\nname = "a"\n', "family[1].why is missing"),
-        ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "family[1].warm is not known"),
-        ('[[family]]\nname = "a"\nwhy = "b"\n[[family]]\nname = "a"\nwhy = "b"\n', "names of their own"),
+        ('[[family]]\nname = "a"\n', "family[1].why"),
+        ('[[family]]\nname = "a"\nwhy = "b"\nwarm = true\n', "family[1].warm"),
+        ('[[family]]\nname = "a"\nwhy = "b"\n[[family]]\nname = "a"\nwhy = "b"\n', "names"),
         (
             '[[family]]\nname = "a"\nwhy = "b"\n[[family.nuisance]]\nname = "c"\nwhy = "d"\n'
             'parameters = ["daq.bits"]\nvalues = ["x"]\nunit = "bit"\n',
-            "c: values must be numbers with a unit, got 'x'",
+            "values, 'x'",
         ),
         (
             '[[family]]\nname = "a"\nwhy = "b"\n[[family.nuisance]]\nname = "c"\nwhy = "d"\n'
             'parameters = ["cylinder.volumes"]\nvalues = ["moving"]\n',
-            "c: values must be among fixed, position, got 'moving'",
+            "values, fixed, position, 'moving'",
         ),
     ],
 )
-def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, message):
+def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, words):
     path = tmp_path / "odd.toml"
     path.write_text('[profile]\nname = "odd"\ntitle = "Odd"\nextends = "bench"\n' + text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"odd\.toml") as error:
+    with refusal("odd.toml", *words.split(", ")):
         load_profile(path)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_an_unknown_family_is_named(unmodelled):
-    with pytest.raises(InputError, match=r"must be one of its own .*hoses.*, got 'pipes'"):
+    with refusal("hoses", "'pipes'"):
         draw(unmodelled, 1, family="pipes")
 
 
@@ -101,8 +101,8 @@ def test_a_rig_written_down_before_a_parameter_was_known_loads():
     del tree["cylinder"]["k_load"], tree["daq"]["jitter"], tree["sensors"]["p_A"]["lag"]
     again = Rig.from_dict(tree, place="log.nc")
     assert again == rig
-    assert "cylinder.k_load" not in rig.present()
-    assert rig.with_overrides({"k_load": 5.0}).present()["cylinder.k_load"] == 5.0
+    assert "cylinder.k_load" not in rig.present_values()
+    assert rig.with_overrides({"k_load": 5.0}).present_values()["cylinder.k_load"] == 5.0
 
 
 def test_equal_hoses_are_larger_chambers():
@@ -131,15 +131,15 @@ def test_the_springs_force_is_that_of_its_deflection():
 def test_a_load_that_drifts_moves_the_pressures_by_its_force():
     """Between a run with a growing force and one without, the mean pressure difference grows by force over area."""
     size, duration = 60.0, 12.0
-    drift = ParameterDrift("F_l", linear(size, duration), absolute=True)
+    drift = ParameterDrift("F_l", linear_path(size, duration), absolute=True)
     loaded, free = (simulate(duration=duration, seed=2, drifts=drifts) for drifts in ((drift,), ()))
     change = (loaded["p_A"] - loaded["p_B"]) - (free["p_A"] - free["p_B"])
     whole = round(2 * math.pi / 4.0 * 500)  # one stroke back and forth
     area = load_rig("thesis").cylinder.A_A
     early, late = change[:whole].mean(), change[-whole:].mean()
     assert late - early == pytest.approx(size * (duration - whole / 500) / duration / area, rel=0.1)
-    with pytest.raises(InputError, match="F_l must be absolute"):
-        ParameterDrift("F_l", linear(0.1, 1.0))
+    with refusal("F_l"):
+        ParameterDrift("F_l", linear_path(0.1, 1.0))
 
 
 @pytest.mark.parametrize("lag", [0.0005, 0.004, 0.03])
@@ -147,16 +147,16 @@ def test_a_slow_transducer_answers_a_ramp_as_the_closed_form(lag):
     """lag y' + y = r t from rest: y = r (t - lag (1 - exp(-t/lag)))."""
     t = np.arange(400) / 2000.0
     expected = t - lag * (1.0 - np.exp(-t / lag))
-    assert lagging(t, lag, 2000.0) == pytest.approx(expected, abs=1e-12)
-    assert lagging(np.full(5, 3.0), lag, 2000.0) == pytest.approx(np.full(5, 3.0), rel=1e-12)
-    assert lagging(t, 0.0, 2000.0) is t
+    assert filter_first_order(t, lag, 2000.0) == pytest.approx(expected, abs=1e-12)
+    assert filter_first_order(np.full(5, 3.0), lag, 2000.0) == pytest.approx(np.full(5, 3.0), rel=1e-12)
+    assert filter_first_order(t, 0.0, 2000.0) is t
 
 
 def test_a_jittering_clock_samples_where_it_says():
     f, interval = 60.0, 1.0 / 2000.0
     t = np.arange(4000) * interval
     late = np.clip(0.4 * np.random.default_rng(1).standard_normal(1000), -1.0, 1.0)
-    result = at_jittered(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
+    result = sample_with_jitter(lambda values: values[::4], np.sin(2 * np.pi * f * t), late)
     exact = np.sin(2 * np.pi * f * (t[::4] + late * interval))
     punctual = np.sin(2 * np.pi * f * t[::4])
     assert np.abs(result - exact)[1:].max() < 0.01 * np.abs(punctual - exact).max()
@@ -176,7 +176,7 @@ def test_harmonics_stand_beside_the_hum():
 def test_a_batch_refuses_what_its_instruments_do_not_know():
     for name, value in (("daq.jitter", 1e-4), ("sensors.p_A.lag", 0.01), ("sensors.p_B.hum_harmonics", 0.5)):
         with pytest.raises(InputError, match=name):
-            refuse(Experiment.of(duration=1.0, set={name: value}), 0)
+            refuse_unbatchable(Experiment.of(duration=1.0, set={name: value}), 0)
 
 
 def test_a_duty_in_turn_is_its_sines_one_after_the_other():
@@ -190,7 +190,7 @@ def test_a_duty_in_turn_is_its_sines_one_after_the_other():
     t = np.linspace(0.0, second, 50, endpoint=False)
     for turn in (first, 2 * first + second):
         assert duty.volts(turn + t) == pytest.approx(3 * np.sin(4 * t), abs=1e-12)
-    with pytest.raises(InputError, match="sines from zero"):
+    with refusal("sines"):
         Alternating(((2, Sine(1.0, 2.0, 0.5)),))
-    with pytest.raises(InputError, match="command must be like"):
+    with refusal("command"):
         parse_command("2 periods of step 5")

@@ -7,13 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
-from sealscope.simulation.commands import Sine, step, tabulated
+from sealscope.simulation.commands import Sine, polyline_from_table, step
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.leaks import from_time, growing
+from sealscope.simulation.leaks import growing_opening, opening_from
 from sealscope.simulation.simulate import simulate_experiment, write_truth
+
+from ..refusals import refusal
 
 PSI = 6894.757293168361
 LPM = 1e-3 / 60
@@ -27,22 +28,25 @@ LEAKING_PUMP = {"G_pump": 2.4e-13}
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("pump leak x3 from 90 s", Fault("pump leak", 3.0, opening=from_time(90.0))),
-        ("pump leakage +50 % growing from 1 s to 3 s", Fault("pump leak", 1.5, opening=growing(1.0, 3.0))),
+        ("pump leak x3 from 90 s", Fault("pump leak", 3.0, opening=opening_from(90.0))),
+        ("pump leakage +50 % growing from 1 s to 3 s", Fault("pump leak", 1.5, opening=growing_opening(1.0, 3.0))),
         ("pump leak G = 5e-13", Fault("pump leak G", 5e-13)),
-        ("rod seal A 0.012 L/min from 90 s", Fault("rod seal", 0.012 * LPM, "A", from_time(90.0))),
-        ("external leak B G = 2e-13 from 90", Fault("rod seal G", 2e-13, "B", from_time(90.0))),
-        ("friction x1.3 from 90 s", Fault("friction", 1.3, opening=from_time(90.0))),
+        ("rod seal A 0.012 L/min from 90 s", Fault("rod seal", 0.012 * LPM, "A", opening_from(90.0))),
+        ("external leak B G = 2e-13 from 90", Fault("rod seal G", 2e-13, "B", opening_from(90.0))),
+        ("friction x1.3 from 90 s", Fault("friction", 1.3, opening=opening_from(90.0))),
         ("friction -20 %", Fault("friction", 0.8)),
-        ("air 1 % growing from 60 s to 120 s", Fault("air", 0.01, opening=growing(60.0, 120.0))),
-        ("sensor p_A offset -2 psi from 90 s", Fault("sensor offset", -13789.514586336723, "p_A", from_time(90.0))),
+        ("air 1 % growing from 60 s to 120 s", Fault("air", 0.01, opening=growing_opening(60.0, 120.0))),
+        ("sensor p_A offset -2 psi from 90 s", Fault("sensor offset", -13789.514586336723, "p_A", opening_from(90.0))),
         ("sensor x offset 1 mm", Fault("sensor offset", 1e-3, "x")),
-        ("sensor p_B gain +1 % from 9 s", Fault("sensor gain", 0.01, "p_B", from_time(9.0))),
-        ("sensor p_1 stuck from 90 s to 100 s", Fault("sensor stuck", 0.0, "p_1", from_time(90.0, 100.0))),
-        ("sensor q_leak stuck", Fault("sensor stuck", 0.0, "q_leak", from_time(0.0))),
-        ("duty amplitude x1.5 from 90 s", Fault("duty", 1.5, opening=from_time(90.0))),
-        ("duty amplitude x0.5 frequency x2 growing from 1 s to 2 s", Fault("duty", 0.5, "", growing(1.0, 2.0), 2.0)),
-        ("duty frequency x0.8", Fault("duty", 1.0, pace=0.8)),
+        ("sensor p_B gain +1 % from 9 s", Fault("sensor gain", 0.01, "p_B", opening_from(9.0))),
+        ("sensor p_1 stuck from 90 s to 100 s", Fault("sensor stuck", 0.0, "p_1", opening_from(90.0, 100.0))),
+        ("sensor q_leak stuck", Fault("sensor stuck", 0.0, "q_leak", opening_from(0.0))),
+        ("duty amplitude x1.5 from 90 s", Fault("duty", 1.5, opening=opening_from(90.0))),
+        (
+            "duty amplitude x0.5 frequency x2 growing from 1 s to 2 s",
+            Fault("duty", 0.5, "", growing_opening(1.0, 2.0), 2.0),
+        ),
+        ("duty frequency x0.8", Fault("duty", 1.0, frequency_factor=0.8)),
     ],
 )
 def test_faults_are_read_from_words_and_their_own_words_read_back(text, fault):
@@ -71,38 +75,36 @@ def test_no_fault_is_none():
 
 
 @pytest.mark.parametrize(
-    ("text", "rule"),
+    ("text", "words"),
     [
-        ("", "fault must be like"),
-        ("pump leak", "fault must be like"),
-        ("pump leak x-3", "must change by a factor >= 0, got -3"),
-        ("rod seal C 0.01 L/min", "fault must be like"),
+        ("", "fault"),
+        ("pump leak", "fault"),
+        ("pump leak x-3", "-3, 0"),
+        ("rod seal C 0.01 L/min", "fault"),
         ("rod seal A 0.01 psi", "psi"),
-        ("friction x1e999", "factor >= 0, got inf"),
-        ("air 80 %", "0 % to 50 %"),
-        ("sensor p_9 offset 2 psi", "must be one of p_1, p_2, p_A, p_B, x, q_leak, got 'p_9'"),
+        ("friction x1e999", "inf, 0"),
+        ("air 80 %", "0 %, 50 %"),
+        ("sensor p_9 offset 2 psi", "'p_9', p_A, q_leak"),
         ("sensor p_A offset 2 mm", "mm"),
-        ("sensor p_A gain -100 %", "must be > -100 %"),
-        ("sensor p_A stuck from 9 s to 3 s", "must end later than that, got 3 s"),
-        ("duty", "fault must be like"),
-        ("duty amplitude x1.5 from 3 s; rm", "fault must be like"),
-        ("friction x1.3 growing from 9 s to 3 s", "stop growing after it starts"),
+        ("sensor p_A gain -100 %", "-100 %"),
+        ("sensor p_A stuck from 9 s to 3 s", "3 s"),
+        ("duty", "fault"),
+        ("duty amplitude x1.5 from 3 s; rm", "fault"),
+        ("friction x1.3 growing from 9 s to 3 s", "growing"),
     ],
 )
-def test_other_words_are_refused_in_one_line(text, rule):
-    with pytest.raises(InputError) as caught:
+def test_other_words_are_refused_in_one_line(text, words):
+    with refusal(*words.split(", ")):
         parse_fault(text)
-    assert rule in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_fault_that_cannot_be_on_this_rig_is_refused():
-    with pytest.raises(InputError, match=r"needs pump.G_pump > 0, got 0 \(pump leak x3 from 90 s\)"):
+    with refusal("pump.G_pump", "0", "pump leak x3 from 90 s"):
         Experiment.of(fault="pump leak x3 from 90 s")
-    with pytest.raises(InputError, match=r"command must stay within \+-10 V, got -?1\d"):
+    with refusal("command", "+-10 V"):
         Experiment.of(fault="duty amplitude x2 from 90 s", command="7 sin(4t)")
-    with pytest.raises(InputError, match="got table"):
-        Fault("duty", 2.0, opening=tabulated(np.array([0.0]), np.array([1.0])))
+    with refusal("table"):
+        Fault("duty", 2.0, opening=polyline_from_table(np.array([0.0]), np.array([1.0])))
 
 
 def pair(fault: str, *, values: dict | None = None, duration: float = 8.0, **others):
@@ -201,15 +203,15 @@ def test_a_faulty_sensor_errs_as_it_says_and_the_machine_does_not_know():
 
 def test_a_changed_duty_changes_size_and_pace_without_a_jump_in_phase():
     t = np.arange(0.0, 20.0, 1e-3)
-    command = Fault("duty", 1.5, "", from_time(10.0), 0.5).commanded(Sine(3.0, 4.0))
+    command = Fault("duty", 1.5, "", opening_from(10.0), 0.5).change_command(Sine(3.0, 4.0))
     u = command.volts(t)
     np.testing.assert_allclose(u[t < 10], 3 * np.sin(4 * t[t < 10]))
     np.testing.assert_allclose(u[t >= 10], 4.5 * np.sin(40 + 2 * (t[t >= 10] - 10)), atol=1e-9)
-    gradual = Fault("duty", 1.0, "", growing(5.0, 10.0), 2.0).commanded(Sine(1.0, 3.0))
-    pace = np.gradient(gradual.clock(t), t)
+    gradual = Fault("duty", 1.0, "", growing_opening(5.0, 10.0), 2.0).change_command(Sine(1.0, 3.0))
+    pace = np.gradient(gradual.original_time(t), t)
     np.testing.assert_allclose(pace, 1.0 + np.clip((t - 5) / 5, 0, 1), atol=2e-3)
     assert np.abs(np.diff(gradual.volts(t))).max() < 6.5e-3
-    assert step(1.0).volts(t).shape == Fault("duty", 2.0).commanded(step(1.0)).volts(t).shape
+    assert step(1.0).volts(t).shape == Fault("duty", 2.0).change_command(step(1.0)).volts(t).shape
     recorded = simulate_experiment(
         Experiment.of(duration=4.0, fault="duty amplitude x1.5 frequency x0.5 from 2 s")
     ).recording

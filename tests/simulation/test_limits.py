@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError, SimulationFailed
+from sealscope.errors import SimulationFailed
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 from sealscope.simulation.experiment import choose_method
+
+from ..refusals import refusal
 
 FULL_CHARGE = {"p_charge": "40[MPa]"}  # so that the emptied chamber stays above vacuum
 
@@ -44,7 +46,7 @@ def test_current_and_voltage_stay_within_the_drive_s_limits(check_rig, drive):
 
 def test_the_drive_s_own_gains_cannot_be_resolved(check_rig, drive):
     for throttled in (False, True):
-        with pytest.raises(SimulationFailed, match=r"step must be <= 9\.4e-06 s to resolve speed loop"):
+        with refusal("step", "9.4e-06 s", "speed loop", error=SimulationFailed):
             drive(check_rig(throttled, k_p=50_000.0, K_i=100.0), 1.0)
     # with the step that the message asks for the loop is as stiff as it is meant to be
     run = drive(check_rig(k_p=50_000.0, K_i=100.0), 1.0, step=9e-6)
@@ -53,8 +55,7 @@ def test_the_drive_s_own_gains_cannot_be_resolved(check_rig, drive):
 
 def test_rk4_with_throttles_at_the_thesis_s_step_is_refused(check_rig, drive):
     rig = check_rig(throttled=True)
-    rule = r"step must be <= .* for rk4 with throttles .* got 0\.0001 s; use method imex"
-    with pytest.raises(SimulationFailed, match=rule):
+    with refusal("step", "rk4", "throttles", "0.0001 s", "imex", error=SimulationFailed):
         drive(rig, 5.0, method="rk4", step=1e-4)
     chatter = drive(rig, 5.0, method="rk4", step=1e-4, allow_unresolved=True)
     truth = drive(rig, 5.0)
@@ -65,7 +66,7 @@ def test_rk4_with_throttles_at_the_thesis_s_step_is_refused(check_rig, drive):
 
 
 def test_a_step_too_long_for_the_rig_is_refused_and_a_default_step_adapts(check_rig, drive):
-    with pytest.raises(SimulationFailed, match=r"step must be <= 0\.0015 s to resolve .*, got 0\.005 s"):
+    with refusal("step", "0.0015 s", "0.005 s", error=SimulationFailed):
         drive(check_rig(), 1.0, step=5e-3, rate=100.0)
     stiff = check_rig(K_oil="20000[MPa]", M_eq="1[kg]")  # the oil column rings at 8 300 rad/s
     assert drive(stiff, 0.1).step <= 1 / 8000
@@ -76,7 +77,7 @@ def test_a_step_too_long_for_the_rig_is_refused_and_a_default_step_adapts(check_
 def test_a_leak_that_the_step_cannot_resolve_is_refused(check_rig, drive):
     C = 2e-7
     truth = drive(check_rig(), 1.0, C=C, step=2e-5)
-    with pytest.raises(SimulationFailed, match=r"to resolve the leak, got 0\.0005 s"):
+    with refusal("leak", "0.0005 s", error=SimulationFailed):
         drive(check_rig(), 1.0, C=C, step=5e-4)
     wrong = drive(check_rig(), 1.0, C=C, step=5e-4, allow_unresolved=True)
     assert np.mean(np.abs(wrong["q_leak"])) > 1.2 * np.mean(np.abs(truth["q_leak"]))  # why it is refused
@@ -87,7 +88,7 @@ def test_a_leak_that_the_step_cannot_resolve_is_refused(check_rig, drive):
 def test_a_cap_too_stiff_for_the_step_is_refused_only_once_it_is_hit(check_rig, drive):
     rig = check_rig(k_stop=1e10, d_stop=3.5e5, **FULL_CHARGE)
     drive(rig, 1.0, u=hold(5.0))
-    with pytest.raises(SimulationFailed, match="to resolve the hard stop"):
+    with refusal("hard stop", error=SimulationFailed):
         drive(rig, 1.0, u=hold(5.0), x_0=0.28)
 
 
@@ -95,15 +96,14 @@ def test_vacuum_is_refused_with_place_and_time(check_rig, drive):
     def push(t: np.ndarray) -> np.ndarray:
         return 5.0 * np.minimum(t / 0.5, 1.0)
 
-    rule = r"p_B must stay above vacuum .*-101325 Pa.* at t = .* s \(x = 0\.30"
-    with pytest.raises(SimulationFailed, match=rule):
+    with refusal("p_B", "vacuum", "-101325 Pa", "t", "x", error=SimulationFailed):
         drive(check_rig(), 3.0, u=push, x_0=0.28)
     run = drive(check_rig(), 3.0, u=push, x_0=0.28, allow_unresolved=True)
     assert run["p_B"].min() < -101325
 
 
 def test_a_run_that_diverges_is_refused_even_when_all_is_allowed(check_rig, drive):
-    with pytest.raises(SimulationFailed, match=r"the run diverged: .* is not finite at t = "):
+    with refusal("finite", error=SimulationFailed):
         drive(check_rig(), 5.0, step=1e-2, rate=100.0, allow_unresolved=True)
 
 
@@ -120,22 +120,22 @@ def test_the_literal_integral_tends_to_the_state_as_the_step_goes_to_zero(check_
 
 
 @pytest.mark.parametrize(
-    ("values", "method", "rule"),
+    ("values", "method", "words"),
     [
-        ({}, "imex", "imex needs throttles"),
-        ({}, "euler", "method must be auto, rk4 or imex, got 'euler'"),
-        ({"orifices": "present", "integrator": "euler"}, "auto", "needs method rk4"),
-        ({"orifices": "present", "integrator": "euler"}, "imex", "needs method rk4"),
+        ({}, "imex", "imex, throttles"),
+        ({}, "euler", "method, 'euler', rk4"),
+        ({"orifices": "present", "integrator": "euler"}, "auto", "rk4"),
+        ({"orifices": "present", "integrator": "euler"}, "imex", "rk4"),
     ],
 )
-def test_a_method_that_does_not_suit_the_rig_is_refused(check_rig, values, method, rule):
-    with pytest.raises(InputError, match=rule):
+def test_a_method_that_does_not_suit_the_rig_is_refused(check_rig, values, method, words):
+    with refusal(*words.split(", ")):
         choose_method(check_rig(**values), method)
 
 
 @pytest.mark.parametrize("step", [0.0, -1e-4, float("nan"), float("inf")])
 def test_a_step_must_be_a_time(check_rig, drive, step):
-    with pytest.raises(InputError, match="step must be > 0 s"):
+    with refusal("step", "0 s"):
         drive(check_rig(), 1.0, step=step)
 
 
@@ -168,7 +168,7 @@ def test_a_step_between_the_two_limits_is_refused(check_rig, drive):
     rig = check_rig(throttled=True, volumes="position")
     p = rig_numbers(rig)
     mid = DECAY_LIMIT / (p.K_oil * (1 / p.V_1 + 1 / p.V) * p.c_A_in / np.sqrt(p.dp_0))
-    with pytest.raises(SimulationFailed, match="for rk4 with throttles"):
+    with refusal("rk4", "throttles", error=SimulationFailed):
         drive(rig, 0.2, method="rk4", step=0.98 * mid, x_0=-0.29)
 
 
@@ -187,7 +187,7 @@ def test_the_pressure_in_the_friction_shortens_the_step(check_rig, drive):
     slope = (p.F_pr + p.F_cfr * 2 * p.p_charge) * p.K_brk / p.v_th + p.F_v
     assert longest_step(p) == pytest.approx(DECAY_LIMIT / (slope / p.M_eq), rel=0.02)
     assert longest_step(p._replace(coulomb_of_difference=True)) > 5 * longest_step(p)
-    with pytest.raises(SimulationFailed, match=r"step must be <= .* friction of this rig"):
+    with refusal("step", "friction", error=SimulationFailed):
         drive(rig, 1.0, step=5e-4)
     chosen = drive(rig, 4.0)
     truth = drive(rig, 4.0, step=chosen.step / 8)

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.simulation.changes import (
     ParameterDrift,
     Wander,
-    linear,
+    linear_path,
 )
-from sealscope.simulation.commands import tabulated
+from sealscope.simulation.commands import polyline_from_table
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import FILTER_REACH, decimate
 from sealscope.simulation.simulate import simulate, simulate_experiment
+
+from ..refusals import refusal
 
 PRESSURES = ("p_1", "p_2", "p_A", "p_B")
 QUIET = {"sensors.common_noise": 0.0, "bits": 24} | {
@@ -31,7 +32,7 @@ LINEAR = {"F_pr": 0.0, "F_cfr": 0.0, "G_pump": 3e-13}
 def test_a_drifting_viscous_friction_follows_the_equation_with_time_in_it():
     """The linear rig with F_v(t) = F_v (1 + 0.3 t/20), against an independent program that has F_v in its equations."""
     rig = load_rig().with_overrides(LINEAR)
-    drift = ParameterDrift("friction.F_v", linear(0.3, 20.0))
+    drift = ParameterDrift("friction.F_v", linear_path(0.3, 20.0))
     common = {"rig": rig, "duration": 20.0, "set": {"sample_rate": "100[Hz]"}}
     drifting, constant = (simulate_experiment(Experiment.of(**common, drifts=d)).truth for d in ((drift,), ()))
     m, c, d = rig.motor, rig.cylinder, rig.pump.q_b / (2 * np.pi)
@@ -67,7 +68,7 @@ def test_a_drift_of_nothing_changes_no_byte():
     still = simulate(
         duration=3.0,
         seed=4,
-        drifts=(ParameterDrift("K_oil", linear(0.0, 3.0)), ParameterDrift("friction", linear(0, 3))),
+        drifts=(ParameterDrift("K_oil", linear_path(0.0, 3.0)), ParameterDrift("friction", linear_path(0, 3))),
     )
     for name in plain.channels:
         assert plain[name].tobytes() == still[name].tobytes()
@@ -85,7 +86,7 @@ def test_a_number_that_steps_in_the_table_is_the_rig_with_that_number(throttled)
 
 def test_the_oil_s_modulus_may_drift_without_making_oil():
     values = {"orifices": "present", "closed_A": 0.5, "closed_B": 0.5}
-    drifts = (ParameterDrift("K_oil", Wander((0.1, -0.05), 5.0)), ParameterDrift("line.C_d", linear(-0.2, 5.0)))
+    drifts = (ParameterDrift("K_oil", Wander((0.1, -0.05), 5.0)), ParameterDrift("line.C_d", linear_path(-0.2, 5.0)))
     o = simulate_experiment(Experiment.of(duration=5.0, set=values, drifts=drifts)).truth.outputs
     rig = load_rig().with_overrides(values)
     held = rig.cylinder.V * (o["p_A"] + o["p_B"]) + rig.line.V_1 * (o["p_1"] + o["p_2"])
@@ -93,27 +94,26 @@ def test_the_oil_s_modulus_may_drift_without_making_oil():
 
 
 @pytest.mark.parametrize(
-    ("make", "rule"),
+    ("make", "words"),
     [
-        (lambda: ParameterDrift("V_9", linear(0.1, 1.0)), "'V_9' is not a parameter"),
-        (lambda: ParameterDrift("cylinder.L", linear(0.1, 1.0)), "cylinder.L cannot drift"),
-        (lambda: ParameterDrift("daq.bits", linear(0.1, 1.0)), "daq.bits cannot drift"),
-        (lambda: ParameterDrift("volumes", linear(0.1, 1.0)), "cylinder.volumes cannot drift"),
-        (lambda: ParameterDrift("p_A.offset", linear(0.1, 1.0)), "must be absolute"),
-        (lambda: ParameterDrift("K_oil", linear(0.1, 1.0), absolute=True), "must be relative"),
-        (lambda: linear(0.1, 0.0), "last > 0 s"),
-        (lambda: Wander((float("nan"),), 1.0), "finite weights"),
-        (lambda: tabulated(np.array([1.0, 0.0]), np.zeros(2)), "times must rise"),
+        (lambda: ParameterDrift("V_9", linear_path(0.1, 1.0)), "'V_9'"),
+        (lambda: ParameterDrift("cylinder.L", linear_path(0.1, 1.0)), "cylinder.L"),
+        (lambda: ParameterDrift("daq.bits", linear_path(0.1, 1.0)), "daq.bits"),
+        (lambda: ParameterDrift("volumes", linear_path(0.1, 1.0)), "cylinder.volumes"),
+        (lambda: ParameterDrift("p_A.offset", linear_path(0.1, 1.0)), "absolute"),
+        (lambda: ParameterDrift("K_oil", linear_path(0.1, 1.0), absolute=True), "relative"),
+        (lambda: linear_path(0.1, 0.0), "0 s"),
+        (lambda: Wander((float("nan"),), 1.0), "weights"),
+        (lambda: polyline_from_table(np.array([1.0, 0.0]), np.zeros(2)), "times"),
         (
-            lambda: Experiment.of(duration=9.0, drifts=(ParameterDrift("F_v", linear(-1.2, 9.0)),)),
-            "above -100 %, got -120 %",
+            lambda: Experiment.of(duration=9.0, drifts=(ParameterDrift("F_v", linear_path(-1.2, 9.0)),)),
+            "-120 %, -100",
         ),
     ],
 )
-def test_an_impossible_drift_is_refused(make, rule):
-    with pytest.raises(InputError, match=rule) as caught:
+def test_an_impossible_drift_is_refused(make, words):
+    with refusal(*words.split(", ")):
         make()
-    assert "\n" not in str(caught.value)
 
 
 def test_a_wander_is_the_sum_it_says_and_starts_at_nothing():
@@ -122,10 +122,10 @@ def test_a_wander_is_the_sum_it_says_and_starts_at_nothing():
     expected = 0.05 * t / 10 + sum(w * np.sin((k + 0.5) * np.pi * t / 10) for k, w in enumerate(wander.weights))
     np.testing.assert_allclose(wander.value_at(t), expected, atol=1e-14)
     assert wander.value_at(np.zeros(1))[0] == 0.0
-    assert np.ptp(wander.scaled(0.08).value_at(np.linspace(0, 10, 1001))) == pytest.approx(0.08)
-    assert tabulated(np.array([0.0, 4.0]), np.array([0.0, 0.2])).value_at(np.array([2.0, 9.0])) == pytest.approx(
-        [0.1, 0.2]
-    )
+    assert np.ptp(wander.scale_to_range(0.08).value_at(np.linspace(0, 10, 1001))) == pytest.approx(0.08)
+    assert polyline_from_table(np.array([0.0, 4.0]), np.array([0.0, 0.2])).value_at(
+        np.array([2.0, 9.0])
+    ) == pytest.approx([0.1, 0.2])
 
 
 # -- instruments ----------------------------------------------------------------------------------------------------
@@ -134,9 +134,9 @@ def test_a_wander_is_the_sum_it_says_and_starts_at_nothing():
 def test_noise_bias_and_hum_drift_at_the_instruments_alone():
     values = {**QUIET, "sensors.p_A.noise": 5e3, "sensors.p_B.hum": 5e3}
     drifts = (
-        ParameterDrift("sensors.p_A.noise", linear(0.5, 60.0)),
-        ParameterDrift("sensors.p_1.offset", linear(3000.0, 60.0), absolute=True),
-        ParameterDrift("sensors.p_B.hum", linear(1.0, 60.0)),
+        ParameterDrift("sensors.p_A.noise", linear_path(0.5, 60.0)),
+        ParameterDrift("sensors.p_1.offset", linear_path(3000.0, 60.0), absolute=True),
+        ParameterDrift("sensors.p_B.hum", linear_path(1.0, 60.0)),
     )
     common = {"command": "step 0", "duration": 60.0, "set": values}
     plain, drifting = (simulate_experiment(Experiment.of(**common, drifts=d)) for d in ((), drifts))

@@ -16,11 +16,12 @@ from sealscope.recordings import split_map_option
 from sealscope.simulation.commands import Chirp, check_command, parse_command
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import parse_leak
-from sealscope.storage.opening import names_a_file
+from sealscope.storage.opening import is_file_path
 from sealscope.storage.rows import ROWS
 from sealscope.units import parse_quantity
 
 from ..recordings.refusals import count_calls
+from ..refusals import refusal
 
 PLAN = '[campaign]\nname = "a"\nduration = "6 s"\ndetectors = ["rms change"]\n[[records]]\ncount = 1\n'
 
@@ -36,24 +37,24 @@ def test_a_message_is_one_line_of_bounded_length(kind: type[SealscopeError]) -> 
 
 
 @pytest.mark.parametrize(
-    ("entry", "rule"),
+    ("entry", "words"),
     [
-        (f"seed = {'1' * 4400}", "a plan must be TOML"),
-        (f"seed = {2**53 + 1}", r"a whole number must be at most 2\^53 in size"),
-        (f"duration = 1{'0' * 400}", r"a whole number must be at most 2\^53 in size"),
-        ("channels = [['p_A']]", r"channels\[1\] must be a valid string, got \['p_A'\]"),
-        (f'rig = "{"thesis" * 900}"', "is no packaged rig"),
-        ("false_alarm = 1e-320", "the false-alarm probability must be at least 1e-15"),
+        (f"seed = {'1' * 4400}", "TOML"),
+        (f"seed = {2**53 + 1}", "2^53"),
+        (f"duration = 1{'0' * 400}", "2^53"),
+        ("channels = [['p_A']]", "channels[1], 'p_A'"),
+        (f'rig = "{"thesis" * 900}"', "rig"),
+        ("false_alarm = 1e-320", "1e-15"),
     ],
 )
-def test_settings_of_a_plan(entry: str, rule: str, tmp_path: Path) -> None:
+def test_settings_of_a_plan(entry: str, words: str, tmp_path: Path) -> None:
     path, key = tmp_path / "plan.toml", entry.partition(" ")[0]
     lines = [line for line in PLAN.splitlines() if not line.startswith(f"{key} =")]
     calibrated = '[[records]]\nuse = "calibrate"\ncount = 9\n' if key == "false_alarm" else ""
     detectors = "d3 of p_A fell" if calibrated else "rms change"
     text = "\n".join([lines[0], entry, *lines[1:], calibrated]).replace("rms change", detectors)
     path.write_text(text)
-    with pytest.raises(InputError, match=rule):
+    with refusal(*words.split(", ")):
         load_plan(path)
 
 
@@ -62,21 +63,21 @@ def test_patterns_of_a_plan(files: str, tmp_path: Path) -> None:
     (tmp_path / "plan.toml").write_text(
         f'[campaign]\nname = "a"\ndetectors = ["rms change"]\n[recordings]\n[[recordings.sets]]\nfiles = "{files}"\n'
     )
-    with pytest.raises(InputError, match="files must"):
+    with refusal("files"):
         load_plan(tmp_path / "plan.toml")
 
 
 @pytest.mark.parametrize("name", ["thesis" * 1000, "a\0b", "\udcff"])
 def test_what_no_path_can_be_is_no_file(name: str) -> None:
-    assert not names_a_file(name)
-    with pytest.raises(InputError, match="is no packaged rig"):
+    assert not is_file_path(name)
+    with refusal("rig"):
         load_rig(name)
 
 
 def test_a_row_without_its_time_is_no_row(tmp_path: Path) -> None:
     row = '{"id": "a", "use": "judge", "leak_lpm": 0, "fault": "", "levels": {}, "replicate": 0, "error": "e", '
     (tmp_path / ROWS).write_text(row + '"scores": {}, "seconds": null}\n')
-    with pytest.raises(UnreadableFile, match="a line of a campaign must be a row, got something else"):
+    with refusal("row", error=UnreadableFile):
         store.read_rows(tmp_path)
 
 
@@ -135,7 +136,7 @@ def test_a_long_command_is_checked_in_little_memory() -> None:
     tracemalloc.start()
     try:
         check_command(Chirp(3.0, 0.1, 5.0, 60.0), t, 10.0)
-        with pytest.raises(InputError, match=r"got 11 V at t = 5000 s"):
+        with refusal("11 V", "5000 s"):
             check_command(parse_command("step 11 at 5000 s"), t, 10.0)
         assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:

@@ -14,9 +14,9 @@ import pytest
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.experiment import Experiment
-from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, row_of
-from sealscope.thesis.engine.context import SimulatedRun, simulated_run
-from sealscope.thesis.engine.items import Item, collect
+from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, make_row
+from sealscope.thesis.engine.context import SimulatedRun, simulate_run
+from sealscope.thesis.engine.items import Item, load_items
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, FILES, Condition, DataSheet, read_sheet
 
@@ -27,7 +27,7 @@ needs_sheet = pytest.mark.skipif(
 )
 
 
-ITEMS: dict[str, Item] = {item.id: item for item in collect()}
+ITEMS: dict[str, Item] = {item.id: item for item in load_items()}
 
 
 class Kept:
@@ -46,7 +46,7 @@ class Kept:
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
         of = experiment.key(), prove
         if of not in self.runs:
-            self.runs[of] = simulated_run(experiment, prove)
+            self.runs[of] = simulate_run(experiment, prove)
         return self.runs[of]
 
     def product(self, item: str) -> tuple[Product | Claim, ...]:
@@ -78,7 +78,7 @@ def table_with(sheet: DataSheet, item: str, range_MPa: Callable[[Condition], flo
     rows = []
     for k, condition in enumerate(APPENDIX_C):
         rms = {c: {q: tuple(sheet.rms[c][q][k].tolist()) for q in QUANTITIES} for c in CHAMBERS}
-        rows.append(row_of(condition, "", condition.mean_leak_lpm, (range_MPa(condition),) * 2, rms))
+        rows.append(make_row(condition, "", condition.mean_leak_lpm, (range_MPa(condition),) * 2, rms))
     return ITEMS[item].table(rows, "", COLUMNS, resolved=True)
 
 

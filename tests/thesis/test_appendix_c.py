@@ -11,7 +11,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters import appendix_c
 from sealscope.thesis.chapters import appendix_c_runs as simulation
-from sealscope.thesis.chapters.appendix_c_runs import drawn_drifts, sheet_of
+from sealscope.thesis.chapters.appendix_c_runs import draw_drifts, parse_sheet
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet
 
@@ -32,7 +32,7 @@ def tables() -> dict[str, tuple[ThesisTable, ...]]:
 
 def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
     (table,) = tables["appendix-c-leak"]
-    sheet = sheet_of(table)
+    sheet = parse_sheet(table)
     row = dict(zip(table.columns, table.rows[2], strict=True))
     assert row["test"] == 40
     assert row["mean leak [L/min]"] == pytest.approx(0.0163, rel=0.01)
@@ -41,7 +41,7 @@ def test_a_table_reads_back_as_the_sheet_it_holds(tables: dict[str, tuple[Thesis
 
 
 def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
-    sheet = sheet_of(tables["appendix-c-no-leak"][0])
+    sheet = parse_sheet(tables["appendix-c-no-leak"][0])
     first, second = (sheet.rms["p_A"]["d1"][k] for k in (0, 1))
     assert np.all(first != second)
     np.testing.assert_allclose(first, second, rtol=0.05)
@@ -52,14 +52,14 @@ def test_the_same_condition_gives_the_same_truth_and_other_noise(tables: dict[st
 def test_nothing_moves_without_a_leak_beyond_the_noise_of_the_estimate(
     tables: dict[str, tuple[ThesisTable, ...]],
 ) -> None:
-    sheet = sheet_of(tables["appendix-c-no-leak"][0])
+    sheet = parse_sheet(tables["appendix-c-no-leak"][0])
     for chamber in CHAMBERS:
         assert np.abs(sheet.log_change(chamber, "d1")).max() < 0.05  # 7500 samples: deviation about 1 % a difference
         assert np.abs(sheet.log_change(chamber, "d3")).max() < 0.25
 
 
 def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ThesisTable, ...]]) -> None:
-    sheet = sheet_of(tables["appendix-c-drift"][0])
+    sheet = parse_sheet(tables["appendix-c-drift"][0])
     drawn = [np.log1p(moved(condition.number)["sensors.common_noise"]) for condition in TWO]
     found = np.mean([sheet.log_change(chamber, "d1") for chamber in CHAMBERS], axis=0)
     np.testing.assert_allclose(found, drawn, atol=0.03)  # deviation under 1 % where both chambers are averaged
@@ -68,7 +68,7 @@ def test_a_drift_moves_the_noise_as_drawn(tables: dict[str, tuple[ThesisTable, .
 
 def moved(number: int, draw: int = 0) -> dict[str, float]:
     """By what share each parameter of a test that drifts at 9 s has moved after it; before, none has."""
-    drifts = drawn_drifts(number, 9.0, draw)
+    drifts = draw_drifts(number, 9.0, draw)
     assert [drift.shape.value_at(np.array(8.999)) for drift in drifts] == [0.0] * len(drifts)
     return {drift.parameter: float(drift.shape.value_at(np.array(9.0))) for drift in drifts}
 
@@ -101,7 +101,7 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
     still = full_table(made_sheet(2, scatter=0.01), "appendix-c-no-leak")
     products: dict[str, tuple[Product | Claim, ...]] = {"appendix-c-leak": (leak,), "appendix-c-no-leak": (still,)}
     context = Kept(products, measured if given else None)
-    summary, of_a, of_b = appendix_c.appendix(context, ITEMS["appendix-c"])  # type: ignore[arg-type]
+    summary, of_a, of_b = appendix_c.agreement_tables(context, ITEMS["appendix-c"])  # type: ignore[arg-type]
     assert (summary.id, of_a.id, of_b.id) == ("appendix-c", "appendix-c-pa", "appendix-c-pb")
     assert (len(summary.rows), len(of_a.rows), len(of_b.rows)) == (10, 41, 41)
     first = dict(zip(summary.columns, summary.rows[0], strict=True))
@@ -124,9 +124,9 @@ def test_the_appendix_stands_beside_the_sheet_where_there_is_one(given: bool) ->
 @pytest.mark.long
 def test_the_thesis_s_rule_fires_like_a_coin_where_nothing_leaks() -> None:
     context = Kept()
-    still = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
-    drift = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-drift"])[0])  # type: ignore[arg-type]
-    leak = sheet_of(simulation.runs_table(context, ITEMS["appendix-c-leak"])[0])  # type: ignore[arg-type]
+    still = parse_sheet(simulation.runs_table(context, ITEMS["appendix-c-no-leak"])[0])  # type: ignore[arg-type]
+    drift = parse_sheet(simulation.runs_table(context, ITEMS["appendix-c-drift"])[0])  # type: ignore[arg-type]
+    leak = parse_sheet(simulation.runs_table(context, ITEMS["appendix-c-leak"])[0])  # type: ignore[arg-type]
     for sheet in (still, drift):  # beyond 9 to 32 one column in 4000 of coins
         for chamber in CHAMBERS:
             assert 9 <= np.sum(sheet.log_change(chamber, "d1") < 0) <= 32, chamber

@@ -16,7 +16,7 @@ from sealscope.thesis.chapters.chapter3 import (
     wavelet_spectrum,
 )
 from sealscope.thesis.engine.context import SimulatedRun
-from sealscope.thesis.engine.products import Claim, Figure, verdict_of
+from sealscope.thesis.engine.products import Claim, Figure, claim_verdict
 
 from .conftest import ITEMS, Kept, numbers
 
@@ -167,4 +167,4 @@ def test_a_pressure_that_drops_makes_claim_3_6_hold(monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_verdict_follows_from_the_tests(tests: list[bool | None], verdict: str) -> None:
-    assert verdict_of(tests) == verdict
+    assert claim_verdict(tests) == verdict

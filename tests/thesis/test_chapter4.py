@@ -15,24 +15,24 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4 import figures as chapter4
 from sealscope.thesis.chapters.chapter4.cases import (
     CASES,
-    OURS,
+    DEFAULT_READING,
     PERIOD,
     READINGS,
     THESIS_STEP,
     Reading,
     Runs,
-    both_runs,
+    all_resolved,
+    make_experiment,
     mean_difference,
-    numbers_of,
     piston_drift,
-    resolved,
-    span,
-    spec,
+    run_both_solvers,
     steady_output,
+    steady_range,
+    summarise_run,
     visible_pressure,
 )
 from sealscope.thesis.chapters.chapter4.claims import ringing
-from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold
+from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, friction_at_threshold
 from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
@@ -47,9 +47,9 @@ def kept() -> Kept:
 
 @pytest.fixture(scope="module", autouse=True)
 def shorter_drifts() -> Iterator[None]:
-    """A quarter of a minute shows a drift, too."""
+    """Eight seconds show a drift, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sealscope.thesis.chapters.chapter4.cases._DRIFT_DURATION", 15.0)
+        patch.setattr("sealscope.thesis.chapters.chapter4.cases._DRIFT_DURATION", 8.0)
         yield
 
 
@@ -66,7 +66,7 @@ def claims(kept: Kept) -> dict[str, Claim]:
 
 
 def of_case(context: Kept, name: str) -> Runs:
-    return both_runs(context, *CASES[name])  # type: ignore[arg-type]
+    return run_both_solvers(context, *CASES[name])  # type: ignore[arg-type]
 
 
 def test_cases_are_those_of_tables_4_2_and_4_3() -> None:
@@ -97,7 +97,7 @@ def test_measured_only_figures_are_listed(kept: Kept) -> None:
 
 @pytest.mark.parametrize("reading", READINGS, ids=lambda one: one.title)
 def test_a_reading_sets_what_it_says(reading: Reading) -> None:
-    rig = spec("5 sin(2t)", 25.0, reading).rig
+    rig = make_experiment("5 sin(2t)", 25.0, reading).rig
     free = 0.92 * math.pi / 4.0 * (reading.d_line_mm * 1e-3) ** 2 * math.sqrt(2.0 / 847.0)
     tight = free * (0.75 if reading.closed_means == "area" else 0.5625)
     expected = (free, tight, tight, free) if reading.metering == "literal" else (free, tight, free, tight)
@@ -106,13 +106,16 @@ def test_a_reading_sets_what_it_says(reading: Reading) -> None:
 
 
 def test_the_readings_differ_and_open_throttles_do_not_know_them() -> None:
-    assert spec("5 sin(2t)", 0.0, OURS).key() == spec("5 sin(2t)", 0.0, Reading("literal", "diameter")).key()
-    assert len({spec("5 sin(2t)", 25.0, reading).key() for reading in READINGS}) == 2
+    assert (
+        make_experiment("5 sin(2t)", 0.0, DEFAULT_READING).key()
+        == make_experiment("5 sin(2t)", 0.0, Reading("literal", "diameter")).key()
+    )
+    assert len({make_experiment("5 sin(2t)", 25.0, reading).key() for reading in READINGS}) == 2
 
 
 @pytest.mark.parametrize("name", ["4.2-a", "4.3-a"])
-def test_the_literal_run_has_the_thesis_s_own_method_and_step(kept: Kept, name: str) -> None:
-    run = of_case(kept, name)["literal"]
+def test_the_published_solver_has_the_thesis_s_method_and_step(kept: Kept, name: str) -> None:
+    run = of_case(kept, name)["as_published"]
     assert run.recording is not None
     solver = run.recording.provenance["solver"]
     assert (solver["method"], solver["step_s"]) == ("rk4", pytest.approx(THESIS_STEP, rel=1e-12))
@@ -120,8 +123,8 @@ def test_the_literal_run_has_the_thesis_s_own_method_and_step(kept: Kept, name: 
 
 def test_without_orifices_the_step_is_fine(kept: Kept) -> None:
     both = of_case(kept, "4.2-c")
-    assert resolved(both)
-    gap = steady_output(both["literal"], "p_A") - steady_output(both["converged"], "p_A")
+    assert all_resolved(both)
+    gap = steady_output(both["as_published"], "p_A") - steady_output(both["converged"], "p_A")
     assert np.sqrt(np.mean(gap**2)) < 10.0
     (figure,) = make(kept, ALL["fig-4.9"])
     assert figure.resolved is True
@@ -130,7 +133,7 @@ def test_without_orifices_the_step_is_fine(kept: Kept) -> None:
 def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
     both = of_case(kept, "4.3-a")
     assert both["converged"].resolved is True
-    assert both["literal"].resolved is False
+    assert both["as_published"].resolved is False
     for name in ("fig-4.10", "fig-4.12", "fig-4.13", "fig-4.33", "table-4.3-a"):
         (product,) = make(kept, ALL[name])
         assert product.resolved is False
@@ -140,7 +143,7 @@ def test_with_orifices_it_is_not_and_the_figure_says_so(kept: Kept) -> None:
 
 def test_the_converged_drop_is_the_orifice_s(kept: Kept) -> None:
     run = of_case(kept, "4.3-i")["converged"]
-    c = throttle_coefficients(spec("7 sin(4t)", 75.0).rig)
+    c = throttle_coefficients(make_experiment("7 sin(4t)", 75.0).rig)
     drop, flow = steady_output(run, "p_1") - steady_output(run, "p_A"), steady_output(run, "Q_A")
     assert drop.min() == pytest.approx(-((flow.min() / c[1]) ** 2), rel=1e-3)
     assert drop.max() == pytest.approx((flow.max() / c[0]) ** 2, rel=1e-3)
@@ -169,7 +172,7 @@ def rk4_of_the_drop(forward: float, back: float, Q: float, h: float, seconds: fl
 
 def test_what_rk4_shows_at_the_orifice_is_a_fixed_point_of_the_method(kept: Kept) -> None:
     c = 0.92 * math.pi / 4.0 * 0.007**2 * math.sqrt(2.0 / 847.0)
-    run = of_case(kept, "4.3-a")["literal"]
+    run = of_case(kept, "4.3-a")["as_published"]
     far, near = (rk4_of_the_drop(0.75 * c, c, Q, 1e-4, 0.5) for Q in (-1e-6, 1e-6))  # the method has two, the rig none
     assert far == pytest.approx(775e3, rel=0.01)
     assert near == pytest.approx(-130e3, rel=0.01)
@@ -188,7 +191,7 @@ def test_case_table_holds_both_runs(kept: Kept) -> None:
     assert list(rows) == [
         "omega [rad/s]", "x [mm]", "p_1 [MPa]", "p_2 [MPa]", "p_A [MPa]", "p_B [MPa]", "Q_A [L/min]", "Q_B [L/min]",
     ]  # fmt: skip
-    assert rows["p_1 [MPa]"][1] == pytest.approx(steady_output(both["literal"], "p_1").min() * 1e-6)
+    assert rows["p_1 [MPa]"][1] == pytest.approx(steady_output(both["as_published"], "p_1").min() * 1e-6)
     assert rows["x [mm]"][5] == pytest.approx(steady_output(both["converged"], "x").max() * 1e3)
     assert rows["Q_B [L/min]"][6] == pytest.approx(steady_output(both["converged"], "Q_B").std() * 6e4)
 
@@ -199,7 +202,7 @@ def test_a_figure_follows_the_reading_of_its_item(kept: Kept) -> None:
     assert usual[key] < 0 < printed[key]
     other = {"d_line_mm": 5.0, "closed_means": "diameter"}
     narrow = replace(ALL["fig-4.14"], inputs={**ALL["fig-4.14"].inputs, "reading": other})
-    assert chapter4.reading_of(narrow) == Reading(d_line_mm=5.0, closed_means="diameter")
+    assert chapter4.item_reading(narrow) == Reading(d_line_mm=5.0, closed_means="diameter")
     assert abs(numbers(make(kept, narrow)[0])[key]) > 3.0 * abs(usual[key])
 
 
@@ -217,17 +220,19 @@ def test_a_run_that_diverged_leaves_its_reason_and_no_curve(kept: Kept) -> None:
     assert [len(panel.curves) for panel in figure.panels] == [1, 1]
     (table,) = make(failing, ALL["table-4.3-a"])
     assert table.rows[0][1:4] == (None, None, None)
-    assert math.isnan(numbers_of(failing.run(spec("3 sin(4t)", 25.0, solver="literal")))["mean of p_1 - p_A"])
-    (openings,) = make(failing, ALL["fig-4.33"])
-    assert len(openings.panels[0].curves) == 3
-    assert len(openings.panels[1].curves) == 0
+    assert math.isnan(
+        summarise_run(failing.run(make_experiment("3 sin(4t)", 25.0, solver="as_published")))["mean of p_1 - p_A"]
+    )
+    (closing_figure,) = make(failing, ALL["fig-4.33"])
+    assert len(closing_figure.panels[0].curves) == 3
+    assert len(closing_figure.panels[1].curves) == 0
 
 
 def test_friction_is_continuous_under_one_bracketing_only(kept: Kept) -> None:
-    jumps = jumps_at_threshold(25.0)
+    jumps = friction_at_threshold(25.0)
     assert jumps["continuous"] == pytest.approx((73.24, 73.24), abs=0.01)
     assert jumps["literal"][0] == pytest.approx(145.24, abs=0.01)
-    assert falls_up_to(25.0) == pytest.approx(math.log(500.0 / 300.0) / 10.0)
+    assert falling_friction_limit(25.0) == pytest.approx(math.log(500.0 / 300.0) / 10.0)
     for name in ("fig-4.2", "fig-4.3"):
         (figure,) = make(kept, ALL[name])
         assert figure.panels
@@ -277,9 +282,9 @@ def test_the_table_of_readings_marks_what_the_step_made(kept: Kept) -> None:
     tested = {(row[2], row[-1]) for row in table.rows}
     assert tested == {("converged", "passed"), ("RK4 1e-4 s", "not passed")}
     assert len(table.rows) == 2 * 2 * 4
-    ours = [row for row in table.rows if row[0] == OURS.title and row[2] == "converged"]
-    run = kept.run(spec("5 sin(2t)", 75.0))
-    assert ours[-1][3] == pytest.approx(span(run, "p_1") * 1e-6)
+    ours = [row for row in table.rows if row[0] == DEFAULT_READING.title and row[2] == "converged"]
+    run = kept.run(make_experiment("5 sin(2t)", 75.0))
+    assert ours[-1][3] == pytest.approx(steady_range(run, "p_1") * 1e-6)
 
 
 def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str, Claim]) -> None:

@@ -13,15 +13,15 @@ import pytest
 from sealscope.errors import SimulationFailed
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.simulation.experiment import Experiment
-from sealscope.thesis.chapters.appendix_c_runs import detail_rms
+from sealscope.thesis.chapters.appendix_c_runs import part_detail_rms
 from sealscope.thesis.chapters.chapter5 import (
     TESTS,
-    ShownTest,
-    best_step,
-    figure,
+    PrintedTest,
+    fit_step_time,
+    leak_test_figure,
+    make_test_experiment,
     measure_test,
-    spec_of,
-    windowed,
+    windowed_detail_rms,
 )
 from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.items import Item
@@ -29,6 +29,7 @@ from sealscope.thesis.engine.products import Figure
 from sealscope.thesis.sheet import APPENDIX_C
 from sealscope.units import PSI
 
+from ..refusals import refusal
 from .conftest import ITEMS, Kept, numbers
 
 THESIS = sorted((Path(__file__).resolve().parents[3] / "shared" / "thesis").glob("0*.txt"))
@@ -51,7 +52,7 @@ def item(number: int) -> Item:
 
 
 def drawn(context: Direct, number: int) -> Figure:
-    (made,) = figure(context, item(number))
+    (made,) = leak_test_figure(context, item(number))
     return made
 
 
@@ -101,9 +102,9 @@ def test_the_row_of_a_test_is_the_one_nearest_to_the_level_s_nominal_leak() -> N
 
 
 def test_one_run_serves_all_figures_of_a_test() -> None:
-    assert len({spec_of(test).key() for test in TESTS.values()}) == 10
-    assert spec_of(TESTS["5.2a"]).duration == 120.0
-    assert {spec_of(test).duration for test in list(TESTS.values())[1:]} == {180.0}
+    assert len({make_test_experiment(test).key() for test in TESTS.values()}) == 10
+    assert make_test_experiment(TESTS["5.2a"]).duration == 120.0
+    assert {make_test_experiment(test).duration for test in list(TESTS.values())[1:]} == {180.0}
 
 
 def test_command_speed_and_displacement(context: Direct) -> None:
@@ -142,14 +143,14 @@ def test_details_are_pywavelets_in_psi_and_split_at_the_onset(context: Direct) -
         "d1 [psi]", "d2 [psi]", "d3 [psi]", "d4 [psi]", "d3d4 [psi^2]",
     ]  # fmt: skip
     assert [curve.role for curve in made.panels[2].curves] == ["no leak", "leak"]
-    recording = context.run(spec_of(TESTS["5.2a"])).recording
+    recording = context.run(make_test_experiment(TESTS["5.2a"])).recording
     assert recording is not None
     pressure = recording["p_A"] / PSI
     n = pressure.size // 16 * 16
     deepest_first = pywt.swt(pressure[:n], "db8", level=4, trim_approx=True, norm=False)[1:]
     d3 = deepest_first[1]
     part = slice(round(20 * recording.rate), round(59 * recording.rate))
-    near = detail_rms(recording, ((20.0, 59.0),))["p_A"]["d3"][0]
+    near = part_detail_rms(recording, ((20.0, 59.0),))["p_A"]["d3"][0]
     assert near == pytest.approx(np.sqrt(np.mean(d3[part] ** 2)), rel=0.02)
     shown_d3 = made.panels[2].curves[0]
     at = np.round(shown_d3.x * recording.rate).astype(int)
@@ -165,9 +166,9 @@ def test_the_numbers_of_details_and_of_their_rms_agree(context: Direct) -> None:
 
 
 def test_windows_are_a_thousand_samples_five_hundred_apart(context: Direct) -> None:
-    recording = context.run(spec_of(TESTS["5.2a"])).recording
+    recording = context.run(make_test_experiment(TESTS["5.2a"])).recording
     assert recording is not None
-    centres, curves = windowed(recording, "p_A")
+    centres, curves = windowed_detail_rms(recording, "p_A")
     np.testing.assert_allclose(np.diff(centres), 500 / recording.rate)
     assert centres[0] == pytest.approx((105 + 500) / recording.rate)
     assert set(curves) == {"d1", "d2", "d3", "d4", "d3d4"}
@@ -189,8 +190,8 @@ def test_a_run_that_failed_is_told_and_not_drawn() -> None:
         def run(self, spec: Experiment, *, prove: bool = True) -> SimulatedRun:
             return SimulatedRun(None, np.empty(0), {}, math.nan, False, diverged="p_A is not finite at t = 3 s")
 
-    with pytest.raises(SimulationFailed, match="p_A is not finite"):
-        figure(Failing(), item(1))
+    with refusal("p_A", error=SimulationFailed):
+        leak_test_figure(Failing(), item(1))
 
 
 def test_an_unresolved_run_marks_its_figure(context: Direct) -> None:
@@ -198,7 +199,7 @@ def test_an_unresolved_run_marks_its_figure(context: Direct) -> None:
         def run(self, spec: Experiment, *, prove: bool = True) -> SimulatedRun:
             return replace(context.run(spec), resolved=False)
 
-    assert figure(Unresolved(), item(4))[0].resolved is False
+    assert leak_test_figure(Unresolved(), item(4))[0].resolved is False
 
 
 def noise(values: np.ndarray, rate: float = 500.0) -> Recording:
@@ -209,7 +210,7 @@ def noise(values: np.ndarray, rate: float = 500.0) -> Recording:
 
 def test_detail_rms_of_white_noise_is_its_deviation_in_psi() -> None:
     values = 1.5 * PSI * np.random.default_rng(1).standard_normal(60_000)
-    result = detail_rms(noise(values), ((5.0, 60.0), (60.0, 120.0)))
+    result = part_detail_rms(noise(values), ((5.0, 60.0), (60.0, 120.0)))
     for level in range(1, 5):
         assert result["p_A"][f"d{level}"] == pytest.approx((1.5, 1.5), rel=0.04)
         assert result["p_B"][f"d{level}"] == pytest.approx((3.0, 3.0), rel=0.04)
@@ -221,21 +222,21 @@ def test_a_part_sees_nothing_outside_of_itself() -> None:
     loud[:5000] += 1e6 * np.random.default_rng(3).standard_normal(5000)
     loud[15_000:] += 1e6 * np.random.default_rng(4).standard_normal(5000)
     part = ((10.0, 30.0),)
-    quiet, beside = detail_rms(noise(values), part), detail_rms(noise(loud), part)
+    quiet, beside = part_detail_rms(noise(values), part), part_detail_rms(noise(loud), part)
     assert {c: {q: pytest.approx(rms) for q, rms in of.items()} for c, of in quiet.items()} == beside
-    wider = detail_rms(noise(loud), ((9.6, 30.0),))
+    wider = part_detail_rms(noise(loud), ((9.6, 30.0),))
     assert wider["p_A"]["d1"][0] > 2 * beside["p_A"]["d1"][0]
 
 
 @pytest.mark.parametrize(("command", "omega"), [("3 sin(4t)", 4.0), ("8 sin(t)", 1.0)])
 def test_omega_of_a_command(command: str, omega: float) -> None:
-    assert ShownTest("5.2a", command, "large", 1, 0, 90.0).omega == omega
+    assert PrintedTest("5.2a", command, "large", 1, 0, 90.0).omega == omega
 
 
 def test_best_step_finds_a_step_and_no_end_effect() -> None:
     t = np.arange(100.0)
     y = np.where(t < 63, 1.0, 0.8) + 0.02 * np.random.default_rng(5).standard_normal(100)
-    assert best_step(t, y) == 62.5
-    everywhere = [best_step(t, np.random.default_rng(k).standard_normal(100)) for k in range(40)]
+    assert fit_step_time(t, y) == 62.5
+    everywhere = [fit_step_time(t, np.random.default_rng(k).standard_normal(100)) for k in range(40)]
     assert min(everywhere) >= 4.5
     assert max(everywhere) <= 94.5

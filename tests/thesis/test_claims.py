@@ -9,11 +9,11 @@ import pytest
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import QUANTITIES
-from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures
+from sealscope.thesis.chapters.chapter5 import TESTS, LeakTestMeasures
 from sealscope.thesis.claims import detection as claims
 from sealscope.thesis.claims import rig as claims_rig
 from sealscope.thesis.claims import sheet as claims_sheet
-from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, correlated
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, is_correlated
 from sealscope.thesis.engine.products import Claim, Product
 from sealscope.thesis.sheet import DataSheet
 
@@ -28,12 +28,12 @@ def made(seed: int, shifts: dict[tuple[str, str], float] | None = None) -> DataS
     return made_sheet(seed, shifts, 0.03)
 
 
-def one_shown(section: str, step_s: float | None = None) -> ShownMeasures:
+def one_shown(section: str, step_s: float | None = None) -> LeakTestMeasures:
     test = TESTS[section]
     rms = {chamber: {name: (2.0, 1.5) for name in QUANTITIES} for chamber in CHAMBERS}
     pairs = {chamber: (0.12, 0.118) for chamber in CHAMBERS}
     steps = {chamber: test.half + 1.0 if step_s is None else step_s for chamber in CHAMBERS}
-    return ShownMeasures(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, steps)
+    return LeakTestMeasures(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, steps)
 
 
 def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> ClaimEvidence:
@@ -52,7 +52,7 @@ def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> Claim
 def every_claim(of: ClaimEvidence) -> dict[str, Claim]:
     result = (
         *claims_sheet.claims(of),
-        *claims_sheet.curves(of),
+        *claims_sheet.curve_claims(of),
         *claims_rig.claims(of),
     )
     return {claim.id: claim for claim in result}
@@ -75,7 +75,7 @@ def measured(measured_sheet: DataSheet) -> dict[str, Claim]:
 
 def test_ids_are_unique_and_every_part_is_told(said: dict[str, Claim]) -> None:
     of = evidence(made(14, AS_SAID))
-    listed = [*claims_sheet.claims(of), *claims_sheet.curves(of), *claims_rig.claims(of)]
+    listed = [*claims_sheet.claims(of), *claims_sheet.curve_claims(of), *claims_rig.claims(of)]
     assert len({claim.id for claim in listed}) == len(listed)
     for claim in said.values():
         assert re.fullmatch(r"claim-[a1-6](\.\d+)+", claim.id)
@@ -122,7 +122,7 @@ def test_verdicts_on_the_thesis_s_own_sheet(measured: dict[str, Claim]) -> None:
 
 def test_leak_sizes_are_judged_by_the_conditions() -> None:
 
-    result = {claim.id: claim for claim in claims_sheet.levels()}
+    result = {claim.id: claim for claim in claims_sheet.leak_level_claims()}
     assert result["claim-5.1.2"].verdict == "does not hold"
     assert result["claim-5.1.3"].verdict == "does not hold"
     assert "0.0163" in result["claim-5.1.3"].sheet
@@ -132,14 +132,14 @@ def test_leak_sizes_are_judged_by_the_conditions() -> None:
 def test_the_drift_of_the_piston_is_laid_to_the_leak_only_where_the_control_drifts_on() -> None:
     of = evidence(None)
     assert every_claim(of)["claim-5.7.2"].verdict == "does not hold"
-    drifting_on = replace(of, control=replace(one_shown("5.2a"), drift=(0.04, 0.04)))
+    drifting_on = replace(of, no_leak_measures=replace(one_shown("5.2a"), drift=(0.04, 0.04)))
     assert every_claim(drifting_on)["claim-5.7.2"].verdict == "holds"
 
 
 def test_the_onset_must_be_near_in_every_test() -> None:
     of = evidence(None)
     assert every_claim(of)["claim-5.7.4"].verdict == "holds"
-    one_late = replace(of, shown={**of.shown, "5.5d": one_shown("5.5d", step_s=20.0)})
+    one_late = replace(of, test_measures={**of.test_measures, "5.5d": one_shown("5.5d", step_s=20.0)})
     late = every_claim(one_late)["claim-5.7.4"]
     assert late.verdict == "does not hold"
     assert "9/10" in late.simulation
@@ -148,15 +148,15 @@ def test_the_onset_must_be_near_in_every_test() -> None:
 def test_throttles_raise_the_range_where_they_do() -> None:
     assert every_claim(evidence(None))["claim-6.1.3"].verdict == "holds"
     flat = evidence(None)
-    rows = tuple((*row[:5], 0.12, 0.12, *row[7:]) for row in flat.table.rows)
-    weakened = every_claim(replace(flat, table=replace(flat.table, rows=rows)))["claim-6.1.3"]
+    rows = tuple((*row[:5], 0.12, 0.12, *row[7:]) for row in flat.leak_table.rows)
+    weakened = every_claim(replace(flat, leak_table=replace(flat.leak_table, rows=rows)))["claim-6.1.3"]
     assert weakened.verdict != "holds"
 
 
 def test_correlations_of_41_points_differ_from_zero_above_0_31() -> None:
-    assert not correlated(0.30, 41)
-    assert correlated(-0.32, 41)
-    assert not correlated(0.32, 41, controls=5)
+    assert not is_correlated(0.30, 41)
+    assert is_correlated(-0.32, 41)
+    assert not is_correlated(0.32, 41, controls=5)
 
 
 def test_the_table_of_claims_gathers_all_chapters_in_order() -> None:
@@ -170,7 +170,7 @@ def test_the_table_of_claims_gathers_all_chapters_in_order() -> None:
         "chapter-6-claims": (),
     }
 
-    table, verdicts = claims.table(Kept(products), ITEMS["claims"])  # type: ignore[arg-type]
+    table, verdicts = claims.claims_tables(Kept(products), ITEMS["claims"])  # type: ignore[arg-type]
     assert [row[0] for row in table.rows] == ["claim-a.1", "claim-3.2", "claim-4.2", "claim-4.10", "claim-5.1.1"]
     assert dict(verdicts.rows) == {"holds": 3, "holds in part": 1, "does not hold": 1, "cannot be tested": 0}
     assert "not given" in table.notes

@@ -21,15 +21,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.errors import InputError, UnreadableFile
-from sealscope.storage.plain_values import as_type
-from sealscope.storage.rows import locked, read_rows, stored
+from sealscope.errors import UnreadableFile
+from sealscope.storage.plain_values import convert_type
+from sealscope.storage.rows import lock_rows, read_rows, store_rows
 from sealscope.thesis.engine import build, context
-from sealscope.thesis.engine.build import ItemRow, ItemStatus, reproduce, undrawn
-from sealscope.thesis.engine.context import simulated_run
-from sealscope.thesis.engine.items import Item, collect, select_items
+from sealscope.thesis.engine.build import ItemRow, ItemStatus, drop_curves, reproduce
+from sealscope.thesis.engine.context import simulate_run
+from sealscope.thesis.engine.items import Item, load_items, select_items
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, ThesisTable
 from sealscope.thesis.sheet import MISSING
+
+from ..refusals import refusal
+from ..waiting import until
 
 
 def nothing(context: object, item: Item) -> tuple[()]:
@@ -76,12 +79,12 @@ def test_select_by_id_chapter_wildcard_and_all() -> None:
 
 
 def test_an_unknown_id_names_the_closest() -> None:
-    with pytest.raises(InputError, match=r"got 'fig-5\.9'; closest: fig-5\.1"):
+    with refusal("'fig-5.9'", "fig-5.1"):
         select_items((bare("fig-5.1"), bare("t-1")), ["fig-5.9"])
 
 
 def test_ids_are_unique_file_names_and_what_is_needed_exists_without_a_circle() -> None:
-    items = collect()
+    items = load_items()
     assert len({of.id for of in items}) == len(items)
     assert all(re.fullmatch(r"[a-z0-9]+([-.][a-z0-9]+)*", of.id) for of in items)
     order = list(TopologicalSorter({of.id: of.needs for of in items}).static_order())
@@ -149,7 +152,7 @@ def test_a_damaged_row_is_one_line_with_its_place(fakes: Path, tmp_path: Path) -
     assert rows.read_bytes() == whole
     for damage in (b"PK" + whole, whole.replace(b'"columns"', b'"colours"'), b"[" * 10**5 + b"\n"):
         rows.write_bytes(damage)
-        with pytest.raises(UnreadableFile, match=r"must be a row, got something else .*rows\.jsonl, line 1"):
+        with refusal("rows.jsonl, line 1", error=UnreadableFile):
             reproduce(["all"], "out", items=items, jobs=1)
 
 
@@ -170,7 +173,7 @@ def test_a_maker_may_ask_only_for_what_it_named(fakes: Path, tmp_path: Path) -> 
 
 def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:
     (tmp_path / "out" / "kept").mkdir(parents=True)
-    with locked(tmp_path / "out" / "kept", "x"), pytest.raises(InputError, match="by one process at a time"):
+    with lock_rows(tmp_path / "out" / "kept", "x"), refusal("one process"):
         reproduce(["all"], "out", items=(item("t-1", "table"),), jobs=1)
 
 
@@ -181,14 +184,14 @@ def test_products_survive_the_file_but_for_what_is_drawn(tmp_path: Path) -> None
     figure = Figure("fig-1", "One", (panel,), numbers, ("claim-1",), False, "note")
     claim = Claim("claim-1", "section 1", "It is.", "so", "so", "holds", "why")
     table = ThesisTable("t-1", "T", ("a", "b"), ((1, 2.5), ("x", None), (np.float64(0.1), math.inf)))
-    row = ItemRow("one", "key", tuple(map(undrawn, (figure, claim, table))), ("a.svg",))
+    row = ItemRow("one", "key", tuple(map(drop_curves, (figure, claim, table))), ("a.svg",))
     with pytest.raises(ValueError, match="float"):
-        list(stored(tmp_path, (of for of in [row]), "x"))
-    list(stored(tmp_path, (of for of in [row]), "x", allow_nan=True))
-    again = read_rows(tmp_path, lambda tree: as_type(ItemRow, tree), "x", json.loads)["one"]
+        list(store_rows(tmp_path, (of for of in [row]), "x"))
+    list(store_rows(tmp_path, (of for of in [row]), "x", allow_nan=True))
+    again = read_rows(tmp_path, lambda tree: convert_type(ItemRow, tree), "x", json.loads)["one"]
     assert again.files == ("a.svg",)
     assert again.products[1] == claim
-    assert asdict(again.products[0]) == asdict(undrawn(figure))
+    assert asdict(again.products[0]) == asdict(drop_curves(figure))
     assert (again.products[2].id, again.products[2].rows) == ("t-1", ((1, 2.5), ("x", None), (0.1, math.inf)))
 
 
@@ -216,7 +219,7 @@ def test_without_the_sheet_items_that_need_it_are_left_out(
 
 def test_equal_runs_are_simulated_once(fakes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    monkeypatch.setattr(context, "simulated_run", lambda *of: calls.append(of) or simulated_run(*of))
+    monkeypatch.setattr(context, "simulate_run", lambda *of: calls.append(of) or simulate_run(*of))
     drawn: dict[str, Any] = {}
 
     def publish(of: Item, products: Any, folder: Path) -> tuple[str, ...]:
@@ -265,11 +268,13 @@ def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path,
     call = subprocess.Popen(
         [sys.executable, str(script)], env={**os.environ, "PYTHONPATH": paths}, cwd=tmp_path, stderr=subprocess.DEVNULL
     )
-    end = time.monotonic() + 60
     rows = tmp_path / "out" / "kept" / "rows.jsonl"
-    while not (rows.is_file() and rows.read_bytes().count(b"\n") >= 3) and time.monotonic() < end:
-        assert call.poll() is None
-        time.sleep(0.02)
+
+    def has_three_rows() -> bool:
+        assert call.poll() is None, "it ended before it could be killed"
+        return rows.is_file() and rows.read_bytes().count(b"\n") >= 3
+
+    until(has_three_rows)
     call.send_signal(how)
     call.wait(20)
     time.sleep(1.0)  # workers of a killed parent end with it

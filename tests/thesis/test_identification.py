@@ -13,9 +13,9 @@ from sealscope.thesis.identification import (
     fit_table,
     log_residuals,
     log_rms,
-    noise_of,
     parameters_table,
     predicted_sheet,
+    pressure_noise,
 )
 from sealscope.thesis.sheet import (
     APPENDIX_C,
@@ -65,7 +65,7 @@ def test_the_noise_of_a_sample_has_three_sources() -> None:
     rig = load_rig("thesis").with_overrides({"sensors.p_A.noise": 3e4, "sensors.common_noise": 4e4})
     step = rig.daq.step / (rig.daq.sensor_volts_hi - rig.daq.sensor_volts_lo)
     step *= rig.sensors.p_A.range_hi - rig.sensors.p_A.range_lo
-    assert noise_of(rig, "p_A") * PSI == pytest.approx(np.sqrt(5e4**2 + step**2 / 12.0))
+    assert pressure_noise(rig, "p_A") * PSI == pytest.approx(np.sqrt(5e4**2 + step**2 / 12.0))
 
 
 def test_a_sensor_that_reads_less_lowers_its_own_chamber_only() -> None:
@@ -73,7 +73,7 @@ def test_a_sensor_that_reads_less_lowers_its_own_chamber_only() -> None:
     rig = load_rig(BENCH_RIG)
     plain, less = (predicted_sheet(rig, Hypothesis("", gain_B=gain), one) for gain in (1.0, 0.5))
     assert np.array_equal(plain.rms["p_A"]["d4"], less.rms["p_A"]["d4"])
-    without = [np.sqrt(of.rms["p_B"]["d4"][0, 0] ** 2 - noise_of(rig, "p_B") ** 2) for of in (plain, less)]
+    without = [np.sqrt(of.rms["p_B"]["d4"][0, 0] ** 2 - pressure_noise(rig, "p_B") ** 2) for of in (plain, less)]
     assert without[1] == pytest.approx(0.5 * without[0], rel=1e-6)
 
 
@@ -104,7 +104,7 @@ def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data(measured_sheet: 
     change, real = (np.log(of.rms["p_A"]["d3"][:, 1] / of.rms["p_A"]["d3"][:, 0]) for of in (made, sheet))
     assert np.sum(np.sign(change) == np.sign(real)) >= 39
     assert np.corrcoef(change, real)[0, 1] > 0.6
-    # the size is predicted too small, about half (docs/decisions/0006-calibration.md)
+    # the size is predicted too small, about half (docs/explanation/calibrated-rig.md)
     assert 0.35 < np.mean(change) / np.mean(real) < 0.65
 
 

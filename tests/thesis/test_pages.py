@@ -20,10 +20,11 @@ from sealscope.thesis.engine.build import ItemStatus
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, FigureCurve, Image, Number, Panel, Role, ThesisTable
 from sealscope.thesis.pages.files import figure_rows, publish
-from sealscope.thesis.pages.page import VERDICTS, cell, write_thesis_page
+from sealscope.thesis.pages.page import VERDICTS, format_cell, write_thesis_page
 from sealscope.thesis.pages.plot_style import STYLES, caption, typeset
-from sealscope.thesis.pages.plots import MOST_SVG_BYTES, UNRESOLVED, draw, grid_of, visible
+from sealscope.thesis.pages.plots import MAX_SVG_BYTES, UNRESOLVED, choose_grid, draw, drawn_points
 
+from ..refusals import refusal
 from ..reporting.pages import Reader
 
 pytest.importorskip("matplotlib", reason="figures need the extra 'report'")
@@ -104,16 +105,16 @@ def test_long_records_stay_small_and_keep_their_peaks() -> None:
             )
         )
     svg, png = draw(Figure("fig-5.5", "Details", tuple(panels)))
-    assert len(svg) <= MOST_SVG_BYTES
+    assert len(svg) <= MAX_SVG_BYTES
     assert len(png) < 400_000
-    x, y = visible(panels[0].curves[0], None)
+    x, y = drawn_points(panels[0].curves[0], None)
     assert x.size < 3000
     assert y.max() == 60.0
 
 
 def test_a_zoomed_panel_keeps_every_sample_in_its_range() -> None:
     t = np.arange(90_000) / 500
-    x, _ = visible(FigureCurve(t, np.sin(t), "x"), (80.0, 82.0))
+    x, _ = drawn_points(FigureCurve(t, np.sin(t), "x"), (80.0, 82.0))
     assert x.size == pytest.approx(1001, abs=3)
     assert x[0] <= 80.0
     assert x[-1] >= 82.0
@@ -137,13 +138,13 @@ def lightness(colour: str) -> float:
 
 @pytest.mark.parametrize(
     "together",
-    [("A", "B"), ("no leak", "leak"), ("literal", "converged"), ("measured", "simulated"),
+    [("A", "B"), ("no leak", "leak"), ("as_published", "converged"), ("measured", "simulated"),
      ("25 %", "50 %", "75 %")],
 )  # fmt: skip
 def test_what_is_drawn_together_differs_in_grey(together: tuple[Role, ...]) -> None:
     greys = sorted(lightness(STYLES[role].colour) for role in together)
     assert min(np.diff(greys)) > 0.08
-    assert len({STYLES[role].dashes for role in together}) > 1 or together == ("literal", "converged")
+    assert len({STYLES[role].dashes for role in together}) > 1 or together == ("as_published", "converged")
 
 
 def test_every_role_has_a_style() -> None:
@@ -175,7 +176,7 @@ def test_symbols_are_set_as_symbols() -> None:
 
 
 def test_panels_are_laid_out_in_up_to_three_columns() -> None:
-    assert [grid_of(panels) for panels in (1, 5, 6, 8, 13)] == [(1, 1), (5, 1), (3, 2), (4, 2), (5, 3)]
+    assert [choose_grid(panels) for panels in (1, 5, 6, 8, 13)] == [(1, 1), (5, 1), (3, 2), (4, 2), (5, 3)]
     draw(Figure("fig-1.1", "Many", tuple(Panel("t [s]", f"y_{k}", (FigureCurve(T, T, "x"),)) for k in range(13))))
 
 
@@ -285,7 +286,7 @@ def test_an_empty_folder_gives_a_page_that_says_so(tmp_path: Path) -> None:
      (123456.0, "1.235e+5")],
 )  # fmt: skip
 def test_cells(value: object, text: str) -> None:
-    assert cell(value) == text
+    assert format_cell(value) == text
 
 
 def test_the_svg_of_the_page_is_the_smaller_picture(page: str, tmp_path: Path) -> None:
@@ -297,5 +298,5 @@ def test_the_svg_of_the_page_is_the_smaller_picture(page: str, tmp_path: Path) -
 
 def test_without_the_drawing_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'sealscope\[report\]'"):
+    with refusal("sealscope[report]", error=MissingExtra):
         draw(figure())

@@ -15,20 +15,21 @@ from sealscope.thesis.chapters.success_rates import (
     RATES,
     UNCLAIMED,
     column_tests,
-    counts,
+    count_rules,
+    count_with_thresholds,
     d1_threshold,
     drift_threshold,
-    thresholds,
 )
 from sealscope.thesis.claims.evidence import (
-    change_columns,
-    condition_columns,
-    left_out_r2,
+    change_design,
+    classify_without_baseline,
+    condition_design,
+    leave_one_out_r2,
     partial_correlation,
-    separation_by_levels,
 )
 from sealscope.thesis.sheet import DataSheet, mean_leaks
 
+from ..refusals import refusal
 from .conftest import made_sheet, needs_sheet
 
 
@@ -54,25 +55,27 @@ def test_what_the_columns_of_the_sheet_show_beyond_chance(measured_sheet: DataSh
 
 @needs_sheet
 def test_with_a_threshold_from_d1_the_sheet_s_d3_finds_35_of_41(measured_sheet: DataSheet) -> None:
-    rows = {row[0]: row for row in thresholds(measured_sheet, made_sheet(1), made_sheet(2))}
+    rows = {row[0]: row for row in count_with_thresholds(measured_sheet, made_sheet(1), made_sheet(2))}
     assert rows["P_A d3 down"][2] == "35/41"
     assert d1_threshold(measured_sheet, "p_A") == pytest.approx(0.0723, abs=5e-4)
 
 
 @needs_sheet
 def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured_sheet: DataSheet) -> None:
-    leak, given_condition = mean_leaks(), condition_columns()
-    change = np.log(measured_sheet.rms["p_A"]["d3"][:, 1] / measured_sheet.rms["p_A"]["d3"][:, 0])
-    assert abs(partial_correlation(change, leak, given_condition)) < 0.1
-    assert np.corrcoef(change, leak)[0, 1] < -0.6
-    assert left_out_r2(given_condition, leak) == pytest.approx(0.76, abs=0.01)
-    assert left_out_r2(change_columns(measured_sheet), leak) == pytest.approx(0.45, abs=0.01)
+    """The fall of d3 goes with the leak, but only as far as both go with the operating condition."""
+    leaks, conditions = mean_leaks(), condition_design()
+    without, with_leak = measured_sheet.rms["p_A"]["d3"].T
+    fall = np.log(with_leak / without)
+    assert np.corrcoef(fall, leaks)[0, 1] < -0.6
+    assert abs(partial_correlation(fall, leaks, conditions)) < 0.1
+    assert leave_one_out_r2(conditions, leaks) == pytest.approx(0.76, abs=0.01)
+    assert leave_one_out_r2(change_design(measured_sheet), leaks) == pytest.approx(0.45, abs=0.01)
 
 
 @needs_sheet
 def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured_sheet: DataSheet) -> None:
-    accuracy, auc = separation_by_levels(measured_sheet, "test")
-    accuracy_by_condition, auc_by_condition = separation_by_levels(measured_sheet, "condition")
+    accuracy, auc = classify_without_baseline(measured_sheet, "test")
+    accuracy_by_condition, auc_by_condition = classify_without_baseline(measured_sheet, "condition")
     assert (accuracy, accuracy_by_condition) == (78 / 82, 73 / 82)
     assert (auc, auc_by_condition) == pytest.approx((0.990, 0.980), abs=0.001)
 
@@ -80,7 +83,7 @@ def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured_sheet: Da
 def test_rates_stand_beside_their_controls() -> None:
     leak = made_sheet(1, {("p_A", "d3"): -0.3, ("p_A", "d3d4"): -0.5, ("p_B", "d3d4"): 0.5})
     drift = made_sheet(3, n=123)
-    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in counts(None, leak, made_sheet(2), drift)}
+    rows = {str(row[0]): dict(zip(RATES, row, strict=True)) for row in count_rules(None, leak, made_sheet(2), drift)}
     assert rows["P_A d3 down"]["simulated leak: fires"] == "41/41"
     assert rows["both d3d4"]["simulated leak: rate [%]"] == 100.0
     assert rows["P_A d3 down"]["sheet: fires"] is None
@@ -113,14 +116,14 @@ def test_column_tests_find_what_moves_and_little_else() -> None:
     assert false <= 20  # 200 sheets of nothing: at most 5 % of them name any column, 20 is four deviations above
 
 
-def test_left_out_r2_is_that_of_leaving_each_out() -> None:
+def test_leave_one_out_r2_is_that_of_leaving_each_out() -> None:
     random = np.random.default_rng(6)
     X = np.column_stack([np.ones(30), random.standard_normal((30, 2))])
     y = X @ np.array([1.0, 2.0, -1.0]) + random.standard_normal(30)
     predicted = np.array(
         [X[k] @ np.linalg.lstsq(np.delete(X, k, 0), np.delete(y, k), rcond=None)[0] for k in range(30)]
     )
-    assert left_out_r2(X, y) == pytest.approx(1 - np.sum((y - predicted) ** 2) / np.sum((y - y.mean()) ** 2))
+    assert leave_one_out_r2(X, y) == pytest.approx(1 - np.sum((y - predicted) ** 2) / np.sum((y - y.mean()) ** 2))
 
 
 def test_partial_correlation_takes_the_common_cause_out() -> None:
@@ -134,10 +137,10 @@ def test_partial_correlation_takes_the_common_cause_out() -> None:
 
 def test_without_scikit_learn_the_claim_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sklearn.linear_model", None)
-    with pytest.raises(MissingExtra, match=r"sealscope\[learn\]"):
-        separation_by_levels(made_sheet(8), "test")
+    with refusal("sealscope[learn]", error=MissingExtra):
+        classify_without_baseline(made_sheet(8), "test")
 
 
 def test_levels_without_information_tell_nothing() -> None:
-    _, auc = separation_by_levels(made_sheet(8, scatter=0.4), "test")
+    _, auc = classify_without_baseline(made_sheet(8, scatter=0.4), "test")
     assert 0.3 < auc < 0.7

@@ -1,4 +1,4 @@
-"""A campaign's result, from its folder or from recordings: rows judged, tables written."""
+"""Judge a campaign's rows, from its folder or from recordings, and write the tables of its result."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sealscope.campaigns.cases.recordings import ProgressCallback, recorded_rows
+from sealscope.campaigns.cases.recordings import ProgressCallback, judge_recordings
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.judging.judge import Judgement, judge
-from sealscope.campaigns.judging.tables import PriorKnowledge, records_table, tables_of, write_tables
-from sealscope.campaigns.plans.detectors import ALL_CHANNELS, plan_detector
+from sealscope.campaigns.judging.tables import PriorKnowledge, build_tables, records_table, write_tables
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, parse_detector_name
 from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.errors import InputError
 from sealscope.storage.folders import make_folder
@@ -21,8 +21,8 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and its results.
 
-    `missing`: records of the plan that have no row yet; `mode`: how the rows of a simulated campaign were
-    made, "" for another; `known`: detector -> what it was given beside the record.
+    `missing`: number of the plan's records without a row; `mode`: mode in which a simulated campaign was run, "" for
+    recordings; `known`: detector -> the information it was given.
     """
 
     plan: AnyPlan
@@ -34,19 +34,18 @@ class CampaignResult:
 
 
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
-    """Collect the knowledge that a plan's detectors have besides the recording.
+    """Collect the information that a plan gives to each of its detectors.
 
-    A scorer of the two sides of a split knows the true onset where the records are simulated, for they are split
-    there; in recordings it is split half-way, and nothing is known. Other detectors assume the rig that the plan
-    states.
+    Scorers that compare two parts of a record are given the true onset of simulated records, which are split there;
+    recordings are split in the middle. Other detectors assume the plan's rig.
     """
-    simulated = isinstance(plan, SimulatedPlan)
+    is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name
     knowledge = {}
     for name in plan.detectors:
-        detector = plan_detector(name)
+        detector = parse_detector_name(name)
         knowledge[name] = PriorKnowledge(
-            onset=simulated and detector.scorer is not None and detector.scorer.split,
+            onset=is_simulated and detector.scorer is not None and detector.scorer.compares_parts,
             channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
             rig=rig if detector.scorer is None else "",
         )
@@ -59,6 +58,7 @@ def _judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
+    """Judge rows with the detectors and probabilities of a plan."""
     return judge(
         rows,
         plan.detectors,
@@ -70,27 +70,29 @@ def _judge(
     )
 
 
-def simulated_result(plan: SimulatedPlan, folder: Path) -> CampaignResult:
-    """Judge a simulated campaign, complete or not; raise InputError where its rows do not suffice."""
-    rows = tuple(store.rows_of(plan, folder).values())
+def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResult:
+    """Judge the rows of a simulated campaign; raise InputError if there are too few to judge or to set thresholds."""
+    rows = tuple(store.read_plan_rows(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
-    head = store.head(folder) or store.made_from(plan)
+    head = store.read_head(folder) or store.collect_row_inputs(plan)
     judgement = _judge(plan, rows, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0)
     mode = str(head.get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
 
-def recorded_result(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> CampaignResult:
-    """Judge a campaign over the recordings in a folder."""
-    rows = recorded_rows(plan, folder, progress)
-    return CampaignResult(plan, tuple(rows), 0, _judge(plan, rows), known=prior_knowledge(plan))
+def judge_recorded_campaign(
+    plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None
+) -> CampaignResult:
+    """Judge the recordings in a folder by a plan."""
+    rows = judge_recordings(plan, folder, progress)
+    return CampaignResult(plan, tuple(rows), missing=0, judgement=_judge(plan, rows), known=prior_knowledge(plan))
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
-    """Write the tables into the folder; return the files."""
+    """Write the tables of a result into the folder; return the files."""
     make_folder(folder)
     unit = result.plan.unit
-    tables = tables_of(result.judgement, unit, result.known, getattr(result.plan, "part", ""))
+    tables = build_tables(result.judgement, unit, result.known, getattr(result.plan, "part", ""))
     tables["records"] = records_table(result.rows, result.plan.detectors, unit)
     return write_tables(folder, tables)

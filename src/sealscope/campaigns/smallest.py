@@ -1,14 +1,14 @@
-"""Plan a recording: the command, load and duration that find a leak of a size on a rig.
+"""Plan a recording: the command, load and duration with which `diagnose` detects a leak of a given size on a rig.
 
-Leak-free recordings of the rig with its instruments are simulated under each duty; the information of their blocks says
-which step of the leak's conductance `diagnose` finds in them, by the same test that judges (`StepTest.findable`),
+Leak-free recordings of the rig and its instruments are simulated under each duty. The smallest step of the leak's
+conductance that is detected with the probability `detection` follows from the test that `diagnose` uses
+(`StepTest.detectable_step`),
 
-    findable = (threshold^(1/2) + z_detection) s,
+    detectable step = (threshold^(1/2) + z_detection) s,
 
-s the deviation of a step at the median onset, the threshold that of the likelihood ratio at the false-alarm
-probability. A seal is a conductance: duties are compared by it, and sizes stated as the flow that it passes under the
-first duty. Whether a step of the piston's leak is separable from one of the pump's is the Fisher information of both at
-once, all other terms free.
+with s the standard error of a step at the median onset, and the threshold of the likelihood ratio at the false-alarm
+probability. Duties are compared by the conductance of the leak; flows are stated at the mean pressure of the usual
+duty. The step that can be separated from one of the pump's leakage follows from the Fisher information of both.
 """
 
 from __future__ import annotations
@@ -18,31 +18,34 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
+from sealscope.campaigns.held import PlannedHold, has_shut_off, plan_hold
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.errors import InputError, SealscopeError
 from sealscope.paragraphs import paragraph
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import centred_start
-from sealscope.simulation.courses import Position, command_or_target, parse_force
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
-#: Commands and constant loads that are tried beside the machine's own duty.
+#: Commands and constant loads that are tried in addition to the machine's usual duty.
 COMMANDS, LOADS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)", "8 sin(t)"), ("", "100 N", "2 kN")
-#: Durations that are tried [s], and that at which duties are compared.
-DURATIONS, COMPARED = (20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 270.0, 400.0, 600.0), 60.0
-#: Records of a duty whose median is stated, and how much of a command is looked at to centre its sweep [s].
-RECORDS, _LONGEST_LOOK = 3, 1000.0
+#: Durations [s] that are tried, and the duration at which duties are compared.
+DURATIONS, COMPARISON_SECONDS = (20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 270.0, 400.0, 600.0), 60.0
+#: Number of simulated recordings of a duty, whose median is stated.
+N_RECORDS = 3
+#: Length [s] of the command's beginning from which the sweep of the piston is centred.
+_MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """A command [V] and a load, in words, "" for none."""
+    """The texts of a command [V], such as '3 sin(4t)', and of a load, such as '2 kN' or "" for none."""
 
     command: str
     load: str = ""
@@ -51,16 +54,16 @@ class PlannedDuty(NamedTuple):
         return self.command + (f" under {self.load}" if self.load else "")
 
 
-#: The duty of a machine whose own is not stated.
+#: The usual duty of a machine if none is stated.
 USUAL = PlannedDuty(COMMANDS[0])
 
 
-class Findable(NamedTuple):
-    """The smallest leak that recordings of a duty and a `duration` [s] find.
+class DetectableLeak(NamedTuple):
+    """The smallest leaks that recordings of a duty and a `duration` [s] detect.
 
-    `conductance`: the smallest step of the leak that is found, `separable`: the smallest that can be told from a step
-    of the pump's, both [m^3/(s Pa)] and infinite where there is none; `pressure`: mean |p_A - p_B| [Pa]; `note`: the
-    reason for missing figures.
+    `conductance`: smallest detectable step of the leak, `separable`: smallest step that is also separable from a step
+    of the pump's leakage, both [m^3/(s Pa)], infinite if there is none; `pressure`: mean |p_A - p_B| [Pa]; `note`:
+    reason for missing numbers; `flow`: mean flow of the pump [m^3/s].
     """
 
     duty: PlannedDuty
@@ -69,150 +72,170 @@ class Findable(NamedTuple):
     separable: float
     pressure: float
     note: str = ""
+    flow: float = 0.0
 
 
 class RecordingPlan(NamedTuple):
-    """The recording to make, and all duties compared; `target` conductance [m^3/(s Pa)], None for none.
+    """The planned recording, and the duties that were compared.
 
-    `chosen`: of the shortest duration that finds it, or the best that was tried; `separating`: the same of what is
-    separable from the pump; `usual` pressure [Pa], at which flows are stated.
+    `target`: conductance to detect [m^3/(s Pa)], None to detect the smallest; `for_detection`: the shortest recording
+    that detects it, or the best that was tried; `for_separation`: the same for separating it from the pump's leakage;
+    `usual_pressure`: mean pressure difference of the usual duty [Pa], at which flows are stated; `hold`:
+    the locked hold that detects it, None if no valve shuts the cylinder in.
     """
 
     rig: str
     target: float | None
-    chosen: Findable
-    separating: Findable
-    compared: tuple[Findable, ...]
-    usual: float
+    for_detection: DetectableLeak
+    for_separation: DetectableLeak
+    compared: tuple[DetectableLeak, ...]
+    usual_pressure: float
     false_alarm: float
     detection: float
+    hold: PlannedHold | None = None
 
     @property
     def finds(self) -> bool:
-        """True if the chosen recording finds the target."""
-        return self.target is None or self.chosen.conductance <= self.target
+        """True if the planned recording detects the target."""
+        return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Convert a conductance to the flow at the usual pressure [L/min], None for one that is not finite."""
-        return conductance * self.usual / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+        """Convert a conductance to the flow at the usual pressure [L/min]; return None if it is not finite."""
+        return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the plan to plain JSON values, sizes in L/min at the usual pressure."""
+        """Convert the plan to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
 
-        def plain(findable: Findable) -> dict[str, Any]:
-            sizes = {
-                "smallest_leak_lpm": self.lpm(findable.conductance),
-                "separable_from_pump_lpm": self.lpm(findable.separable),
-            }
-            driving = findable.pressure if np.isfinite(findable.pressure) else None
+        def leak_dict(leak: DetectableLeak) -> dict[str, Any]:
+            """Convert the smallest leaks of one duty to JSON values; infinite numbers become None."""
             return {
-                **findable.duty._asdict(),
-                "duration_s": findable.duration,
-                **sizes,
-                "pressure_Pa": driving,
-                "note": findable.note,
+                **leak.duty._asdict(),
+                "duration_s": leak.duration,
+                "smallest_leak_lpm": self.lpm(leak.conductance),
+                "separable_from_pump_lpm": self.lpm(leak.separable),
+                "pressure_Pa": leak.pressure if np.isfinite(leak.pressure) else None,
+                "note": leak.note,
             }
 
         return {
             "rig": self.rig,
             "wanted_lpm": None if self.target is None else self.lpm(self.target),
             "finds": self.finds,
-            "usual_pressure_Pa": self.usual,
+            "usual_pressure_Pa": self.usual_pressure,
             "false_alarm_probability": self.false_alarm,
             "detection_probability": self.detection,
-            "recording": plain(self.chosen),
-            "separating_from_pump": plain(self.separating),
-            "compared": [plain(findable) for findable in self.compared],
+            "recording": leak_dict(self.for_detection),
+            "separating_from_pump": leak_dict(self.for_separation),
+            "locked_hold": None if self.hold is None else self.hold.as_dict(),
+            "compared": [leak_dict(leak) for leak in self.compared],
         }
 
     def text(self) -> str:
         """Format the plan as lines of text, the answer first."""
-        chosen, separating, usual_pressure = self.chosen, self.separating, f"at {self.usual / 1e6:.2g} MPa"
-        target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {usual_pressure}: "
-        doubt = "" if self.finds else "not found; the best is "
+        best, separating = self.for_detection, self.for_separation
+        at_pressure = f"at {self.usual_pressure / 1e6:.2g} MPa"
+        target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {at_pressure}: "
+        not_found = "" if self.finds else "not found; the best is "
+        separation = "no; record the pump's ports p_1 and p_2 behind throttles"
+        if np.isfinite(separating.separable):
+            separation = f"{separating.duty} for {separating.duration:g} s, {self._format_flow(separating.separable)}"
         lines = [
-            f"{target}{doubt}{chosen.duty} for {chosen.duration:g} s "
-            f"finds {self._size(chosen.conductance)} {usual_pressure}",
+            f"{target}{not_found}{best.duty} for {best.duration:g} s "
+            f"finds {self._format_flow(best.conductance)} {at_pressure}",
             f"  in {100 * self.detection:g} % of recordings, {100 * self.false_alarm:g} % false alarms; rig {self.rig}",
-            "  separated from a leak of the pump: "
-            + (
-                f"{separating.duty} for {separating.duration:g} s, {self._size(separating.separable)}"
-                if np.isfinite(separating.separable)
-                else "no; record the pump's ports p_1 and p_2 behind throttles"
-            ),
+            f"  separated from a leak of the pump: {separation}",
+            *([] if self.hold is None else [self.hold.text(self.usual_pressure)]),
             f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
         comparable = [row for row in self.compared if not row.note]
         lines += [
-            f"  {row.duty!s:<34}{self._size(row.conductance):>14}{self._size(row.separable):>18}" for row in comparable
+            f"  {row.duty!s:<34}{self._format_flow(row.conductance):>14}{self._format_flow(row.separable):>18}"
+            for row in comparable
         ]
         notes = [row for row in self.compared if row.note]
         lines += [paragraph(f"left out: {row.duty}: {row.note}", "  ", 4) for row in notes[:1]]
         return "\n".join(lines)
 
-    def _size(self, conductance: float) -> str:
+    def _format_flow(self, conductance: float) -> str:
+        """Format the flow of a conductance at the usual pressure, or '-' if it is infinite."""
         flow = self.lpm(conductance)
         return "-" if flow is None else f"{flow:.2g} L/min"
 
 
-def experiment_of(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Build the leak-free experiment of a duty, its sweep centred; raise InputError for a text that is no command."""
+def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
+    """Build the leak-free experiment of a duty, with the piston's sweep centred in the stroke.
+
+    Raises InputError if the duty's command is no voltage.
+    """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
         raise InputError(f"a plan must be of a command in volts ('3 sin(4t)'), got a target ({command})")
-    start = centred_start(rig, command, min(duration, _LONGEST_LOOK))
+    start = centred_start(rig, command, min(duration, _MAX_CENTRING_SECONDS))
     load = parse_force(duty.load) if duty.load else None
     return Experiment(rig=rig, command=command, duration=duration, x_0=start, load=load, seed=seed)
 
 
-def findable(
+def detectable_leak(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
-) -> Findable:
-    """Compute the smallest leak that recordings of a duty find; the note says why where there is none."""
-    steps, separable_steps, pressures = [], [], []
+) -> DetectableLeak:
+    """Compute the smallest leak that recordings of a duty detect, or note why it cannot be computed."""
+    steps = []
     try:
-        for seed in range(RECORDS):
-            recording = simulate_experiment(experiment_of(rig, duty, duration, seed)).recording
-            step, separable, pressure = _detectable_in(recording, rig, false_alarm, detection)
-            steps.append(step)
-            separable_steps.append(separable)
-            pressures.append(pressure)
+        for seed in range(N_RECORDS):
+            recording = simulate_experiment(duty_experiment(rig, duty, duration, seed)).recording
+            steps.append(_detectable_steps(recording, rig, false_alarm, detection))
     except SealscopeError as error:
-        return Findable(duty, duration, np.inf, np.inf, np.nan, str(error))
-    step, separable, pressure = (float(np.median(values)) for values in (steps, separable_steps, pressures))
-    return Findable(duty, duration, step, separable, pressure)
+        return DetectableLeak(duty, duration, conductance=np.inf, separable=np.inf, pressure=np.nan, note=str(error))
+    median = _DetectableSteps(*(float(np.median(values)) for values in zip(*steps, strict=True)))
+    return DetectableLeak(duty, duration, median.step, median.separable, median.pressure, flow=median.flow)
 
 
-def _detectable_in(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> tuple[float, float, float]:
-    """Compute the conductance found, that separable from the pump, and the mean pressure, of a leak-free recording."""
+class _DetectableSteps(NamedTuple):
+    """Smallest steps [m^3/(s Pa)] of the leak in a recording, with its mean |p_A - p_B| [Pa] and pump flow [m^3/s].
+
+    `step`: detectable; `separable`: also separable from a step of the pump's leakage.
+    """
+
+    step: float
+    separable: float
+    pressure: float
+    flow: float
+
+
+def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> _DetectableSteps:
+    """Compute the smallest detectable steps of the leak from a leak-free recording."""
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
         raise InputError(f"no balance: {reason}")
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
         raise InputError("no balance: too short, or no block says anything of a leak")
-    within: float = priors("decision")["questions"]["within"]
-    share = false_alarm * (1.0 - within if healthy_leakage(rig) > 0.0 else 1.0)
-    size = balance.size.scale
-    step = balance.test.findable(share, detection) * size
-    ratio = _free_over_known(balance.blocks, balance.columns)
-    return step, step * ratio, balance.mean_pressure()
+    # with a known healthy leakage, a part of the false-alarm probability goes to the test of the level against it
+    level_fraction: float = DECISION.questions.within
+    step_false_alarm = false_alarm * (1.0 - level_fraction if healthy_leakage(rig) > 0.0 else 1.0)
+    scale = balance.size.scale  # of the machine's size, to which the conductances are relative
+    step = balance.test.detectable_step(step_false_alarm, detection) * scale
+    separable_step = step * _separation_ratio(balance.blocks, balance.columns)
+    return _DetectableSteps(step, separable_step, balance.mean_pressure(), balance.mean_flow * scale)
 
 
-def _free_over_known(blocks: Blocks, columns: Sequence[Columns]) -> float:
-    """Compute the deviation of a leak's step at mid-record with the pump's step free, over that with it known.
+def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
+    """Compute by what factor the standard error of a leak's step at mid-record grows if the pump's step is unknown.
 
-    Infinite where no term of the pump is in the balance.
+    Infinite if the balance has no term of the pump, or the two steps cannot be separated.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:
         return np.inf
-    gram, late = (blocks.gram[first:, 0].sum(axis=0) for first in (0, len(blocks) // 2))
-    levels, steps = np.array(column.nuisance), np.array([column.leak, column.names.index(PUMP)])
-    cross = late[np.ix_(levels, steps)]
-    information = late[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(levels, levels)], cross)
-    lone, free = information[0, 0], information[0, 0] - information[0, 1] ** 2 / max(information[1, 1], 1e-300)
-    return float(np.sqrt(lone / free)) if free > 1e-9 * lone else np.inf
+    gram, gram_after_step = (blocks.gram[first:, 0].sum(axis=0) for first in (0, len(blocks) // 2))
+    constants, steps = np.array(column.nuisance), np.array([column.leak, column.names.index(PUMP)])
+    cross = gram_after_step[np.ix_(constants, steps)]
+    # Fisher information of both steps with the constant terms eliminated (Schur complement)
+    information = gram_after_step[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(constants, constants)], cross)
+    known_pump = information[0, 0]
+    unknown_pump = known_pump - information[0, 1] ** 2 / max(information[1, 1], 1e-300)
+    is_separable = unknown_pump > 1e-9 * known_pump  # beyond rounding
+    return float(np.sqrt(known_pump / unknown_pump)) if is_separable else np.inf
 
 
 def plan_recording(
@@ -223,33 +246,43 @@ def plan_recording(
     duties: Iterable[PlannedDuty] | None = None,
     false_alarm: float = 0.01,
     detection: float = 0.9,
-    progress: Callable[[str, float], None] = lambda label, share: None,
+    held: float | None = None,
+    progress: Callable[[str, float], None] = lambda label, fraction: None,
 ) -> RecordingPlan:
-    """Find the shortest recording that finds a leak of `find` [m^3/s] at the pressure of the usual duty.
+    """Find the shortest recording that detects a leak of `find` [m^3/s] at the pressure of the usual duty.
 
-    Without `find`: the recording of `COMPARED` seconds that finds the smallest. Raises InputError where the usual duty
-    cannot be simulated or judged.
+    If `find` is None, plan the recording of `COMPARISON_SECONDS` that detects the smallest leak. `held`: force [N] that
+    the cylinder holds with its valves shut; None: the largest of `LOADS`, if the rig has such valves. Raises
+    InputError if the usual duty cannot be simulated or judged.
     """
     choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
-    tried = [usual, *(duty for duty in choices if duty != usual)]
+    compared_duties = [usual, *(duty for duty in choices if duty != usual)]
     compared = []
-    for k, duty in enumerate(tried):
-        compared.append(findable(rig, duty, COMPARED, false_alarm=false_alarm, detection=detection))
+    for k, duty in enumerate(compared_duties):
+        compared.append(detectable_leak(rig, duty, COMPARISON_SECONDS, false_alarm=false_alarm, detection=detection))
         if compared[0].note:
             raise InputError(f"the usual duty must have a balance, got none of {usual}: {compared[0].note}")
-        progress("duties compared", (k + 1) / len(tried))
-    pressure = compared[0].pressure
-    target = None if find is None else find / pressure
-    best = []
-    for name in ("conductance", "separable"):
-        best_duty = min(compared, key=lambda best_duty: float(getattr(best_duty, name)))
-        if target is not None and np.isfinite(getattr(best_duty, name)):
-            guess = (
-                COMPARED * (getattr(best_duty, name) / target) ** 2
-            )  # a deviation falls with the root of the duration
-            for duration in [seconds for seconds in DURATIONS if seconds >= 0.5 * guess] or DURATIONS[-1:]:
-                best_duty = findable(rig, best_duty.duty, duration, false_alarm=false_alarm, detection=detection)
-                if getattr(best_duty, name) <= target:
+        progress("duties compared", (k + 1) / len(compared_duties))
+    usual_pressure = compared[0].pressure
+    target = None if find is None else find / usual_pressure
+    planned = []
+    for field in ("conductance", "separable"):
+        best = min(compared, key=lambda leak: float(getattr(leak, field)))
+        if target is not None and np.isfinite(getattr(best, field)):
+            # the standard error of a step falls with the square root of the duration
+            predicted_duration = COMPARISON_SECONDS * (getattr(best, field) / target) ** 2
+            durations = [seconds for seconds in DURATIONS if seconds >= 0.5 * predicted_duration] or DURATIONS[-1:]
+            for duration in durations:
+                best = detectable_leak(rig, best.duty, duration, false_alarm=false_alarm, detection=detection)
+                if getattr(best, field) <= target:
                     break
-        best.append(best_duty)
-    return RecordingPlan(rig.name, target, best[0], best[1], tuple(compared), pressure, false_alarm, detection)
+        planned.append(best)
+    detecting, separating = planned
+    if held is None and has_shut_off(rig):
+        held = parse_quantity(LOADS[-1], "N", name="load")
+    hold = None
+    if held is not None:
+        hold = plan_hold(rig, held, compared[0].flow, target, false_alarm=false_alarm, detection=detection)
+    return RecordingPlan(
+        rig.name, target, detecting, separating, tuple(compared), usual_pressure, false_alarm, detection, hold
+    )

@@ -1,4 +1,4 @@
-"""The command line: translation from words to calls, nothing else."""
+"""The command line, which only translates arguments to calls."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 
 _WRONG_CALL, _INTERRUPTED = 2, 130
-#: An interrupt that Python ignored is sent again after this time [s].
-_AGAIN = 0.05
+#: An interrupt that Python ignored is repeated after this time [s].
+_REPEAT_SECONDS = 0.05
 
 app = typer.Typer(
     rich_markup_mode="markdown",
@@ -44,19 +44,9 @@ app = typer.Typer(
 )
 
 for command in (
-    simulation.demo,
-    simulation.simulate,
-    machine.commission,
-    recordings.diagnose,
-    recordings.report,
-    trend.trend,
-    simulation.parameters,
-    planning.plan,
-    recordings.inspect,
-    recordings.convert,
-    reproduction.reproduce,
-    fmu.fmu,
-):
+    simulation.demo, simulation.simulate, machine.commission, recordings.diagnose, recordings.report, trend.trend,
+    simulation.parameters, planning.plan, recordings.inspect, recordings.convert, reproduction.reproduce, fmu.fmu,
+):  # fmt: skip
     app.command()(command)
 for group in (campaign.campaign, rigs.rigs, monitoring.monitor, plugin.plugin):
     app.add_typer(group)
@@ -68,6 +58,7 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help=_VERBOSE)] = False,
 ) -> None:
+    """Handle the options that are valid for all commands."""
     if verbose:
         import logging
 
@@ -81,62 +72,64 @@ def _root(
         raise typer.Exit
 
 
-def arguments_of(words: Sequence[str]) -> list[str]:
-    """Return the words of a call as the commands take them: `-v` first, an option for each baseline."""
-    end = list(words).index("--") if "--" in words else len(words)
+def normalise_arguments(words: Sequence[str]) -> list[str]:
+    """Bring the arguments of a call into the form that typer parses: `-v` first, and an option for each baseline."""
+    end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
-    plain = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
-    if plain[:1] == ["monitor"] and len(plain) > 1 and plain[1] not in monitoring.COMMANDS:
-        plain.insert(1, "run")  # `sealscope monitor FILE`
-    return [*verbose[:1], *spread_baselines(plain)]
+    remaining = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
+    if remaining[:1] == ["monitor"] and len(remaining) > 1 and remaining[1] not in monitoring.COMMANDS:
+        remaining.insert(1, "run")  # `sealscope monitor FILE`
+    return [*verbose[:1], *spread_baselines(remaining)]
 
 
 def spread_baselines(words: Sequence[str]) -> list[str]:
-    """Give every file after `--baseline` an option of its own, so that `FILE... --baseline FILE...` takes wildcards.
+    """Repeat `--baseline` before each of its files, so that `FILE... --baseline FILE...` works with wildcards.
 
-    All words after `--baseline` up to the next option belong to it; but where no other word could be a FILE, only the
-    first one does.
+    All words after `--baseline` up to the next option belong to it; only the first one does if no FILE would be left.
     """
     if "--baseline" not in words or words[0] not in ("diagnose", "report"):
         return list(words)
     end = list(words).index("--") if "--" in words else len(words)
-    groups: list[list[str]] = []
-    plain: list[str] = []
-    of_group = False
+    baselines: list[list[str]] = []  # the files after each `--baseline`
+    remaining: list[str] = []
+    in_baseline = False
     for word in words[1:end]:
         if word == "--baseline":
-            groups.append([])
-            of_group = True
+            baselines.append([])
+            in_baseline = True
             continue
-        of_group = of_group and (word == "-" or not word.startswith("-"))
-        (groups[-1] if of_group else plain).append(word)
-    plain += words[end:]
-    if not all(groups):
+        in_baseline = in_baseline and (word == "-" or not word.startswith("-"))
+        (baselines[-1] if in_baseline else remaining).append(word)
+    remaining += words[end:]
+    if not all(baselines):
         raise InputError("--baseline must be followed by one file or more, got none")
-    files = _command().commands[words[0]].make_context(words[0], list(plain), resilient_parsing=True).params["files"]
-    options = [word for group in groups for name in (group if files else group[:1]) for word in ("--baseline", name)]
-    left = [] if files else [name for group in groups for name in group[1:]]
-    return [words[0], *options, *left, *plain]
+    command = _click_command().commands[words[0]]
+    files = command.make_context(words[0], list(remaining), resilient_parsing=True).params["files"]
+    used = baselines if files else [group[:1] for group in baselines]
+    options = [word for group in used for name in group for word in ("--baseline", name)]
+    moved_files = [] if files else [name for group in baselines for name in group[1:]]
+    return [words[0], *options, *moved_files, *remaining]
 
 
 @cache
-def _command() -> Any:
+def _click_command() -> Any:
+    """Return the click command of the app."""
     return typer.main.get_command(app)
 
 
 def main() -> None:
     """Run the command line.
 
-    Every error a caller can act on is one line on standard error and a status, never a traceback.
+    An error that the caller can act on is printed as one line on standard error, with an exit status and no traceback.
     """
-    # typer brings click along or holds a copy of its own, by version: the class is wherever BadParameter's base is
+    # some versions of typer contain a copy of click: take the exception of the module in which BadParameter is defined
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal without the character shows its code instead
+        if isinstance(stream, io.TextIOWrapper):  # a character that the terminal lacks is printed as its code
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _no_interrupt_lost():
-            status = _command()(arguments_of(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
+        with _repeating_lost_interrupts():
+            status = _click_command()(normalise_arguments(sys.argv[1:]), prog_name="sealscope", standalone_mode=False)
             sys.stdout.flush()
     except typer.Exit as error:
         status = error.exit_code
@@ -157,21 +150,22 @@ def main() -> None:
         complain("interrupted")
     try:
         sys.stdout.flush()
-    except OSError:  # the reader of a pipe is gone: the rest goes nowhere, so that Python's own flush is silent
+    except OSError:  # the reader of a pipe has ended: discard the rest, or Python's flush at exit would complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status if isinstance(status, int) else 0)
 
 
 @contextmanager
-def _no_interrupt_lost() -> Iterator[None]:
+def _repeating_lost_interrupts() -> Iterator[None]:
     """Repeat an interrupt that Python ignored, for example in a finalizer of the compiler."""
-    usual = sys.unraisablehook
+    original_hook = sys.unraisablehook
 
     def repeat_interrupt(unraisable: Any) -> None:
+        """Send SIGINT to this process again if the ignored exception was a KeyboardInterrupt."""
         if unraisable.exc_type is not KeyboardInterrupt:
-            usual(unraisable)
+            original_hook(unraisable)
             return
-        timer = Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT))
+        timer = Timer(_REPEAT_SECONDS, os.kill, (os.getpid(), signal.SIGINT))
         timer.daemon = True
         timer.start()
 
@@ -179,4 +173,4 @@ def _no_interrupt_lost() -> Iterator[None]:
     try:
         yield
     finally:
-        sys.unraisablehook = usual
+        sys.unraisablehook = original_hook

@@ -1,4 +1,4 @@
-"""The commands that measure: campaign run, status and report."""
+"""The commands `campaign run`, `campaign status` and `campaign report`."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ campaign = Typer(
 )
 
 
-def _plans() -> Sequence[str]:
+def _packaged_plans() -> Sequence[str]:
+    """List the names of the packaged plans, for completion."""
     from sealscope.campaigns.plans.reader import plan_names
 
     return plan_names()
 
 
 PlanArgument = Annotated[
-    str, Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=opt.completing(_plans))
+    str,
+    Argument(metavar="PLAN", help="Plan by name, or a TOML file.", autocompletion=opt.make_completion(_packaged_plans)),
 ]
 _FOLDER = "Folder of the campaign; by default sealscope-campaigns/NAME."
 FolderOption = Annotated[Path | None, Option("--output", "-o", help=_FOLDER)]
@@ -54,58 +56,58 @@ def run(
     trust: Annotated[bool, Option("--trust", help=_TRUST)] = False,
     data: DataOption = None,
 ) -> None:
-    """Carry out what is missing of a plan, then report.
+    """Run the missing records of a plan, then report.
 
-    Interrupted, the same call continues. Exit status 1 where a record failed.
+    After an interruption the same call continues. The exit status is 1 if a record failed.
     """
     from sealscope.campaigns.execution.run import run as carry_out
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
-    place = _folder(loaded, folder)
+    target = _campaign_folder(loaded, folder)
     if not isinstance(loaded, SimulatedPlan):
         if batch:
             raise InputError(f"a plan in batches must simulate its records; run it without --batch ({loaded.place})")
-        if _report(loaded, place, data):
+        if _write_report(loaded, target, data):
             raise Exit(1)
         return
     opt.say_jobs(jobs)
-    with _progress() as progress:
+    with _show_progress() as progress:
         state = carry_out(
-            loaded, place, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
+            loaded, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
         )  # fmt: skip
-    echo(_progress_text(state))
-    _report(loaded, place, data)
+    echo(_format_progress(state))
+    _write_report(loaded, target, data)
     if state.failed:
         raise Exit(1)
 
 
 @campaign.command()
 def status(plan: PlanArgument, folder: FolderOption = None) -> None:
-    """Print the progress of a campaign, and what is left."""
-    from sealscope.campaigns.execution.store import progress_of
+    """Print the progress of a campaign and the computing time left."""
+    from sealscope.campaigns.execution.store import read_progress
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
     if isinstance(loaded, SimulatedPlan):
-        echo(_progress_text(progress_of(loaded, _folder(loaded, folder))))
+        echo(_format_progress(read_progress(loaded, _campaign_folder(loaded, folder))))
     else:
         echo("a campaign over measured data has nothing to wait for; report it")
 
 
 @campaign.command()
 def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = None) -> None:
-    """Judge the rows that are there; write tables and page."""
+    """Judge the rows stored so far, and write tables and page."""
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
-    _report(loaded, _folder(loaded, folder), data)
+    _write_report(loaded, _campaign_folder(loaded, folder), data)
 
 
-def _folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Return the campaign's folder; InputError where the default one is a link that came with the folder."""
+def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
+    """Return the campaign's folder, `stated` or the default; raise InputError if the default one is a link."""
     if stated is not None:
         return stated
     folder = Path("sealscope-campaigns") / plan.name
@@ -115,29 +117,31 @@ def _folder(plan: AnyPlan, stated: Path | None) -> Path:
     return folder
 
 
-def _progress_text(state: CampaignProgress) -> str:
+def _format_progress(state: CampaignProgress) -> str:
+    """Format the number of records done and failed, and the computing time left."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
     if state.seconds is not None:
-        left = (state.records - state.done) * state.seconds
+        remaining = (state.records - state.done) * state.seconds
         text += f"; {state.seconds:.2f} s of one core each"
-        text += f", about {opt.time_text(left)} of one core left" if left else ""
+        text += f", about {opt.format_duration(remaining)} of one core left" if remaining else ""
     return text
 
 
 @contextmanager
-def _progress() -> Iterator[ProgressCallback]:
+def _show_progress() -> Iterator[ProgressCallback]:
+    """Show the progress of a campaign on standard error; yield a function of (done, total, failed) records."""
     with opt.counted_progress("records") as update:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
 
-def _report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
-    """Write tables and page; return how many records failed."""
+def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
+    """Write tables and page of a result, and print its main table; return the number of failed records."""
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
-    result = _result(plan, folder, data)
+    result = _load_result(plan, folder, data)
     files = write_result(result, folder)
     write_campaign_page(result, folder / PAGE, [path.name for path in files])
     echo(campaign_text(result))
@@ -147,16 +151,16 @@ def _report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
     return len(result.judgement.failed)
 
 
-def _result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Return the plan's result: from the rows in its folder, or from the recordings in the folder `data`."""
+def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
+    """Judge a plan by the rows in its folder, or by the recordings in the folder `data`."""
     from sealscope.campaigns.plans.model import SimulatedPlan
-    from sealscope.campaigns.results import recorded_result, simulated_result
+    from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign
 
     if isinstance(plan, SimulatedPlan):
-        return simulated_result(plan, folder)
+        return judge_simulated_campaign(plan, folder)
     if data is None:
         raise InputError("the plan needs recordings: give their folder with --data")
     if not data.is_dir():
         raise InputError(f"--data must be the folder of recordings, got {data}")
-    with _progress() as progress:
-        return recorded_result(plan, data, progress)
+    with _show_progress() as progress:
+        return judge_recorded_campaign(plan, data, progress)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from typer import Option, echo
 
-from sealscope.cli.options import RigOption, SetOption, check_folder, declared, rig_with
+from sealscope.cli.options import RigOption, SetOption, check_folder, declared_option, load_rig_with
 from sealscope.errors import InputError
 
 _PLATFORM = (
@@ -28,7 +28,7 @@ def fmu(
     version: Annotated[int, Option("--fmi", help="Version of the interface, 2 or 3.")] = 2,
     platforms: Annotated[list[str] | None, Option("--platform", help=_PLATFORM)] = None,
     error: Annotated[str | None, Option(help=_ERROR)] = None,
-    step: Annotated[str | None, declared("step")] = None,
+    step: Annotated[str | None, declared_option("step")] = None,
     sensor: Annotated[str | None, Option(help=_SENSOR)] = None,
     rate: Annotated[str | None, Option(help="Sampling rate of the soft sensor (500 Hz).")] = None,
 ) -> None:
@@ -41,21 +41,21 @@ def fmu(
     from sealscope.units import parse_quantity
 
     check_folder(output)
-    common: dict[str, Any] = {"rig": rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
+    common: dict[str, Any] = {"rig": load_rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
     if sensor is None:
         if rate is not None:
             raise InputError("--rate is of a soft sensor, got it without --sensor")
-        longest = None if step is None else parse_quantity(step, "s", name="step")
-        allowed = ERROR if error is None else parse_quantity(error, "Pa", name="error")
-        variables = write_fmu(output, **common, error=allowed, step=longest)
-        takes = f"steps of at most {next(v.start for v in variables if v.name == 'step'):.3g} s"
+        max_step = None if step is None else parse_quantity(step, "s", name="step")
+        max_error = ERROR if error is None else parse_quantity(error, "Pa", name="error")
+        variables = write_fmu(output, **common, error=max_error, step=max_step)
+        timing = f"steps of at most {next(v.start for v in variables if v.name == 'step'):.3g} s"
     else:
         for name, value in (("--step", step), ("--error", error)):
             if value is not None:
                 raise InputError(f"{name} is of a rig's solver, got it with --sensor")
-        hertz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
-        variables = write_sensor_fmu(output, **common, sensor=sensor, rate=hertz)  # type: ignore[arg-type]
-        takes = f"samples at {hertz:g} Hz"
+        rate_hz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
+        variables = write_sensor_fmu(output, **common, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
+        timing = f"samples at {rate_hz:g} Hz"
     kinds = ("input", "parameter", "output")
     counts = ", ".join(f"{sum(v.causality == kind for v in variables)} {kind}s" for kind in kinds)
-    echo(f"{output}: FMI {version} for co-simulation,\n{counts}, {takes}")
+    echo(f"{output}: FMI {version} for co-simulation,\n{counts}, {timing}")

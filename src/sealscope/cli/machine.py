@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from sealscope.cli.options import StatedMachine, check_folder, say, stating
+from sealscope.cli.options import StatedMachine, check_folder, say, with_machine_options
 from sealscope.errors import InputError
 
 
-@stating("rig", "area", "displacement", "maps", "rate", "limit")
+@with_machine_options("rig", "area", "displacement", "maps", "rate", "limit")
 def commission(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
@@ -27,19 +27,22 @@ def commission(
         ),
     ] = False,
     keep: Annotated[
-        bool, typer.Option("--keep", help="Keep recordings that the others call leaking; else they are left out.")
+        bool,
+        typer.Option(
+            "--keep", help="Keep recordings that look leaking compared with the others; else they are left out."
+        ),
     ] = False,
     since: Annotated[
         str | None,
         typer.Option("--since", metavar="DATE", help="With --add: forget recordings before DATE, as after a repair."),
     ] = None,
 ) -> None:
-    """Learn a machine from healthy recordings, once: its terms, sensors, scatter, and the smallest leak it will show.
+    """Learn a machine once from healthy recordings: its terms, sensors, scatter, and the smallest leak it will show.
 
-    `diagnose`, `trend`, `report` and `monitor` take the file by --machine.
+    `diagnose`, `trend`, `report` and `monitor` use the file with --machine.
     """
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, checksum_of, recordings_in
-    from sealscope.diagnosis.commissioned.machine import commission as commissioned
+    from sealscope.diagnosis.commissioned.machine import commission as learn_machine
     from sealscope.diagnosis.commissioned.machine_file import update_machine, write_machine
 
     if output.suffix.lower() != ".toml":
@@ -49,15 +52,18 @@ def commission(
     check_folder(output)
     if add:
         if keep:
-            raise InputError("--keep must not stand beside --add: what is added is confirmed healthy")
+            raise InputError("--keep must not stand beside --add: added recordings are confirmed healthy")
         if stated != StatedMachine():
-            raise InputError("what states the machine must not stand beside --add: the machine's file states it")
-        repair = None if since is None else _date(since)
+            raise InputError(
+                "--rig, --area and other options of the machine must not stand beside --add: its file states them"
+            )
+        repair = None if since is None else _parse_date(since)
         paths = recordings_in(files)
 
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
+            """Add the files to the healthy recordings, and forget those before the repair."""
             if repair is not None:
-                repaired = JudgedAlarm("", "repaired", repair, repair)
+                repaired = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
                 machine = replace(machine, alarms=(*machine.alarms, repaired))
             for path in paths:
                 machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
@@ -67,7 +73,7 @@ def commission(
     else:
         if output.exists():
             raise InputError(f"a machine's file must be new, got {output}, which exists; --add adds recordings to it")
-        machine = commissioned(
+        machine = learn_machine(
             files, rig=stated.rig, map=stated.channel_map or None, rate=stated.rate, limit=stated.limit,
             name=output.stem, keep=keep,
         )  # fmt: skip
@@ -75,7 +81,8 @@ def commission(
     say(f"{output}:\n{machine}")
 
 
-def _date(text: str) -> float:
+def _parse_date(text: str) -> float:
+    """Parse the date of `--since` to seconds since 1970, as UTC unless it states a time zone."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

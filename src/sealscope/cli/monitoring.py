@@ -1,4 +1,4 @@
-"""`sealscope monitor`: the service, and its file of settings."""
+"""The commands `sealscope monitor ...`: the service, its settings, a demonstration and exports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typer import Argument, Option, Typer, echo
 from sealscope.cli.options import check_folder, write_text
 from sealscope.errors import InputError
 
-#: Words after `monitor` that are no file of settings.
+#: Words after `monitor` that are commands or options, and no file of settings.
 COMMANDS = ("init", "run", "demo", "export", "dashboard", "-h", "--help")
 
 monitor = Typer(
@@ -26,9 +26,7 @@ FileOption = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The 
 
 
 @monitor.command()
-def init(
-    output: FileOption = Path("monitor.toml"),
-) -> None:
+def init(output: FileOption = Path("monitor.toml")) -> None:
     """Write a commented file of settings."""
     from sealscope.monitor.settings import template
 
@@ -49,9 +47,9 @@ def run(
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     from sealscope.monitor.supervisor import LimitedLines
 
-    limit = LimitedLines()  # one, for all: messages from outside must not fill the disk
+    line_limit = LimitedLines()  # shared by all handlers, so that messages from outside cannot fill the disk
     for handler in (*logging.getLogger().handlers, *logging.getLogger("sealscope").handlers):
-        handler.addFilter(limit)
+        handler.addFilter(line_limit)
     _serve(file, once=once)
 
 
@@ -61,16 +59,16 @@ def demo(
     port: Annotated[int, Option(min=0, max=65535, help="Port of the page.")] = 8765,
     speed: Annotated[float, Option(min=0.1, max=1000.0, help="Times real time.")] = 20.0,
 ) -> None:
-    """Watch three simulated actuators at 20 times real time; one begins to leak after two minutes of theirs."""
+    """Watch three simulated actuators at 20 times real time; one begins to leak after two simulated minutes."""
     import tempfile
 
     from sealscope.live_simulation import DEMO
     from sealscope.storage.folders import make_folder
 
     with tempfile.TemporaryDirectory() as temporary:
-        place = Path(temporary) if folder is None else folder
-        make_folder(place)
-        file = place / "demo.toml"
+        demo_folder = Path(temporary) if folder is None else folder
+        make_folder(demo_folder)
+        file = demo_folder / "demo.toml"
         write_text(file, DEMO.format(port=port, speed=speed))
         _serve(file)
 
@@ -80,7 +78,7 @@ def export(
     file: Annotated[Path, Argument(metavar="FILE", help="Settings of the monitor.")],
     folder: Annotated[Path, Option("--output", "-o", metavar="FOLDER", help="Where the tables are written.")],
 ) -> None:
-    """Write what persons said of alarms as labelled data: alarms.csv and estimates.csv."""
+    """Write people's judgements of alarms as labelled data: alarms.csv and estimates.csv."""
     from sealscope.monitor.database.export import export_labels
     from sealscope.monitor.database.store import MonitorStore
     from sealscope.monitor.settings import read_settings
@@ -93,9 +91,7 @@ def export(
 
 
 @monitor.command()
-def dashboard(
-    file: FileOption = Path("grafana.json"),
-) -> None:
+def dashboard(file: FileOption = Path("grafana.json")) -> None:
     """Write a dashboard that Grafana imports, for the metrics of the page's /metrics."""
     import json
 
@@ -107,15 +103,15 @@ def dashboard(
 
 
 def _serve(file: Path, *, once: bool = False) -> None:
-    """Run the service of a file of settings until it ends, or a signal ends it."""
+    """Run the service with a file of settings until it ends or receives SIGTERM or SIGINT."""
     from sealscope.monitor.service import Service
     from sealscope.monitor.settings import read_settings
 
     settings, sources = read_settings(file), []
     if any(actuator.simulate is not None for actuator in settings.actuator):
-        from sealscope.live_simulation import simulated_sources
+        from sealscope.live_simulation import make_simulated_sources
 
-        sources = simulated_sources(settings, lambda text: echo(text, err=True))
+        sources = make_simulated_sources(settings, lambda text: echo(text, err=True))
     service = Service(settings, once=once, sources=sources)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())

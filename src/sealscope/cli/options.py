@@ -1,4 +1,4 @@
-"""Options that several commands share, and what commands do alike."""
+"""Options and functions that several commands share."""
 
 from __future__ import annotations
 
@@ -32,30 +32,32 @@ if TYPE_CHECKING:
     from sealscope.simulation.experiment import Experiment
 
 T = TypeVar("T")
-#: Exit status where a verdict is one of those that `--fail-on` names.
+#: Exit status if a verdict is among those of `--fail-on`.
 FAILED_ON = 3
-#: Stands for standard input.
+#: Name of standard input in place of a file.
 STANDARD_INPUT = Path("-")
 _log = logging.getLogger(__name__)
 
 
-def completing(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return a shell's completion from these names."""
+def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Build the function that completes a name in the shell from `names`."""
 
     def complete(incomplete: str) -> list[str]:
+        """List the names that begin with the typed text; typer requires the parameter's name."""
         return [name for name in names() if name.startswith(incomplete)]
 
     return complete
 
 
 def _rig_names() -> Sequence[str]:
+    """List the names of the packaged rigs, for completion."""
     from sealscope.parameters import rig_names
 
     return rig_names()
 
 
-def _overrides() -> list[str]:
-    """Return names of parameters, whole or as a symbol that only one has, ready for a value."""
+def _override_names() -> list[str]:
+    """List parameters for completion as `NAME=`: full names, and symbols that belong to only one parameter."""
     from sealscope.parameters import declared_names
 
     names = declared_names()
@@ -63,21 +65,22 @@ def _overrides() -> list[str]:
     return [f"{name}=" for name in (*names, *(symbol for symbol in symbols if symbols.count(symbol) == 1))]
 
 
-complete_rigs = completing(_rig_names)
+complete_rigs = make_completion(_rig_names)
 
 
-def declared(name: str, *, option: str = "", several: bool = False, **shown: Any) -> Any:
-    """Return the option for an argument of `Experiment.of`, with the text that is declared there."""
-    text = _text_of(name) + (" Repeat for several." if several else "")
-    return Option(option or f"--{name.replace('_', '-')}", help=text, **shown)
+def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
+    """Build the option for an argument of `Experiment.of`, with the help text declared there."""
+    text = _argument_text(name) + (" Repeat for several." if several else "")
+    return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
 
 
-def _text_of(name: str) -> str:
+def _argument_text(name: str) -> str:
+    """Return the help text of an argument of `Experiment.of`."""
     return str(Arguments.__dataclass_fields__[name].metadata["text"])
 
 
-RigOption = Annotated[str, declared("rig", autocompletion=complete_rigs)]
-RigArgument = Annotated[str, Argument(help=_text_of("rig"), autocompletion=complete_rigs)]
+RigOption = Annotated[str, declared_option("rig", autocompletion=complete_rigs)]
+RigArgument = Annotated[str, Argument(help=_argument_text("rig"), autocompletion=complete_rigs)]
 AssumeOption = Annotated[
     str | None,
     Option(
@@ -95,7 +98,7 @@ _LIMIT = "Leak to be repaired: a flow, '5 mL/min', or a speed of creep. [default
 LimitOption = Annotated[str | None, Option("--limit", metavar="LEAK[unit]", help=_LIMIT)]
 SetOption = Annotated[
     list[str] | None,
-    declared("set", several=True, metavar="NAME=VALUE[unit]", autocompletion=completing(_overrides)),
+    declared_option("set", several=True, metavar="NAME=VALUE[unit]", autocompletion=make_completion(_override_names)),
 ]
 MapOption = Annotated[
     list[str] | None,
@@ -114,7 +117,7 @@ BaselineOption = Annotated[list[Path] | None, Option("--baseline", metavar="FILE
 _MACHINE = "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings."
 MachineOption = Annotated[Path | None, Option("--machine", metavar="FILE", help=_MACHINE)]
 FalseAlarmOption = Annotated[float, Option("--false-alarm", help="Probability of `leak` on a leak-free recording.")]
-SeedOption = Annotated[int, declared("seed")]
+SeedOption = Annotated[int, declared_option("seed")]
 _JOBS = "Processes; by default one a core, two a core at most."
 JobsOption = Annotated[int | None, Option("--jobs", "-j", help=_JOBS)]
 _FAIL_ON = "End with status 3 on this verdict; repeat."
@@ -126,9 +129,13 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """The machine as a call states it: its file (`known`), or how to read its files, its rig, limit and baseline."""
+    """The machine as the options of a call state it.
 
-    known: CommissionedMachine | None = None
+    `commissioned`: the machine of `--machine`, which states everything else; otherwise `channel_map` and `rate`: how to
+    read files; `rig`, `limit` and `baseline`: None or () if not stated.
+    """
+
+    commissioned: CommissionedMachine | None = None
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
     rig: Rig | None = None
@@ -147,9 +154,9 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Read the stated machine from the options. Raise InputError for a wrong option, or one next to `--machine`."""
+        """Build the machine from the options; raise InputError for an invalid one, or one given with `--machine`."""
         from sealscope.diagnosis.verdict.severity import RepairLimit
-        from sealscope.recordings.formats.columns import check_call
+        from sealscope.recordings.formats.columns import check_request
 
         if machine is not None:
             from sealscope.diagnosis.commissioned.machine_file import read_machine
@@ -161,54 +168,57 @@ class StatedMachine:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
             known = read_machine(machine)
             return cls(known, rig=known.rig, limit=known.limit)
-        own_rig = _assumed_rig(rig, area, displacement)
-        stated = cls(None, channel_map_of(maps), rate, own_rig, limit, tuple(baseline or ()))
-        check_call(stated.channel_map, rate)
-        check_call(stated._map_of_rig, rate)
-        RepairLimit.of(limit)
+        stated = cls(
+            rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps), rate=rate,
+            limit=limit, baseline=tuple(baseline or ()),
+        )  # fmt: skip
+        check_request(stated.channel_map, rate)
+        check_request(stated._rig_map, rate)
+        RepairLimit.parse(limit)
         return stated
 
     @property
-    def _map_of_rig(self) -> ChannelMap:
-        """The map that the rig's file keeps; a `--map` stands in its place."""
+    def _rig_map(self) -> ChannelMap:
+        """The channel map in the rig's file, unless `--map` replaces it."""
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
-    def maps(self) -> bool:
-        """Test whether the call or its rig states a map."""
-        return bool(self.channel_map or self._map_of_rig)
+    def has_map(self) -> bool:
+        """True if the call or its rig states a channel map."""
+        return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
-        """Read a file, standard input for `-`; the rig's map is for files that have its columns."""
-        if self.known is not None:
-            return self.known.read(file)
+        """Read a file, or standard input for `-`; the channel map of the rig applies to files that have its columns."""
+        if self.commissioned is not None:
+            return self.commissioned.read(file)
         if file.is_dir():
-            ways = "name its files, or state its machine by --machine"
-            raise UnreadableFile(f"a recording must be a file, got a folder: {ways} ({file})")
+            remedy = "name its files, or state its machine by --machine"
+            raise UnreadableFile(f"a recording must be a file, got a folder: {remedy} ({file})")
         if file != STANDARD_INPUT:
             return self._read(file)
         with TemporaryDirectory() as folder:
-            copied = Path(folder) / "standard input"
-            with copied.open("wb") as copy:
+            path = Path(folder) / "standard input"
+            with path.open("wb") as copy:
                 shutil.copyfileobj(sys.stdin.buffer, copy)
             try:
-                return self._read(copied)
+                return self._read(path)
             except UnreadableFile as error:
-                raise UnreadableFile(str(error).replace(str(copied), copied.name)) from error
+                raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        if not self._map_of_rig:
+        """Read a file with the channel map of the call or the rig."""
+        if not self._rig_map:
             from sealscope.recordings import read
 
             return read(file, map=self.channel_map or None, rate=self.rate)
-        from sealscope.diagnosis.commissioned.machine import read_of_machine
+        from sealscope.diagnosis.commissioned.machine import read_by_map
 
-        return read_of_machine(file, self._map_of_rig, self.rate)
+        return read_by_map(file, self._rig_map, self.rate)
 
-    def read_all(self, files: Sequence[Path], joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
-        """Yield each file and its recording, or None and a line on standard error if it is unreadable.
+    def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
+        """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
 
-        `joined`: the first file and the recording of all files joined instead, None where one is bad.
+        `joined`: yield the first file with the recording of all files joined, or with None if one is unreadable.
         """
         recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
         if not joined:
@@ -216,50 +226,57 @@ class StatedMachine:
             return
         from sealscope.recordings import join
 
-        parts = [recording for _, recording in recordings]
-        whole = [part for part in parts if part is not None]
-        yield files[0], join(whole, names=[file.name for file in files]) if len(whole) == len(files) else None
+        parts = [recording for _, recording in recordings if recording is not None]
+        yield files[0], join(parts, names=[file.name for file in files]) if len(parts) == len(files) else None
 
     def diagnose(
         self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float
     ) -> Diagnosis:
-        """Diagnose a recording of this machine."""
+        """Diagnose a recording of this machine; `false_alarm`: probability, `file`: its name in the diagnosis."""
         from dataclasses import replace
 
         from sealscope.diagnosis.diagnose import diagnose
 
-        if self.known is not None:
-            diagnosis = self.known.diagnose(recording, false_alarm_probability=false_alarm)
+        if self.commissioned is not None:
+            diagnosis = self.commissioned.diagnose(recording, false_alarm_probability=false_alarm)
             return replace(diagnosis, file=str(file))
-        stated: dict[str, Any] = {"rig": self.rig, "limit": self.limit, "file": file}
-        return diagnose(recording, baseline, false_alarm_probability=false_alarm, **stated)
+        return diagnose(
+            recording, baseline, false_alarm_probability=false_alarm, rig=self.rig, limit=self.limit, file=file
+        )  # fmt: skip
 
 
-def stating(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of `StatedMachine.of`, or those of these names, in place of its parameter `stated`."""
-    every = inspect.signature(StatedMachine.of, eval_str=True).parameters
-    return _replace_parameter("stated", StatedMachine.of, [every[name] for name in names or every])
+def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace a command's parameter `stated` by the options of `StatedMachine.of`, all or those in `names`."""
+    options = inspect.signature(StatedMachine.of, eval_str=True).parameters
+    return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
 
-def simulating(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each argument of `Experiment.of` in place of its parameter `experiment`."""
-    known = {"rig": RigOption, "set": SetOption, "x_0": Annotated[str, declared("x_0", option="--start-position")]}
-    known |= {name: Annotated[list[str] | None, declared(name, several=True)] for name in ("leak", "fault")}
+def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace a command's parameter `experiment` by an option for each argument of `Experiment.of`."""
+    special_options = {
+        "rig": RigOption,
+        "set": SetOption,
+        "x_0": Annotated[str, declared_option("x_0", option="--start-position")],
+    }
+    special_options |= {
+        name: Annotated[list[str] | None, declared_option(name, several=True)] for name in ("leak", "fault")
+    }
     options = []
     for argument in fields(Arguments):
-        if argument.name == "drifts":  # no text says what drifts
+        if argument.name == "drifts":  # has no textual form
             continue
         default = f"{argument.default:g}" if isinstance(argument.default, float) else argument.default
         kind = str | None if default is None else type(default)
-        annotation = known.get(argument.name, Annotated[kind, declared(argument.name)])
+        annotation = special_options.get(argument.name, Annotated[kind, declared_option(argument.name)])
         options.append(Parameter(argument.name, Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
-    return _replace_parameter("experiment", _experiment, options)(command)
+    return _replace_parameter("experiment", _build_experiment, options)(command)
 
 
-def _experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
+def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
+    """Build the experiment of a call from its options."""
     from sealscope.simulation.experiment import Experiment
 
-    return Experiment.of(rig=rig_with(rig, set), **arguments)
+    return Experiment.of(rig=load_rig_with(rig, set), **arguments)
 
 
 def _replace_parameter(
@@ -267,53 +284,59 @@ def _replace_parameter(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Replace a command's parameter `name` by options, from which `make` builds its value."""
 
-    def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        command.__annotations__[name] = Any  # the type may not be loaded yet
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        """Wrap the command with a signature that has the options in place of the parameter."""
+        command.__annotations__[name] = Any  # its type may be imported for type checking only
         signature = inspect.signature(command, eval_str=True)
 
         @wraps(command)
         def call(**arguments: Any) -> None:
+            """Call the command with the value built from the options."""
             value = make(**{option.name: arguments.pop(option.name) for option in options})
             command(**{name: value}, **arguments)
 
         parameters = list(signature.parameters.values())
-        place = list(signature.parameters).index(name)
-        parameters[place : place + 1] = options
-        by_name = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
-        call.__signature__ = signature.replace(parameters=by_name)  # type: ignore[attr-defined]
+        index = list(signature.parameters).index(name)
+        parameters[index : index + 1] = options
+        keyword_only = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
+        call.__signature__ = signature.replace(parameters=keyword_only)  # type: ignore[attr-defined]
         return call
 
-    return decorated
+    return decorate
 
 
-def _assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Return the rig of `--rig` with the values of `--area` and `--displacement`, None without these options."""
-    from sealscope.diagnosis.verdict.machine import unstated
+def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
+    """Build the rig of `--rig` with the values of `--area` and `--displacement`; None without these options."""
+    from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
 
     rig = None if name is None else load_rig(name)
-    source, stated = "set by the call (--area, --displacement)", dict[str, float]()
+    source = "set by the call (--area, --displacement)"
     if area:
         if len(area) > 2:
             raise InputError(f"--area must be given once, or twice for sides A and B, got {len(area)} times")
-        sides = [parse_quantity(text, "m^2", name="--area") for text in area]
-        rig = (rig or unstated()).with_areas(sides[0], sides[-1], source=source)
+        areas = [parse_quantity(text, "m^2", name="--area") for text in area]  # of side A, and of B if it differs
+        rig = (rig or unstated_rig()).with_areas(areas[0], areas[-1], source=source)
     if displacement is not None:
-        stated["pump.q_b"] = parse_quantity(displacement, "m^3/rev", name="--displacement")
-    return rig if not stated else (rig or unstated()).with_overrides(stated, source=source)
+        overrides = {"pump.q_b": parse_quantity(displacement, "m^3/rev", name="--displacement")}
+        rig = (rig or unstated_rig()).with_overrides(overrides, source=source)
+    return rig
 
 
-def rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """Return the rig of that name or file with the values of `--set`."""
+def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
+    """Load a rig by name or file, with the values of `--set`."""
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
     return rig.with_overrides(parse_overrides(overrides), source="set by --set") if overrides else rig
 
 
-def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
-    """Channel -> column of the `--map` options, the rest by names with `auto`; InputError for a channel given twice."""
+def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
+    """Parse the `--map` options to channel -> column; raise InputError for a channel that is given twice.
+
+    With `auto` the remaining channels are found by the names of the columns.
+    """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
 
@@ -326,18 +349,18 @@ def channel_map_of(options: Sequence[str] | None) -> ChannelMap:
     return "auto" if set(columns) == {REST} else columns
 
 
-def verbose(context: Context) -> bool:
-    """Test whether the call has `-v`."""
+def is_verbose(context: Context) -> bool:
+    """Test whether the call has the option `-v`."""
     return bool(context.find_root().params.get("verbose"))
 
 
 def say(text: str) -> None:
-    """Print lines on standard output."""
+    """Print lines on standard output, with control characters escaped."""
     echo(printable(text, "\n"))
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print a paragraph on standard output, beside `head`; its lines are as wide as words allow, 80 columns."""
+    """Print a paragraph on standard output, wrapped at 80 columns and indented after `head`."""
     say(paragraph(text, head, len(head) or 2))
 
 
@@ -347,21 +370,21 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return `work()`, or None and one line on standard error if it fails with this file."""
+    """Return `work()`, or None after a message on standard error if it fails; other files can then be handled."""
     try:
         return work()
     except SealscopeError as error:
         complain(error if str(file) in str(error) else f"{error} ({file})")
     except MemoryError:
         complain(f"too little memory ({file})")
-    except Exception as error:  # a defect of the program; the other files have their results yet
+    except Exception as error:  # a defect of the program must not prevent the results of other files
         _log.debug("cannot handle %s", file, exc_info=True)
         complain(f"cannot handle {file}, got {type(error).__name__}: {error} (-v says where)")
     return None
 
 
 def check_folder(file: Path) -> None:
-    """Refuse a file in a missing folder before the long work, and remove the remains of a killed call."""
+    """Check before long work that a file can be written; remove temporary files that a killed call left behind."""
     from sealscope.storage import atomic
 
     atomic.check_folder(file)
@@ -369,73 +392,80 @@ def check_folder(file: Path) -> None:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a text whole or not at all."""
+    """Write a text file atomically."""
     from sealscope.storage.atomic import atomic_write
 
     with atomic_write(file) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")  # a file's name
+        # the name of a file in the text may contain bytes that are no UTF-8
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Complain on standard error if fewer processes start than `--jobs` asks for."""
+    """Print a message on standard error if fewer processes are started than `--jobs` asks for."""
     from sealscope.campaigns.execution.workers import process_count
 
-    if jobs is not None and jobs > (most := process_count(jobs)):
-        complain(f"--jobs {jobs}: {most} processes are started, two a core")
+    if jobs is not None and jobs > (n_processes := process_count(jobs)):
+        complain(f"--jobs {jobs}: {n_processes} processes are started, two a core")
 
 
 @contextmanager
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
-    """Show tasks and their shares on standard error, in lines that disappear at the end.
+    """Show progress bars on standard error, which disappear at the end; yield a function of (task, fraction).
 
-    Without a terminal nothing is shown; of many things, `noun`, a line a minute for the log.
+    `noun`: what is counted, for a single bar. If standard error is no terminal, a line per minute is printed if `noun`
+    is given, else nothing.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:  # a disabled bar may print an empty line
-        yield _each_minute() if noun else lambda *_: None
+        yield _minute_reporter() if noun else lambda *_: None
         return
     columns = (BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as bar:
         tasks: dict[str, Any] = {}
 
-        def update(task: str, share: float) -> None:
+        def update(task: str, fraction: float) -> None:
+            """Show the bar of a task, or the only bar, at a fraction of its length."""
             key = noun or task
             if key not in tasks:
                 tasks[key] = bar.add_task(task, total=1.0)
-            bar.update(tasks[key], completed=share, description=task)
+            bar.update(tasks[key], completed=fraction, description=task)
 
         yield update
 
 
-def _each_minute() -> Callable[[str, float], None]:
-    """Make a function that prints the task and the time left, once a minute."""
-    began = printed = time.monotonic()
-    first: float | None = None
+def _minute_reporter() -> Callable[[str, float], None]:
+    """Build a function of (task, fraction) that prints the task and the time left once a minute."""
+    start = last_print = time.monotonic()
+    start_fraction: float | None = None
 
-    def update(task: str, share: float) -> None:
-        nonlocal printed, first
-        now, first = time.monotonic(), share if first is None else first
-        if now - printed >= 60.0 and share > first:
-            printed = now
-            echo(f"{task}, about {time_text((now - began) / (share - first) * (1.0 - share))} left", err=True)
+    def update(task: str, fraction: float) -> None:
+        """Print the task and the time left if the last print is a minute ago."""
+        nonlocal last_print, start_fraction
+        now = time.monotonic()
+        if start_fraction is None:
+            start_fraction = fraction
+        if now - last_print >= 60.0 and fraction > start_fraction:
+            last_print = now
+            remaining = (now - start) / (fraction - start_fraction) * (1.0 - fraction)
+            echo(f"{task}, about {format_duration(remaining)} left", err=True)
 
     return update
 
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show on standard error how many of `noun` are done, the time left and a note."""
+    """Show on standard error the number of `noun` done and the time left; yield a function of (done, total, note)."""
     with progress(noun) as show:
         yield lambda done, total, note: show(
             f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)
         )
 
 
-def time_text(seconds: float) -> str:
-    """Return a time as hours, minutes or seconds."""
+def format_duration(seconds: float) -> str:
+    """Format a duration [s] in hours, minutes or seconds."""
     if seconds > 5400:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""The command that plans a recording: which command, load and duration find a leak, before anyone measures."""
+"""The command `plan`, which finds the command, load and duration of a recording that detects a leak."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typer import Option, echo
 from sealscope.cli import options as opt
 from sealscope.errors import InputError
 
+_HELD = "Plan a locked hold, too: the load that the cylinder holds with its valves shut ('2 kN')."
 _FIND = "Leak to be found, under the usual duty: '0.005 L/min'."
 
 
@@ -19,6 +20,7 @@ def plan(
     find: Annotated[str | None, Option(metavar="FLOW", help=_FIND)] = None,
     command: Annotated[str, Option(help="Command of the machine's usual duty.")] = "3 sin(4t)",
     load: Annotated[str, Option(help="Load of the usual duty: '500 N'.")] = "",
+    hold: Annotated[str | None, Option(metavar="FORCE", help=_HELD)] = None,
     false_alarm: opt.FalseAlarmOption = 0.01,
     detection: Annotated[float, Option(help="Probability with which the leak is to be found.")] = 0.9,
     overrides: opt.SetOption = None,
@@ -26,7 +28,7 @@ def plan(
 ) -> None:
     """Plan the recording that finds a leak: command, load and duration, and whether it tells piston from pump.
 
-    From the information of simulated leak-free recordings, by the test that diagnose judges with.
+    The plan uses simulated leak-free recordings and the statistical test of diagnose.
     """
     from sealscope.campaigns.smallest import PlannedDuty, plan_recording
     from sealscope.diagnosis.commissioned.machine_file import read_machine
@@ -39,19 +41,22 @@ def plan(
     leak_flow = None if find is None else parse_quantity(find, "m^3/s", name="--find")
     if leak_flow is not None and not leak_flow > 0.0:
         raise InputError(f"--find must be a flow > 0, got {find}")
-    known = opt.rig_with(rig, overrides)
+    hold_force = None if hold is None else parse_quantity(hold, "N", name="--hold")
+    if hold_force is not None and not hold_force > 0.0:
+        raise InputError(f"--hold must be a force > 0, got {hold}")
+    planned_rig = opt.load_rig_with(rig, overrides)
     if machine is not None:
         commissioned = read_machine(machine)
         if overrides:
             raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
         if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq"):
             smallest = commissioned.summary.smallest
-            shown = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
-            raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){shown}")
-        known = commissioned.rig
+            hint = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
+            raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){hint}")
+        planned_rig = commissioned.rig
     with opt.progress() as update:
         planned = plan_recording(
-            known, leak_flow, usual=PlannedDuty(command, load), false_alarm=false_alarm, detection=detection,
-            progress=update,
+            planned_rig, leak_flow, usual=PlannedDuty(command, load), held=hold_force, false_alarm=false_alarm,
+            detection=detection, progress=update,
         )  # fmt: skip
     echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())

@@ -1,4 +1,4 @@
-"""`sealscope plugin new`: a distribution with a detector of one's own, ready to be installed and judged."""
+"""The command `plugin new`, which writes a distribution with a new detector, ready to be installed and judged."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def new(
         Path | None, Option("--output", "-o", help="Folder to make; by default the name with dashes.")
     ] = None,
 ) -> None:
-    """Write a distribution with a detector of your own: code that runs, tests, a plan that judges it."""
+    """Write a package with a detector of your own: code that runs, its tests, and a plan that judges it."""
     from sealscope.storage.folders import make_folder
 
     if not re.fullmatch(r"[a-z][a-z0-9]*( [a-z0-9]+){0,5}", name) or len(name) > 60:
@@ -34,11 +34,12 @@ def new(
     if keyword.iskeyword(module):
         raise InputError(f"a detector's name must be no word of Python's, got {name!r}")
     values = {"words": name, "dashed": name.replace(" ", "-"), "module": module, "cls": name.title().replace(" ", "")}
-    place = folder or Path(values["dashed"])
-    if place.exists():
-        raise InputError(f"a plug-in's folder must be new, got {place}, which exists")
-    make_folder(place)
+    target_folder = folder or Path(values["dashed"])
+    if target_folder.exists():
+        raise InputError(f"a plug-in's folder must be new, got {target_folder}, which exists")
+    make_folder(target_folder)
     for file in (resources.files("sealscope.cli") / "plugin_files").iterdir():
         target = file.name.removesuffix(".txt").replace("detector.py", f"{module}.py")
-        write_text(place / target, Template(file.read_text(encoding="utf-8")).substitute(values))
-    echo(f"{place}: written; pip install -e {place}\nthen its name is among the methods of sealscope diagnose")
+        write_text(target_folder / target, Template(file.read_text(encoding="utf-8")).substitute(values))
+    echo(f"{target_folder}: written; pip install -e {target_folder}")
+    echo("then its name is among the methods of sealscope diagnose")

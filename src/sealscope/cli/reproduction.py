@@ -1,4 +1,4 @@
-"""The command that reproduces the thesis."""
+"""The command `reproduce`, which reproduces the thesis's tables and figures."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from sealscope.cli import options as opt
 from sealscope.errors import InputError
 
 
-def _items() -> list[str]:
-    from sealscope.thesis.engine.items import collect
+def _item_names() -> list[str]:
+    """List the names that can be reproduced, for completion."""
+    from sealscope.thesis.engine.items import load_items
 
-    items = collect()
+    items = load_items()
     groups = [f"chapter-{number}" for number in sorted({item.chapter for item in items})]
     return ["all", *groups, *(item.id for item in items)]
 
@@ -26,7 +27,7 @@ _ID = "What to reproduce: ids such as fig-5.58, all, chapter-4, or wildcards suc
 
 def reproduce(
     ids: Annotated[
-        list[str] | None, Argument(metavar="[ID...]", help=_ID, autocompletion=opt.completing(_items))
+        list[str] | None, Argument(metavar="[ID...]", help=_ID, autocompletion=opt.make_completion(_item_names))
     ] = None,
     listing: Annotated[bool, Option("--list", help="List what there is, and what it needs.")] = False,
     quick: Annotated[bool, Option("--quick", help="Fewer and shorter simulations.")] = False,
@@ -36,9 +37,9 @@ def reproduce(
     sheet: opt.SheetOption = None,
     jobs: opt.JobsOption = None,
 ) -> None:
-    """Make the thesis's tables and figures anew, with a verdict on each claim. Exit status 1 where one failed."""
+    """Reproduce the thesis's tables and figures, with a verdict on each claim. The exit status is 1 if one failed."""
     if listing:
-        _list(ids or ["all"], sheet)
+        _list_items(ids or ["all"], sheet)
         return
     from sealscope.thesis.engine.build import reproduce as build
     from sealscope.thesis.pages.files import publish
@@ -51,18 +52,18 @@ def reproduce(
     require_drawing()
     opt.say_jobs(jobs)
     with opt.counted_progress("items") as update:
-        built = build(
+        status_by_id = build(
             ids, output, quick=quick, jobs=jobs, sheet=sheet, publish=publish,
-            progress=lambda ended, total, in_work: update(ended, total, ", ".join(in_work)),
+            progress=lambda n_done, total, in_work: update(n_done, total, ", ".join(in_work)),
         )  # fmt: skip
-    statuses = list(built.values())
+    statuses = list(status_by_id.values())
     page = write_thesis_page(output, statuses, quick=quick, sheet=find_sheet(sheet) is not None)
     for status in statuses:
         if status.state == "failed":
             opt.complain(f"{status.item.id} failed: {status.reason}")
     counts = Counter(status.state for status in statuses)
-    shown = {"made": counts["made"], "kept from before": counts["kept"], "failed": counts["failed"]}
-    echo("items: " + ", ".join(f"{count} {state}" for state, count in shown.items() if count))
+    count_by_label = {"made": counts["made"], "kept from before": counts["kept"], "failed": counts["failed"]}
+    echo("items: " + ", ".join(f"{count} {label}" for label, count in count_by_label.items() if count))
     if counts["left out"]:
         echo(f"left out: {counts['left out']} ({MISSING})")
     echo(f"page:  {page}")
@@ -70,12 +71,13 @@ def reproduce(
         raise Exit(1)
 
 
-def _list(patterns: Sequence[str], sheet: Path | None) -> None:
-    from sealscope.thesis.engine.items import collect, select_items
+def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
+    """Print the items that match the patterns, and whether they lack the data sheet."""
+    from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 
     has_sheet = find_sheet(sheet) is not None
-    items = select_items(collect(), patterns)
+    items = select_items(load_items(), patterns)
     width = max(len(item.id) for item in items)
     for item in items:
         head = f"{item.id:<{width}}  {item.kind:<6}  "

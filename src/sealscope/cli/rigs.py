@@ -1,4 +1,4 @@
-"""The commands on rigs: list the packaged ones, write a file for another machine, rate a loop."""
+"""The commands on rigs: list the packaged ones, write a file for another machine, print margins of a position loop."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from typer import Argument, Context, Option, Typer, echo, prompt
 
-from sealscope.cli.options import RigArgument, check_folder, declared, say_wrapped, write_text
+from sealscope.cli.options import RigArgument, check_folder, declared_option, say_wrapped, write_text
 from sealscope.errors import InputError
 
 rigs = Typer(
@@ -47,7 +47,7 @@ def new(
 ) -> None:
     """Write a commented rig file from a data sheet: bore and rod (or areas), stroke, and pump or valve.
 
-    A number without a unit is in mm, mm^2, cm^3/rev, L/min or bar. What is needed and not given is asked for.
+    A number without a unit is in mm, mm^2, cm^3/rev, L/min or bar. Missing values are asked for.
     """
     from sealscope.parameters import load_rig
     from sealscope.parameters.new_rig import piston_areas, rig_text, valve_rig_text
@@ -59,20 +59,22 @@ def new(
         if value is not None and kind != needed:
             raise InputError(f"{option} must stand with --kind {needed}, got --kind {kind}")
     if bore is not None:
-        diameters = _si(bore, "m", _MM, "--bore"), _si(rod or "0", "m", _MM, "--rod")
-        areas = piston_areas(*diameters, both=double_rod)
+        diameters = _parse_size(bore, "m", _MM, "--bore"), _parse_size(rod or "0", "m", _MM, "--rod")
+        areas = piston_areas(*diameters, double_rod=double_rod)
     else:
         sides = (area_A, "Piston area on side A", "--area-A"), (area_B, "... on side B", "--area-B")
-        areas = tuple(_si(text or _ask_size(what, _MM2), "m^2", _MM2, option) for text, what, option in sides)  # type: ignore[assignment]
-    length = _si(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
+        areas = tuple(  # type: ignore[assignment]
+            _parse_size(text or _ask_size(label, _MM2), "m^2", _MM2, option) for text, label, option in sides
+        )
+    length = _parse_size(stroke or _ask_size("Stroke", _MM), "m", _MM, "--stroke")
     if kind == "pump":
         volume = displacement or _ask_size("Displacement of the pump", _CM3)
-        text = rig_text(name, *areas, length, _si(volume, "m^3/rev", _CM3, "--displacement"))
+        text = rig_text(name, *areas, length, _parse_size(volume, "m^3/rev", _CM3, "--displacement"))
     else:
-        flow = _si(valve or _ask_size("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
-        pressures = (None if pressure is None else _si(pressure, "Pa", "bar", option) for pressure, option in (
-            (drop, "--drop"), (supply, "--supply")))  # fmt: skip
-        text = valve_rig_text(name, *areas, length, flow, *pressures)
+        flow = _parse_size(valve or _ask_size("Rated flow of the valve", "L/min"), "m^3/s", "L/min", "--valve")
+        edge_drop = None if drop is None else _parse_size(drop, "Pa", "bar", "--drop")
+        supply_pressure = None if supply is None else _parse_size(supply, "Pa", "bar", "--supply")
+        text = valve_rig_text(name, *areas, length, flow, edge_drop, supply_pressure)
     path = output or Path(f"{name}.toml")
     if path.suffix != ".toml":
         raise InputError(f"a rig's file must end in .toml, got {path}")
@@ -84,24 +86,24 @@ def new(
     echo(f"replace what is assumed (grep 'assumed:' {path}), then:\nsealscope simulate --rig {path} -o run.nc")
 
 
-def _ask_size(what: str, unit: str) -> str:
+def _ask_size(label: str, unit: str) -> str:
     """Ask for a size at the terminal."""
-    return str(prompt(f"{what} [{unit}]"))
+    return str(prompt(f"{label} [{unit}]"))
 
 
-def _si(text: str, si_unit: str, usual: str, option: str) -> float:
-    """Parse an option's quantity, without a unit in the `usual` one."""
+def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
+    """Parse the quantity of an option to `si_unit`; a number without a unit is in `default_unit`."""
     from sealscope.units import parse_quantity
 
-    with suppress(ValueError):
-        text = f"{float(text)}[{usual}]"
+    with suppress(ValueError):  # a text with a unit is no number
+        text = f"{float(text)}[{default_unit}]"
     return parse_quantity(text, si_unit, name=option)
 
 
 @rigs.command("margins")
 def print_margins(
     rig: RigArgument = "thesis-closed-loop",
-    controller: Annotated[str, declared("controller")] = "pi",
+    controller: Annotated[str, declared_option("controller")] = "pi",
     load: Annotated[str, Option(help="Force against +x beside the rig's own [N].")] = "0",
 ) -> None:
     """Print gain, phase and delay margin of a position loop, at standstill and at three speeds of the piston."""
@@ -116,7 +118,9 @@ def print_margins(
     echo(f"{loaded.name}, {controller}, {control.rate:g} Hz, late by {control.delay} samples, load {force:g} N")
     echo("speed [m/s]  gain [dB]  phase [deg]  crossover [Hz]  delay [ms]  peak 1/|1+L|")
     for speed in (0.0, 0.01, 0.02, 0.05):
-        m = margins(loaded, control, speed, force)
-        gain = "inf" if math.isinf(m.gain) else f"{20 * math.log10(m.gain):.1f}"
-        figures = f"{math.degrees(m.phase):11.0f}  {m.crossover:14.2f}  {1e3 * m.delay:10.1f}  {m.peak:12.2f}"
-        echo(f"{speed:11g}  {gain:>9}  {figures}" + ("" if m.damped else "\n  the rig alone is not damped here"))
+        loop = margins(loaded, control, speed, force)
+        gain = "inf" if math.isinf(loop.gain) else f"{20 * math.log10(loop.gain):.1f}"
+        figures = (
+            f"{math.degrees(loop.phase):11.0f}  {loop.crossover:14.2f}  {1e3 * loop.delay:10.1f}  {loop.peak:12.2f}"
+        )
+        echo(f"{speed:11g}  {gain:>9}  {figures}" + ("" if loop.damped else "\n  the rig alone is not damped here"))

@@ -1,4 +1,4 @@
-"""The commands that simulate: simulate, parameters, demo."""
+"""The commands `simulate`, `parameters` and `demo`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FMU = "Record this unit (.fmu, a program that runs with your rights) instead of
 _MAP = "The unit's own name of a channel or an input; repeat."
 
 
-@opt.simulating
+@opt.with_experiment_options
 def simulate(
     output: Annotated[Path, Option("--output", "-o", help="Recording to write (.nc, .h5, .csv, .parquet).")],
     experiment: Experiment,
@@ -32,7 +32,7 @@ def simulate(
     fmu: Annotated[Path | None, Option(help=_FMU)] = None,
     maps: Annotated[list[str] | None, Option("--map", metavar="CHANNEL=NAME", help=_MAP)] = None,
 ) -> None:
-    """Simulate the rig, or run somebody else's unit, and record it as the rig's instruments would."""
+    """Simulate the rig, or run an FMU, and record it with the rig's instruments."""
     from sealscope.recordings import write
     from sealscope.recordings.files import check_target
     from sealscope.simulation.simulate import simulate_experiment, write_truth
@@ -50,24 +50,26 @@ def simulate(
     with opt.progress() as report:
         if fmu is None:
             run = simulate_experiment(experiment, report, prove=prove)
-            recording, (by, *lines) = run.recording, run.lines()
+            recording, (source, *lines) = run.recording, run.lines()
         else:
             from sealscope.fmu.recording import record_fmu
 
-            recording = record_fmu(fmu, experiment, map=dict(map(_pair, maps or ())), progress=report)
-            by, lines = fmu.name, []
+            recording = record_fmu(fmu, experiment, map=dict(map(_parse_map, maps or ())), progress=report)
+            source, lines = fmu.name, []
     write(recording, output)
     if fmu is None and truth is not None:
         write_truth(run.truth, truth)
     if fmu is None and run.proof is not None:
         echo(run.proof.text())
-    for line in (f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({by})", *lines):
+    summary = f"{output}: {len(recording)} samples at {recording.rate:g} Hz, {experiment.command} ({source})"
+    for line in (summary, *lines):
         opt.say_wrapped(line)
 
 
-def _pair(text: str) -> tuple[str, str]:
-    channel, sign, name = text.partition("=")
-    if not (channel and sign and name):
+def _parse_map(text: str) -> tuple[str, str]:
+    """Parse an option `--map CHANNEL=NAME`."""
+    channel, delimiter, name = text.partition("=")
+    if not (channel and delimiter and name):
         raise InputError(f"--map must be CHANNEL=NAME, got {text}")
     return channel.strip(), name.strip()
 
@@ -80,7 +82,7 @@ def parameters(
     """List a rig's parameters: symbol, name, value, unit and source."""
     from sealscope.storage.csv_file import guard_cell
 
-    loaded = opt.rig_with(rig, overrides)
+    loaded = opt.load_rig_with(rig, overrides)
     columns = ("symbol", "name", "meaning", "value", "unit", "source")
     rows = [{column: getattr(row, column) for column in columns} for row in loaded.table()]
     if form == "json":
@@ -91,14 +93,15 @@ def parameters(
         writer.writerows({name: guard_cell(value) for name, value in row.items()} for row in rows)
     else:
         width = min(get_terminal_size((80, 24)).columns, 120)
-        wide = max(len(row["name"]) for row in rows) + 2
+        name_width = max(len(row["name"]) for row in rows) + 2
         lines = [paragraph(f"{loaded.name}: {loaded.title}", width=width), ""]
         for row in rows:
             value = f"{row['value']:.6g}" if isinstance(row["value"], float) else str(row["value"])
-            line = f"{row['name']:<{wide}}{value} {row['unit'] if row['unit'] != '1' else ''}".rstrip()
-            whole = f"{line}  {row['meaning']}"
-            texts = [row["source"]] if len(whole) <= width else [row["meaning"], row["source"]]
-            lines.append(whole if len(whole) <= width else line)
+            line = f"{row['name']:<{name_width}}{value} {row['unit'] if row['unit'] != '1' else ''}".rstrip()
+            with_meaning = f"{line}  {row['meaning']}"
+            has_room = len(with_meaning) <= width
+            texts = [row["source"]] if has_room else [row["meaning"], row["source"]]
+            lines.append(with_meaning if has_room else line)
             lines += [paragraph(text, "    ", width=width) for text in texts if text]
         opt.say("\n".join(lines))
 
@@ -112,7 +115,7 @@ def demo(
 ) -> None:
     """Commission a simulated machine on five healthy recordings, then judge a healthy and a leaking one.
 
-    With -v what was learnt, and every method's verdict.
+    With -v it prints what was learnt, and the verdicts of all methods.
     """
     from sealscope.demo import run_demo
     from sealscope.reporting.messages import diagnosis_text, short_text
@@ -121,11 +124,11 @@ def demo(
     make_folder(folder)
     with opt.progress() as report_progress:
         result = run_demo(folder, seed, report_progress)
-    whole = opt.verbose(context)
+    shows_all = opt.is_verbose(context)
     echo(f"{result.machine_file}: learnt from {len(result.machine.healthy)} healthy recordings")
-    echo(str(result.machine) if whole else f"  smallest leak it will show: {result.machine.summary.smallest}")
+    echo(str(result.machine) if shows_all else f"  smallest leak it will show: {result.machine.summary.smallest}")
     for diagnosis in (result.healthy, result.diagnosis):
-        text = diagnosis_text(diagnosis) if whole else short_text(diagnosis)
-        echo(text if whole or diagnosis.verdict == "leak" else "\n".join(text.splitlines()[:2]))
+        text = diagnosis_text(diagnosis) if shows_all else short_text(diagnosis)
+        echo(text if shows_all or diagnosis.verdict == "leak" else "\n".join(text.splitlines()[:2]))
     echo(f"truth:     {result.truth.mean_leak_lpm:.4f} L/min from {result.truth.onset_s:.1f} s")
     echo(f"recording: {result.recording}\npage:      {result.page}")

@@ -1,4 +1,4 @@
-"""The interface of a controller: started with a run, it turns each sample of its measurements into a voltage."""
+"""The interface of a controller: at each of its samples it computes a voltage from its measurements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sealscope.compiled import layout_of, record_at
+from sealscope.compiled import record_dtype, record_view
 from sealscope.recordings.recording import Array
 
 
@@ -29,17 +29,16 @@ class Measured(NamedTuple):
     theta: float = 0.0
 
 
-#: What is measured, at the pointer by which a compiled law is given it.
-measured_at = record_at(layout_of(*Measured._fields))
+#: The compiled function that reads a `Measured` at an address, the argument of a compiled law.
+measured_at = record_view(record_dtype(*Measured._fields))
 
 
 class CompiledLaw(NamedTuple):
     """A controller's law in machine code, for one run from its beginning.
 
-    `address` of a function ``double law(double *memory, double *measured)`` that returns the voltage [V] (numba.cfunc
-    gives one, as C does); `memory` (n,): its state and its numbers. The first of them is the compensated leakage flow
-    [m^3/s], NaN for a controller without one. `measured` holds the numbers of `Measured` in their order. `kept`: an
-    object that must live as long as the law.
+    `address`: that of a function ``double law(double *memory, double *measured)``, from numba.cfunc or C, that returns
+    the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and its parameters, the first of which is
+    the compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law.
     """
 
     address: int
@@ -48,23 +47,23 @@ class CompiledLaw(NamedTuple):
 
 
 class Started:
-    """A compiled law as a Python function from a `Measured` to the voltage [V]."""
+    """A compiled law as a Python function that returns the voltage [V] for a `Measured`."""
 
     def __init__(self, law: CompiledLaw) -> None:
         self._law, self._measured = law, np.empty(len(Measured._fields))
         self._call = LAW(law.address)
-        self._blocks = law.memory.ctypes.data, self._measured.ctypes.data
+        self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
         """Compute the voltage [V] of the next sample."""
         self._measured[:] = measured
-        volts = float(self._call(*self._blocks))
-        raise_within(self._law)
+        volts = float(self._call(*self._addresses))
+        reraise_python_error(self._law)
         return volts
 
     @property
     def compensated(self) -> float:
-        """Leakage flow that is made good [m^3/s]; AttributeError where none is."""
+        """The compensated leakage flow [m^3/s]; AttributeError if the controller reports none."""
         flow = float(self._law.memory[0])
         if math.isnan(flow):
             raise AttributeError("compensated")
@@ -75,18 +74,20 @@ class Started:
 LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
-class _Called:
-    """A controller written in Python, as a law that is called by its address."""
+class _PythonLaw:
+    """A controller written in Python, with an address at which compiled code calls it."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
+        """Make a function in C that calls `voltage`, and the law that states its address."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
-        self._function = LAW(self._volts)
+        self._function = LAW(self._call_voltage)
         address = ctypes.cast(self._function, ctypes.c_void_p).value
         assert address is not None
         self.law = CompiledLaw(address, self._memory, self)
 
-    def _volts(self, _memory: int, measured: int) -> float:
+    def _call_voltage(self, _memory: int, measured: int) -> float:
+        """Compute the voltage for the measurements at an address; on an exception store it in `raised`, return NaN."""
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
             volts = float(self._voltage(Measured(*numbers)))
@@ -98,34 +99,34 @@ class _Called:
         return volts
 
 
-def law_of(controller: Controller) -> CompiledLaw:
-    """Start a controller for one run: return its law in machine code, or in Python behind an address."""
+def start_law(controller: Controller) -> CompiledLaw:
+    """Start a controller for one run; return its law, in machine code if it has one, else in Python."""
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
-    return _Called(controller.start()).law if law is None else law
+    return _PythonLaw(controller.start()).law if law is None else law
 
 
-def raise_within(law: CompiledLaw) -> None:
-    """Raise the exception that a controller in Python raised within this law."""
-    kept: Any = law
-    while isinstance(kept, CompiledLaw):
-        kept = kept.kept
-    if isinstance(kept, _Called) and kept.raised is not None:
-        raise kept.raised
+def reraise_python_error(law: CompiledLaw) -> None:
+    """Raise the exception that a controller in Python raised when compiled code last called this law, if any."""
+    innermost: Any = law
+    while isinstance(innermost, CompiledLaw):  # a law that calls another keeps it
+        innermost = innermost.kept
+    if isinstance(innermost, _PythonLaw) and innermost.raised is not None:
+        raise innermost.raised
 
 
 class Controller(Protocol):
     """A sampled controller of the piston's position.
 
-    `rate` [Hz]: a whole multiple of, or a whole fraction of, the rig's sampling rate; `delay`: whole samples from a
-    measurement to the voltage that it leads to. A run calls `start` and then the function that it returns once a
-    sample; what that function remembers belongs to the run alone, so that a run can be begun anew. The voltage is held
-    until the next, and held within the converter's range by the rig. A frozen dataclass tells runs apart by its fields.
+    `rate` [Hz]: a whole multiple or a whole fraction of the rig's sampling rate; `delay`: whole samples from a
+    measurement to its voltage. A run calls `start`, and the function that it returns once a sample; all state is in
+    that function, so that a run can be repeated. The voltage is constant between samples, and limited to the
+    converter's range. Make the controller a frozen dataclass: its fields identify the run.
 
-    Where the function has an attribute `compensated`, the leakage flow [m^3/s] that it makes good at its last sample,
-    the recording has it as the channel `q_comp`, so that control does not hide the wear.
+    If the function has an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample, the
+    recording has it as channel `q_comp`: otherwise control would hide the wear.
 
-    A controller may also have a method `compiled` that returns a `CompiledLaw`: then a run calls no Python, and takes a
-    fraction of the time. `start` is ``return Started(self.compiled())`` then.
+    A controller may also have a method `compiled` that returns a `CompiledLaw`. Then a run calls no Python, and takes a
+    fraction of the time; `start` is ``return Started(self.compiled())``.
 
     Examples
     --------
@@ -146,12 +147,12 @@ class Controller(Protocol):
 
     @property
     def rate(self) -> float:
-        """Samples of the controller a second [Hz]."""
+        """Sampling rate of the controller [Hz]."""
         ...
 
     @property
     def delay(self) -> int:
-        """Whole samples from a measurement to its voltage."""
+        """Samples from a measurement to its voltage."""
         ...
 
     def start(self) -> Callable[[Measured], float]:

@@ -1,4 +1,4 @@
-"""Models of a drive in controllers: the voltage for a flow, by the inverse of a pump's speed loop or of a valve."""
+"""A controller's model of the drive: the voltage for a flow, by inverting a pump's speed loop or a servo valve."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import kernel, law, layout_of, record_of
+from sealscope.compiled import kernel, law, make_record, record_dtype
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 
@@ -18,44 +18,48 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Least share of the supply that a controller assumes across a valve: beyond, a load is more than it can move.
-_LEAST_ACROSS = 0.1
-#: How many times its growth a small voltage is moved to where an overlap ends.
-_ACROSS_OVERLAP = 4.0
-#: Numbers of the inverse of a drive, and what it remembers: those of `Drive`, or of `ValveDrive`, whose Q_N is > 0.
-DRIVE = layout_of(
-    *("displacement", "omega_per_volt", "shortfall", "fading", "droop", "high_passed", "needed_before"),
-    *("Q_N", "dp_N", "u_N", "p_s", "dead"),
+#: Smallest pressure drop of a valve that a controller assumes, over the supply's: a higher load cannot be moved.
+_MIN_VALVE_FRACTION = 0.1
+#: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
+_OVERLAP_GAIN = 4.0
+#: Parameters and state of a drive's inverse: those of `Drive`, or of `ValveDrive`, which is the one with Q_N > 0.
+DRIVE = record_dtype(
+    *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),
+    *("Q_N", "dp_N", "u_N", "p_s", "dead_volts"),
 )
 
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
-    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against p_A - p_B [Pa], sample by sample.
+    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against `dp` = p_A - p_B [Pa], sample by sample.
 
-    `m`: a record `DRIVE`.
+    By the equation of `ValveDrive`, or of `Drive`, in which s/(s + corner) is a high-pass filter of the speed. `m`: a
+    record `DRIVE`, whose filter is advanced by one sample.
     """
-    if m.Q_N > 0.0:
-        across = max(m.p_s - math.copysign(dp, dp * flow), _LEAST_ACROSS * m.p_s)
-        u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * across / m.dp_N))
-        return u + min(max(_ACROSS_OVERLAP * u, -m.dead), m.dead)  # type: ignore[no-any-return]
+    if m.Q_N > 0.0:  # a servo valve
+        valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
+        u = m.u_N * flow / (m.Q_N * math.sqrt(0.5 * valve_drop / m.dp_N))
+        return u + min(max(_OVERLAP_GAIN * u, -m.dead_volts), m.dead_volts)  # type: ignore[no-any-return]
     omega = flow / m.displacement
-    needed = omega + m.droop * dp
-    m.high_passed = m.fading * (m.high_passed + needed - m.needed_before)
-    m.needed_before = needed
+    speed = omega + m.droop * dp
+    m.high_passed = m.decay * (m.high_passed + speed - m.previous_speed)
+    m.previous_speed = speed
     return (omega + m.shortfall * m.high_passed) / m.omega_per_volt  # type: ignore[no-any-return]
 
 
 @kernel
-def write_lag(values: np.ndarray, fading: float, first: float, out: np.ndarray) -> None:
-    """Write the first-order lag of values (n,) into `out` (n,); `fading` of the difference remains after a sample."""
+def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
+    """Filter values (n,) by a first-order lag into `out` (n,), from `state` on; `decay`: factor within a sample."""
     for sample in range(values.size):
-        out[sample] = first
-        first = values[sample] + fading * (first - values[sample])
+        out[sample] = state
+        state = values[sample] + decay * (state - values[sample])
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Raise InputError for a number of `source` that is not finite, not > 0, or not >= 0; `what` is its owner."""
+    """Check that attributes of an object are finite numbers > 0 (`positive`) or >= 0 (`not_negative`).
+
+    Raises InputError otherwise, which calls the object `what`.
+    """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
@@ -66,13 +70,13 @@ class _Invertible(ABC):
     """A model of a drive whose flow can be inverted to a voltage."""
 
     @abstractmethod
-    def numbers(self, rate: float, dead: float = 0.0) -> Any:
-        """Compute the numbers (1,) of the inverse, called at `rate` [Hz], as `drive_voltage` takes them."""
+    def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
+        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` [V]: overlap of a valve."""
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build the inverse, called at `rate` [Hz]: the voltage [V] for a flow [m^3/s] and p_A - p_B [Pa]."""
-        (numbers,) = self.numbers(rate)
-        return lambda flow, dp: float(drive_voltage(numbers, flow, dp))
+        """Build the function, called at `rate` [Hz], for the voltage [V] of a flow [m^3/s] against p_A - p_B [Pa]."""
+        (coefficients,) = self.coefficients(rate)
+        return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 
 
 @dataclass(frozen=True)
@@ -97,57 +101,58 @@ class Drive(_Invertible):
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's pump and drive; raise InputError for a valve-controlled rig."""
-        if rig.valve.spool == "present":
+        if not rig.circuit.pump_feeds_chambers:
             raise InputError(
                 f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValveDrive is "
                 "for a servo valve"
             )
-        motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)
+        motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)  # for the class's equation
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
         return cls(displacement, motor.omega_per_volt, shortfall, corner, droop)
 
     @property
     def lag(self) -> float:
-        """Time [s] in which the speed loop takes up what it is short of: infinite without an integral."""
+        """Time constant [s] with which the speed loop removes its shortfall; infinite without an integral."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
     def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
-        """Compute the flow (n,) [m^3/s] of voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
+        """Compute the drive's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
-        The drive's law above, solved for omega: with y, omega_d + droop dp after a `lag`, omega = (omega_d + shortfall
-        (y - droop dp))/(1 + shortfall). It starts from standstill, where it carries the first dp; or so that y is the
-        same after the first `settling` samples as before them.
+        The class's equation solved for omega: omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), where y is
+        omega_d + droop dp after a first-order lag (`lag`). y starts at standstill under the first dp; with `settling`,
+        at the value that it has again after that many samples (a periodic command).
         """
-        commanded, lift = self.omega_per_volt * u, self.droop * dp
-        commanded_and_lift, late = commanded + lift, np.empty_like(commanded)
-        decay, first = -1.0 / (self.lag * rate), float(lift[0])
-        if settling and decay < 0.0:
-            write_lag(commanded_and_lift[: settling + 1], math.exp(decay), 0.0, late[: settling + 1])
-            first = float(late[settling]) / -math.expm1(settling * decay)
-        write_lag(commanded_and_lift, math.exp(decay), first, late)
-        return np.asarray(self.displacement * (commanded + self.shortfall * (late - lift)) / (1.0 + self.shortfall))
+        omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
+        lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
+        exponent, y_0 = -1.0 / (self.lag * rate), float(droop_speed[0])
+        if settling and exponent < 0.0:  # from 0 the lag reaches y_0 less the part of y_0 that has decayed
+            filter_lag(lag_input[: settling + 1], math.exp(exponent), 0.0, y[: settling + 1])
+            y_0 = float(y[settling]) / -math.expm1(settling * exponent)
+        filter_lag(lag_input, math.exp(exponent), y_0, y)
+        omega = (omega_d + self.shortfall * (y - droop_speed)) / (1.0 + self.shortfall)
+        return np.asarray(self.displacement * omega)
 
-    def numbers(self, rate: float, dead: float = 0.0) -> Any:
-        """Compute the numbers (1,) of the inverse, called at `rate` [Hz]; `dead` is of valves alone."""
-        return record_of(DRIVE, self, fading=math.exp(-self.corner / rate))
+    def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
+        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` is for valves only."""
+        return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
-    def steady(self, flow: float) -> float:
-        """Compute the voltage [V] of a flow [m^3/s] that lasts, of a drive that reaches its commanded speed."""
+    def steady_voltage(self, flow: float) -> float:
+        """Compute the voltage [V] of a constant flow [m^3/s], once the drive has reached its commanded speed."""
         return flow / self.displacement / self.omega_per_volt
 
-    def largest(self, u_max: float) -> float:
-        """Compute the flow [m^3/s] at the voltage `u_max` [V]."""
-        return u_max * self.omega_per_volt * self.displacement
+    def unloaded_flow(self, u: float) -> float:
+        """Compute the flow [m^3/s] at a constant voltage `u` [V], without a load."""
+        return u * self.omega_per_volt * self.displacement
 
 
 @dataclass(frozen=True)
 class ValveDrive(_Invertible):
     """A controller's model of a servo valve and its supply.
 
-    Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)) of a valve with equal edges, half of the pressure lost at each of
-    the two that are open (Merritt, Hydraulic Control Systems, 1967, section 5.2); its spool is taken to be where the
-    command wants it. `Q_N` [m^3/s] at `dp_N` [Pa] an edge and `u_N` [V]; `p_s` [Pa]: supply less return.
+    Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)): each of the two open edges takes half of the pressure (equal edges;
+    Merritt, Hydraulic Control Systems, 1967, section 5.2), and the spool follows the command without delay. `Q_N`
+    [m^3/s]: flow at `dp_N` [Pa] an edge and `u_N` [V]; `p_s` [Pa]: pressure of the supply above the return.
     """
 
     Q_N: float
@@ -162,27 +167,24 @@ class ValveDrive(_Invertible):
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's servo valve; raise InputError for a pump-controlled rig."""
         valve, supply = rig.valve, rig.supply
-        if valve.spool == "absent":
+        if not rig.circuit.valve_controlled:
             raise InputError(f"a valve's drive must have a servo valve (valve.spool = present), got rig {rig.name}")
-        pumped = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P
-        return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pumped / supply.G_set)
+        pump_flow = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P  # all of it through the relief valve
+        return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 
-    def numbers(self, rate: float, dead: float = 0.0) -> Any:
-        """Return the numbers (1,) of the inverse as `drive_voltage` takes them.
+    def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
+        """Make the record (1,) `DRIVE`; voltages in the overlap `dead_volts` [V] give no flow and are raised."""
+        return make_record(DRIVE, self, dead_volts=dead_volts)
 
-        Within `dead` [V], the overlap of the edges, nothing flows: a small voltage is moved beyond it.
-        """
-        return record_of(DRIVE, self, dead=dead)
-
-    def steady(self, flow: float) -> float:
-        """Compute the voltage [V] of a flow [m^3/s] without a load."""
+    def steady_voltage(self, flow: float) -> float:
+        """Compute the voltage [V] of a constant flow [m^3/s] without load."""
         return self.inverse(1.0)(flow, 0.0)
 
-    def largest(self, u_max: float) -> float:
-        """Compute the flow [m^3/s] at the voltage `u_max` [V], without a load."""
-        return u_max / self.steady(1.0)
+    def unloaded_flow(self, u: float) -> float:
+        """Compute the flow [m^3/s] at a constant voltage `u` [V], without a load."""
+        return u / self.steady_voltage(1.0)
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:
     """Build the model of a rig's pump and drive, or of its servo valve."""
-    return Drive.from_rig(rig) if rig.valve.spool == "absent" else ValveDrive.from_rig(rig)
+    return Drive.from_rig(rig) if rig.circuit.pump_feeds_chambers else ValveDrive.from_rig(rig)

@@ -1,4 +1,4 @@
-"""Control that tolerates a leak: the flow across the piston is estimated, and the pump delivers it in addition."""
+"""Fault-tolerant control: the leakage across the piston is estimated, and the pump delivers it in addition."""
 
 from __future__ import annotations
 
@@ -9,74 +9,79 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import address_of, call_at, entry, layout_of, record_at, record_of
-from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, law_of, measured_at
+from sealscope.compiled import address_of, call_at, entry, make_record, record_dtype, record_view
+from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, measured_at, start_law
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
-from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, observer_of, update_observer
+from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, make_observer, update_observer
 from sealscope.control.position import PositionPI
 from sealscope.errors import InputError
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time [s] over which the pressures that the leak flows under are averaged.
+#: Time constant [s] of the average of the pressures that drive the leak.
 _PRESSURE_LAG = 0.005
-#: Time [s] over which a change of the estimate enters the control law, so that the integral can make room.
+#: Time constant [s] with which a change of the estimate enters the control law, slow enough for the integral to follow.
 _BLEND = 0.5
-#: A leak is compensated from so many deviations of its estimate on, and no longer below half of them.
-_SIGNIFICANT = 4.0
-#: ... and from a flow on that moves the piston by so many counts of its encoder a second: less is below what it sees.
-_COUNTS = 0.5
-#: Blocks that the observer must have used.
-_FEWEST = 4
-#: What the law remembers, and its numbers; law and memory of the inner one as addresses.
-_MEMORY = layout_of(
-    *("compensated", "inner", "its_memory", "u_max", "G_assumed", "known", "averaged", "blended"),
-    *("mean_A", "mean_B", "G", "stands_out"),
+#: A leak is compensated once its estimate exceeds this many standard errors, until it is below half of that.
+_SIGNIFICANT_SDS = 4.0
+#: It must also move the piston by this many encoder counts a second: less cannot be measured.
+_RESOLVED_COUNTS = 0.5
+#: Blocks that the observer must have used first.
+_MIN_BLOCKS = 4
+#: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
+_NEGLIGIBLE_G = 1e-18
+#: State and parameters of the law; law and memory of the inner controller as addresses.
+_MEMORY = record_dtype(
+    *("compensated", "inner", "inner_memory", "u_max", "G_assumed", "is_known", "pressure_gain", "blend_gain"),
+    *("mean_A", "mean_B", "G", "is_significant"),
     drive=DRIVE,
     observer=OBSERVER,
 )
-_memory_at = record_at(_MEMORY)
+_memory_at = record_view(_MEMORY)
 
 
 @entry
 def _tolerant_law(memory: Any, sample: Any) -> Any:
+    """Compute the voltage [V] of a sample: that of the inner controller, and that for the estimated leakage flow."""
     m, measured = _memory_at(memory), measured_at(sample)
-    u = call_at(int(m.inner), int(m.its_memory), address_of(sample))
+    u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
     if math.isnan(m.mean_A):
         m.mean_A, m.mean_B = measured.p_A, measured.p_B
-    m.mean_A += m.averaged * (measured.p_A - m.mean_A)
-    m.mean_B += m.averaged * (measured.p_B - m.mean_B)
-    over = m.mean_A - m.mean_B
-    if m.known == 0.0:
-        o = m.observer
-        update_observer(o, measured.theta, measured.x, measured.p_A, measured.p_B)
-        G, sd, blocks = conductance(o)
-        above = G - m.G_assumed
+    m.mean_A += m.pressure_gain * (measured.p_A - m.mean_A)
+    m.mean_B += m.pressure_gain * (measured.p_B - m.mean_B)
+    mean_dp = m.mean_A - m.mean_B
+    if m.is_known == 0.0:
+        observer = m.observer
+        update_observer(observer, measured.theta, measured.x, measured.p_A, measured.p_B)
+        G, sd, n_blocks = conductance(observer)
+        excess_G = G - m.G_assumed
         target_G = 0.0
-        if blocks >= _FEWEST:
-            unseen = _COUNTS * o.x_step * min(o.area_A, o.area_B) / max(abs(over), 1.0)
-            needed = (0.5 if m.stands_out > 0.0 else 1.0) * max(_SIGNIFICANT * sd, unseen)
-            m.stands_out = 1.0 if above > needed else 0.0
-            target_G = above if above > needed else 0.0
-        m.G += m.blended * (target_G - m.G)
-        if m.stands_out == 0.0 and m.G < 1e-18:
+        if n_blocks >= _MIN_BLOCKS:
+            unresolved_flow = _RESOLVED_COUNTS * observer.x_step * min(observer.area_A, observer.area_B)
+            unresolved_G = unresolved_flow / max(abs(mean_dp), 1.0)
+            # half the threshold for a leak that is compensated already
+            threshold_G = (0.5 if m.is_significant > 0.0 else 1.0) * max(_SIGNIFICANT_SDS * sd, unresolved_G)
+            m.is_significant = 1.0 if excess_G > threshold_G else 0.0
+            target_G = excess_G if excess_G > threshold_G else 0.0
+        m.G += m.blend_gain * (target_G - m.G)
+        if m.is_significant == 0.0 and m.G < _NEGLIGIBLE_G:
             m.G = 0.0
     if m.G == 0.0:
         m.compensated = 0.0
         return u
-    m.compensated = m.G * over
+    m.compensated = m.G * mean_dp
     return min(max(u + drive_voltage(m.drive, m.compensated, 0.0), -m.u_max), m.u_max)
 
 
 @dataclass(frozen=True)
 class FaultTolerant:
-    """A controller that makes good the leakage across the piston: u = u_inner + inverse of (G dp).
+    """A controller that compensates the leakage across the piston: u = u_inner + inverse of the drive for G dp.
 
-    `inner` is any controller; G [m^3/(s Pa)] comes from a Kalman filter (`update_observer`) on the controller's own
-    signals, less the pump's `G_assumed`. It is 0 until it exceeds its own deviation and a count of the encoder: without
-    a leak the voltages are those of `inner`, to the last bit. `known` [m^3/(s Pa)], not negative, takes its place (an
-    ideal controller that knows the leak). The compensated flow is reported as `compensated` [m^3/s].
+    `inner` is any controller; G [m^3/(s Pa)] is estimated by a Kalman filter (`update_observer`) from the controller's
+    signals, less the pump's `G_assumed`. G is 0 until it is significant and measurable: without a leak the voltages are
+    exactly those of `inner`. `known` >= 0 [m^3/(s Pa)] replaces the estimate (an ideal controller that knows the leak).
+    The compensated flow is reported as `compensated` [m^3/s].
     """
 
     inner: Controller
@@ -93,24 +98,25 @@ class FaultTolerant:
     @classmethod
     def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
         """Build the controller from a rig's parameters around `inner`, by default `PositionPI`."""
-        from sealscope.physics.cylinder import volumes_at_middle
+        from sealscope.physics.cylinder import mid_stroke_volumes
 
-        c, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
-        if rig.valve.spool == "present":
+        cylinder, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
+        if not rig.circuit.pump_is_measured:
             raise InputError(
                 "a fault-tolerant controller must have a pump whose angle it reads (valve.spool = absent), got rig "
                 f"{rig.name}"
             )
-        pilots = makeup.check_valves == "pilot-operated"
+        V_A, V_B = mid_stroke_volumes(cylinder)
         balance = Balance(
-            rig.pump.q_b / (2.0 * math.pi),
-            c.A_A,
-            c.A_B,
-            *volumes_at_middle(c),
-            rig.fluid.K_oil,
-            sensors.x.resolution,
-            math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
-            SHUT * (makeup.p_crack + makeup.p_open) if pilots else 0.0,
+            D=rig.pump.q_b / (2.0 * math.pi),
+            area_A=cylinder.A_A,
+            area_B=cylinder.A_B,
+            V_A=V_A,
+            V_B=V_B,
+            K=rig.fluid.K_oil,
+            x_step=sensors.x.resolution,
+            noise=math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
+            shut=SHUT * (makeup.p_crack + makeup.p_open) if makeup.check_valves == "pilot-operated" else 0.0,
         )
         return cls(
             inner or PositionPI.from_rig(rig), Drive.from_rig(rig), balance, rig.daq.u_max, rig.pump.G_pump, known
@@ -118,12 +124,12 @@ class FaultTolerant:
 
     @property
     def rate(self) -> float:
-        """Samples of the controller a second [Hz]."""
+        """Sampling rate of the controller [Hz]."""
         return self.inner.rate
 
     @property
     def delay(self) -> int:
-        """Whole samples from a measurement to its voltage."""
+        """Samples from a measurement to its voltage."""
         return self.inner.delay
 
     def start(self) -> Callable[[Measured], float]:
@@ -131,19 +137,19 @@ class FaultTolerant:
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Start a run: return the law in machine code, which calls the inner one."""
-        inner, rate = law_of(self.inner), self.rate
-        memory = record_of(
+        """Return the compiled law of a new run, which calls the law of the inner controller."""
+        inner, rate = start_law(self.inner), self.rate
+        memory = make_record(
             _MEMORY,
             self,
             inner=inner.address,  # below 2^53: exact as a double
-            its_memory=inner.memory.ctypes.data,
-            known=self.known is not None,
-            averaged=1.0 - math.exp(-1.0 / (rate * _PRESSURE_LAG)),
-            blended=1.0 - math.exp(-1.0 / (rate * _BLEND)),
+            inner_memory=inner.memory.ctypes.data,
+            is_known=self.known is not None,  # else the conductance is estimated
+            pressure_gain=1.0 - math.exp(-1.0 / (rate * _PRESSURE_LAG)),
+            blend_gain=1.0 - math.exp(-1.0 / (rate * _BLEND)),
             mean_A=math.nan,
-            G=self.known or 0.0,
-            drive=self.drive.numbers(rate),
-            observer=observer_of(self.balance, rate),
+            G=self.known or 0.0,  # an estimate starts at 0
+            drive=self.drive.coefficients(rate),
+            observer=make_observer(self.balance, rate),
         )
         return CompiledLaw(_tolerant_law.address, memory.view(np.float64), inner)

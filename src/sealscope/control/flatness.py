@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from sealscope.compiled import entry, layout_of, record_at, record_of
+from sealscope.compiled import entry, make_record, record_dtype, record_view
 from sealscope.control.controller import CompiledLaw, Measured, Started, measured_at
 from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
 from sealscope.control.position import FOLLOWING, PositionPI, following_voltage
@@ -17,34 +17,37 @@ from sealscope.control.position import FOLLOWING, PositionPI, following_voltage
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time [s] over which the load that the pressures carry is averaged.
+#: Time constant [s] of the average of the load.
 _LOAD_LAG = 0.1
-#: What the law remembers, and its numbers.
-_MEMORY = layout_of(
-    *("compensated", "v_max", "M", "F_C", "v_th", "F_v", "G", "C", "T", "averaged", "first", "v", "dp", "load"),
+#: Largest change of the target's speed within a sample, over `v_max`, that counts as an acceleration and not as a jump.
+_MAX_SPEED_CHANGE = 0.1
+#: State and parameters of the law.
+_MEMORY = record_dtype(
+    *("compensated", "v_max", "M", "F_C", "v_th", "F_v", "G", "C", "T", "load_gain", "is_first", "v", "dp", "load"),
     drive=DRIVE,
     feedback=FOLLOWING,
 )
-_memory_at = record_at(_MEMORY)
+_memory_at = record_view(_MEMORY)
 
 
 @entry
 def _flatness_law(memory: Any, sample: Any) -> Any:
+    """Compute the voltage [V] of a sample: that of the feedback, and the feed-forward of `Flatness`."""
     m, measured = _memory_at(memory), measured_at(sample)
-    f, first = m.feedback, m.first > 0.0
-    v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0
-    a = 0.0 if first else (v - m.v) / m.T
-    a = a if abs(a) * m.T < 0.1 * m.v_max else 0.0
+    feedback, is_first = m.feedback, m.is_first > 0.0
+    v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
+    a = 0.0 if is_first else (v - m.v) / m.T
+    a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0
     force = m.M * a + m.F_C * math.tanh(v / m.v_th) + m.F_v * v
-    pushed = f.area_A * measured.p_A - f.area_B * measured.p_B
-    m.load += (1.0 if first else m.averaged) * (pushed - force - m.load)
-    area = f.area_A if m.load >= 0.0 else f.area_B
+    pressure_force = feedback.area_A * measured.p_A - feedback.area_B * measured.p_B
+    m.load += (1.0 if is_first else m.load_gain) * (pressure_force - force - m.load)
+    area = feedback.area_A if m.load >= 0.0 else feedback.area_B
     dp = (force + m.load) / area
-    rate = 0.0 if first else (dp - m.dp) / m.T
-    flow = m.G * dp + m.C * rate
-    m.v, m.dp, m.first = v, dp, 0.0
-    u = following_voltage(f, measured) + drive_voltage(m.drive, flow, dp)
-    return min(max(u, -f.u_max), f.u_max)
+    dp_rate = 0.0 if is_first else (dp - m.dp) / m.T
+    flow = m.G * dp + m.C * dp_rate
+    m.v, m.dp, m.is_first = v, dp, 0.0
+    u = following_voltage(feedback, measured) + drive_voltage(m.drive, flow, dp)
+    return min(max(u, -feedback.u_max), feedback.u_max)
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,12 @@ class Flatness:
 
     The position is a flat output of the machine: with x = target, v and a its derivatives,
     F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + dp'/(1/C), u = the drive's inverse of (Q, dp).
-    `feedback` gives the part A v and the correction; this adds the leakage of the pump `G` [m^3/(s Pa)], the compliance
-    `C` = V/(2 K) [m^3/Pa], and the speed that the drive loses under the torque of dp. F_f(v) = (`F_C` + `F_v` |v|)
-    sign(v), smooth within `v_th` [m/s]; F_load is averaged from the pressures. All numbers are the controller's own
-    assumptions: `M` [kg], `F_C` [N], `F_v` [N s/m].
+    `feedback` gives A v and the correction of the error. The feed-forward adds the pump's leakage `G` [m^3/(s Pa)], the
+    compliance `C` = V/(2 K) [m^3/Pa] of the oil, and the speed that the drive loses under the torque of dp. F_f(v) =
+    (`F_C` + `F_v` |v|) sign(v), smooth within `v_th` [m/s]; F_load is an average from the pressures. `M` [kg], `F_C`
+    [N], `F_v` [N s/m] are what the controller assumes of the machine.
 
-    A jump of the target has no derivative: at a speed above `v_max` [m/s] nothing is fed forward.
+    A jump of the target has no derivative: a target's speed above `v_max` [m/s] is not fed forward.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
@@ -80,29 +83,31 @@ class Flatness:
     def from_rig(cls, rig: Rig) -> Self:
         """Build the controller from a rig's parameters."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
-        greatest = drive.largest(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
-        by_valve = rig.valve.spool == "present"
-        charge = 0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
+        max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
+        # mean pressure of a chamber at standstill: behind a valve halfway from supply to return
+        mean_pressure = (
+            0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
+        )
         return cls(
-            PositionPI.from_rig(rig),
-            drive,
-            cylinder.M_eq,
-            friction.F_pr + 2.0 * friction.F_cfr * charge,
-            friction.F_v,
-            friction.v_th,
-            0.0 if by_valve else rig.pump.G_pump,
-            cylinder.V / (2.0 * rig.fluid.K_oil),
-            greatest,
+            feedback=PositionPI.from_rig(rig),
+            drive=drive,
+            M=cylinder.M_eq,
+            F_C=friction.F_pr + 2.0 * friction.F_cfr * mean_pressure,
+            F_v=friction.F_v,
+            v_th=friction.v_th,
+            G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,
+            C=cylinder.V / (2.0 * rig.fluid.K_oil),
+            v_max=max_speed,
         )
 
     @property
     def rate(self) -> float:
-        """Samples of the controller a second [Hz]."""
+        """Sampling rate of the controller [Hz]."""
         return self.feedback.rate
 
     @property
     def delay(self) -> int:
-        """Whole samples from a measurement to its voltage."""
+        """Samples from a measurement to its voltage."""
         return self.feedback.delay
 
     def start(self) -> Callable[[Measured], float]:
@@ -110,16 +115,16 @@ class Flatness:
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Start a run: return the law in machine code."""
+        """Return the compiled law of a new run."""
         T = 1.0 / self.rate
-        memory = record_of(
+        memory = make_record(
             _MEMORY,
             self,
             compensated=math.nan,
             T=T,
-            averaged=1.0 - math.exp(-T / _LOAD_LAG),
-            first=1.0,
-            drive=self.drive.numbers(self.rate),
-            feedback=self.feedback.memory(),
+            load_gain=1.0 - math.exp(-T / _LOAD_LAG),
+            is_first=1.0,
+            drive=self.drive.coefficients(self.rate),
+            feedback=self.feedback.make_memory(),
         )
         return CompiledLaw(_flatness_law.address, memory.view(np.float64))

@@ -1,4 +1,4 @@
-"""The leakage between the chambers, estimated sample by sample from what a controller measures."""
+"""The leakage between the chambers, estimated on line from a controller's measurements by a Kalman filter."""
 
 from __future__ import annotations
 
@@ -8,29 +8,35 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.compiled import law, layout_of, record_of
+from sealscope.compiled import law, make_record, record_dtype
 
 #: Length of a block [s] over which volumes are balanced.
 BLOCK = 0.5
-#: Blocks are used where the mean difference of pressure is at least this [Pa].
-LEAST_DP = 20e3
-#: A pilot-operated valve is shut beyond so many times its pressures to open.
+#: Blocks with a smaller mean pressure difference [Pa] are not used.
+MIN_DP = 20e3
+#: A pilot-operated valve counts as shut from this multiple of its cracking and opening pressure on.
 SHUT = 2.0
-#: Prior deviations of the compliance and of the area, as shares, and of the conductance [m^3/(s Pa)].
+#: Prior standard deviations: relative for compliance and area; of the conductance [m^3/(s Pa)].
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
-#: Walks of the conductance, as a deviation a block: absolute [m^3/(s Pa)] and as a share of the estimate.
-_WALK, _WALK_SHARE = 1e-15, 0.03
-#: A block beyond so many deviations is left out; a second one in turn, on the same side, is a leak that opened at once.
-_SURPRISE = 4.0
-#: Time [s] over which all four signals are averaged alike.
+#: Standard deviations of the model's errors in a block, over the compressed and the swept volume.
+_COMPRESSION_ERROR, _SWEPT_ERROR = 0.02, 2e-4
+#: Variance of a pressure's average over that of a sample.
+_MEAN_NOISE = 0.1
+#: Standard deviation of the conductance's random walk a block: absolute [m^3/(s Pa)], and relative to the estimate.
+_WALK, _RELATIVE_WALK = 1e-15, 0.03
+#: A block with an innovation above this many standard deviations is left out as an outlier; a second one in succession
+#: with the same sign is a leak that opened suddenly.
+_OUTLIER_SDS = 4.0
+#: Time constant [s] of the average of all four signals.
 _LAG = 0.01
-#: What the observer assumes (`Balance`) and remembers. `begin`, `averaged`: angle, position and both pressures;
-#: `state`: conductance, errors of 1/K and of the area, with their covariance `P`.
-OBSERVER = layout_of(
-    *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "share"),
-    *("count", "sum_dp", "low", "high", "forward", "back", "surprised", "used"),
+#: Parameters (`Balance`) and state of the observer. `length` of a block in samples; `turned_forward`, `turned_back`:
+#: rotation within the block [rad]; `means`, `begin`: averages of angle, position and both pressures, now and at the
+#: block's begin; `state`: conductance, relative errors of 1/K and of the area, with their covariance `P`.
+OBSERVER = record_dtype(
+    *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "lag_gain"),
+    *("count", "sum_dp", "min_dp", "max_dp", "turned_forward", "turned_back", "outlier_G", "n_blocks"),
     begin=(4,),
-    averaged=(4,),
+    means=(4,),
     state=(3,),
     P=(3, 3),
 )
@@ -38,97 +44,100 @@ OBSERVER = layout_of(
 
 @law
 def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
-    """Take a sample into the observer `m` (`OBSERVER`): angle [rad], position [m], pressures [Pa].
+    """Update the observer `m` (`OBSERVER`) with a sample: angle [rad], position [m], pressures [Pa].
 
-    A Kalman filter of the conductance between the chambers, a block of `BLOCK` seconds at a time. Over a block, on the
-    side with the higher pressure (the other may be fed by its check valve):
-    D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with signs turned
-    for side B; dtheta_in is the pump's turn towards that side, with oil drawn at the other pressure. Besides G
-    the filter holds the errors of 1/K and of the area, as shares. Friction and load do not enter.
+    A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
+    seconds, on the side with the higher pressure (the other may be fed by its check valve):
+    D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with opposite signs
+    for side B; dtheta_in is the pump's rotation towards that side, which compresses oil from the other pressure. The
+    filter also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
-    sample, mean = (theta, x, p_A, p_B), m.averaged
+    sample, means = (theta, x, p_A, p_B), m.means
     if m.count == 0.0:
         for k in range(4):
-            mean[k] = m.begin[k] = sample[k]
-    before = mean[0]
+            means[k] = m.begin[k] = sample[k]
+    previous_angle = means[0]
     for k in range(4):
-        mean[k] = mean[k] + m.share * (sample[k] - mean[k])
-    dp, turned = mean[2] - mean[3], mean[0] - before
-    m.low, m.high = min(m.low, dp), max(m.high, dp)
+        means[k] = means[k] + m.lag_gain * (sample[k] - means[k])
+    dp, turned = means[2] - means[3], means[0] - previous_angle
+    m.min_dp, m.max_dp = min(m.min_dp, dp), max(m.max_dp, dp)
     m.sum_dp += dp
-    m.forward += max(turned, 0.0)
-    m.back += max(-turned, 0.0)
+    m.turned_forward += max(turned, 0.0)
+    m.turned_back += max(-turned, 0.0)
     m.count += 1.0
-    if m.count > m.length:
-        _close(m, m.sum_dp - 0.5 * dp)
-        m.count, m.sum_dp, m.low, m.high, m.forward, m.back = 1.0, 0.5 * dp, dp, dp, 0.0, 0.0
+    if m.count > m.length:  # a sample between two blocks counts half in either (trapezoidal rule)
+        _update_with_block(m, m.sum_dp - 0.5 * dp)
+        m.count, m.sum_dp, m.min_dp, m.max_dp, m.turned_forward, m.turned_back = 1.0, 0.5 * dp, dp, dp, 0.0, 0.0
         for k in range(4):
-            m.begin[k] = mean[k]
+            m.begin[k] = means[k]
 
 
 @law
-def _close(m: Any, total: float) -> None:
-    """Take a block into the filter; `total`: sum of p_A - p_B [Pa] over its samples."""
-    integral = total / m.rate
-    if abs(integral) < LEAST_DP * m.length / m.rate or m.low * m.high <= 0.0:
+def _update_with_block(m: Any, dp_sum: float) -> None:
+    """Update the Kalman filter with the block that ends now; `dp_sum`: sum of p_A - p_B [Pa] over its samples.
+
+    The block is left out if the pressure difference is small, changes its sign, or leaves a check valve open.
+    """
+    dp_integral = dp_sum / m.rate
+    if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
         return
-    if min(abs(m.low), abs(m.high)) < m.shut:
+    if min(abs(m.min_dp), abs(m.max_dp)) < m.shut:
         return
-    begin, end, state, P = m.begin, m.averaged, m.state, m.P
-    turned, travel = m.D * (end[0] - begin[0]), end[1] - begin[1]
-    middle = 0.5 * (end[1] + begin[1])
-    if integral > 0.0:
-        area_of, intake = m.area_A, m.forward
-        V, change = m.V_A + area_of * middle, end[2] - begin[2]
+    begin, end, state, P = m.begin, m.means, m.state, m.P
+    pumped, travel = m.D * (end[0] - begin[0]), end[1] - begin[1]
+    mid_position = 0.5 * (end[1] + begin[1])
+    if dp_integral > 0.0:
+        side_area, intake_angle = m.area_A, m.turned_forward
+        V, dp_side = m.V_A + side_area * mid_position, end[2] - begin[2]
     else:
-        area_of, intake = m.area_B, m.back
-        V, change = m.V_B - area_of * middle, begin[3] - end[3]
-    area = area_of * travel
-    pressed = (V * change + m.D * intake * integral * m.rate / m.length) / m.K
-    measured = turned - area - pressed
-    # a count of the encoder at both ends, the pressures' noise over the average, and what the laws leave out
-    noise = (area_of * m.x_step) ** 2 / 6.0 + 0.1 * (V / m.K * m.noise) ** 2
-    variance = noise + (0.02 * pressed) ** 2 + (2e-4 * area) ** 2
-    row = (integral, pressed, area)
-    innovation = measured - (row[0] * state[0] + row[1] * state[1] + row[2] * state[2])
-    walk = (_WALK + _WALK_SHARE * abs(state[0])) ** 2
-    spread = row[0] * row[0] * walk + variance
+        side_area, intake_angle = m.area_B, m.turned_back
+        V, dp_side = m.V_B - side_area * mid_position, begin[3] - end[3]
+    swept = side_area * travel
+    compressed = (V * dp_side + m.D * intake_angle * dp_integral * m.rate / m.length) / m.K
+    leaked = pumped - swept - compressed
+    # uniform error of one encoder count (1/12) at both ends, noise of the averaged pressures, errors of the model
+    noise = (side_area * m.x_step) ** 2 / 6.0 + _MEAN_NOISE * (V / m.K * m.noise) ** 2
+    variance = noise + (_COMPRESSION_ERROR * compressed) ** 2 + (_SWEPT_ERROR * swept) ** 2
+    row = (dp_integral, compressed, swept)  # leaked = row . state
+    innovation = leaked - (row[0] * state[0] + row[1] * state[1] + row[2] * state[2])
+    walk = (_WALK + _RELATIVE_WALK * abs(state[0])) ** 2
+    innovation_variance = row[0] * row[0] * walk + variance
     for i in range(3):
         for k in range(3):
-            spread += row[i] * P[i, k] * row[k]
-    if innovation**2 > _SURPRISE**2 * spread:
-        before = m.surprised
-        m.surprised = innovation / integral
-        if before * m.surprised <= 0.0:
+            innovation_variance += row[i] * P[i, k] * row[k]
+    if innovation**2 > _OUTLIER_SDS**2 * innovation_variance:
+        previous_outlier_G = m.outlier_G
+        m.outlier_G = innovation / dp_integral
+        if previous_outlier_G * m.outlier_G <= 0.0:
             return
-        more = m.surprised**2
-        walk, spread = walk + more, spread + row[0] * row[0] * more
+        jump_variance = m.outlier_G**2  # a leak that opened suddenly: G may have changed by as much
+        walk, innovation_variance = walk + jump_variance, innovation_variance + row[0] * row[0] * jump_variance
     else:
-        m.surprised = 0.0
+        m.outlier_G = 0.0
     P[0, 0] += walk
-    g_0 = (P[0, 0] * row[0] + P[0, 1] * row[1] + P[0, 2] * row[2]) / spread
-    g_1 = (P[1, 0] * row[0] + P[1, 1] * row[1] + P[1, 2] * row[2]) / spread
-    g_2 = (P[2, 0] * row[0] + P[2, 1] * row[1] + P[2, 2] * row[2]) / spread
-    gain = (g_0, g_1, g_2)
+    gain_0 = (P[0, 0] * row[0] + P[0, 1] * row[1] + P[0, 2] * row[2]) / innovation_variance
+    gain_1 = (P[1, 0] * row[0] + P[1, 1] * row[1] + P[1, 2] * row[2]) / innovation_variance
+    gain_2 = (P[2, 0] * row[0] + P[2, 1] * row[1] + P[2, 2] * row[2]) / innovation_variance
+    gain = (gain_0, gain_1, gain_2)
     for i in range(3):
         state[i] += gain[i] * innovation
-        for k in range(3):  # P is symmetric: its product with the row is gain times spread
-            P[i, k] -= gain[i] * gain[k] * spread
-    m.used += 1.0
+        for k in range(3):  # P row = gain innovation_variance, as P is symmetric
+            P[i, k] -= gain[i] * gain[k] * innovation_variance
+    m.n_blocks += 1.0
 
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the estimated conductance [m^3/(s Pa)], its deviation, and the number of blocks used."""
-    return m.state[0], math.sqrt(m.P[0, 0]), m.used
+    """Return the estimated conductance [m^3/(s Pa)], its standard error, and the number of blocks used."""
+    return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 
 
 @dataclass(frozen=True)
 class Balance:
     """The observer's model: displacement `D` [m^3/rad], areas [m^2], volumes at mid-stroke [m^3], `K` [Pa].
 
-    `x_step` [m]: a count of the encoder; `noise` [Pa]: deviation of a sample of the pressures; `shut` [Pa]: the least
-    |p_A - p_B| at which the valve of the side with the higher pressure is shut.
+    `x_step` [m]: an encoder count; `noise` [Pa]: standard deviation of a pressure's sample; `shut` [Pa]: |p_A - p_B|
+    above which the check valve of the side with the higher pressure is shut.
     """
 
     D: float
@@ -142,15 +151,15 @@ class Balance:
     shut: float = 0.0
 
 
-def observer_of(balance: Balance, rate: float) -> Any:
-    """Make the record (1,) of an observer before its first sample."""
-    return record_of(
+def make_observer(balance: Balance, rate: float) -> Any:
+    """Make the record (1,) `OBSERVER` of an observer before its first sample."""
+    return make_record(
         OBSERVER,
         balance,
         rate=rate,
         length=max(2, round(BLOCK * rate)),
-        share=1.0 - math.exp(-1.0 / (rate * _LAG)),
-        low=math.inf,
-        high=-math.inf,
+        lag_gain=1.0 - math.exp(-1.0 / (rate * _LAG)),
+        min_dp=math.inf,
+        max_dp=-math.inf,
         P=np.diag(np.square([_SD_G, _SD_C, _SD_AREA])),
     )

@@ -1,4 +1,4 @@
-"""Margins of a loop: the gain, phase and delay that it tolerates, from rig and controller as they are."""
+"""Stability margins of a control loop: the gain, phase and delay that it tolerates, from rig and controller."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 Array = NDArray[np.float64]
-#: Longest memory of a controller [s] that is followed.
-_MEMORY = 60.0
-#: Impulses that a controller is asked about: position [m], above any dead band, pressures [Pa], angle [rad].
+#: Duration [s] of a controller's impulse response.
+_RESPONSE_DURATION = 60.0
+#: Sizes of the impulses: position [m], above any dead band, pressures [Pa], angle [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 #: Time [s] in which a moving piston settles before the rig is linearised.
 _SETTLING = 0.5
-_FREQUENCIES = 4000
-#: Samples of an answer that are summed at once.
+_N_FREQUENCIES = 4000
+#: Samples of an impulse response that are summed at once.
 _BLOCK = 64
-#: By how much each state is moved for a difference.
-_SIZES = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
+#: Steps of the voltage [V] and of each state (SI) for the finite differences.
+_VOLTAGE_STEP = 1e-3
+_STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
 
 
 @dataclass(frozen=True)
 class Margins:
     """Margins of a loop at one speed of the piston.
 
-    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf where none ends it; `phase` [rad]: the least
-    distance of arg L from -pi where |L| = 1; `crossover` [Hz]: the highest frequency at which the loop's gain is 1;
-    `delay` [s]: what the loop may be later, the least over all frequencies at which its gain is 1; `peak`: the
-    largest 1/|1 + L|; `damped`: whether the rig rings down by itself (at slow strokes its friction falls with speed,
-    and it may not: then gain and phase margin bound a loop that is not stable to begin with).
+    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase` [rad]: smallest distance
+    of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1; `delay` [s]: smallest
+    additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|; `damped`: True if the
+    rig without controller is stable (in slow strokes its friction falls with speed, and it may not be; then the margins
+    do not prove that the loop is stable).
     """
 
     speed: float
@@ -51,12 +52,13 @@ class Margins:
 
 
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
-    """Compute the margins of the loop of a rig and a controller, cut at the voltage.
+    """Compute the stability margins of the loop of a rig and a controller, opened at the voltage.
 
-    The rig is linearised over one sample of the controller, about a piston that moves at `speed` [m/s], 0: at
-    standstill, under `load` [N] beside the rig's own: y(k+1) = A y(k) + B u(k), by differences of the solver's own
-    steps. The controller is what its answers to an impulse of each measurement say: C_j(z). Loop: L(z) = -z^-delay
-    sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed beyond the drive.
+    The rig is linearised over one sample of the controller by finite differences of the solver's steps, y(k+1) = A y(k)
+    + B u(k), for a piston that moves at `speed` [m/s] (0: standstill) under `load` [N] in addition to the rig's own.
+    The controller's transfer functions C_j(z) are those of its impulse responses to each measurement. The loop is
+    L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed that the
+    drive cannot reach.
 
     Examples
     --------
@@ -67,126 +69,136 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
     >>> loop.gain > 2.0 and loop.phase > 0.7
     True
     """
-    f = np.geomspace(0.05, 0.499 * controller.rate, _FREQUENCIES)
+    f = np.geomspace(0.05, 0.499 * controller.rate, _N_FREQUENCIES)  # [Hz], to just below the Nyquist frequency
     L, damped = open_loop(rig, controller, f, speed, load)
-    return margins_of(f, L, speed, damped)
+    return compute_margins(f, L, speed, damped)
 
 
 def open_loop(
     rig: Rig, controller: Controller, f: Array, speed: float = 0.0, load: float = 0.0
 ) -> tuple[NDArray[np.complex128], bool]:
-    """Compute L (n,) at the frequencies `f` (n,) [Hz], and whether the rig rings down by itself (`margins`)."""
-    A, B, state = _linearised(rig, controller.rate, speed, load)
+    """Compute the open loop L (n,) at frequencies `f` (n,) [Hz], and whether the rig itself is stable."""
+    A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
-    values, vectors = np.linalg.eig(A)
-    inputs = np.linalg.solve(vectors, B.astype(complex))
+    # (z I - A)^-1 B by the eigenvalues of A, for all frequencies at once
+    eigenvalues, eigenvectors = np.linalg.eig(A)
+    modal_inputs = np.linalg.solve(eigenvectors, B.astype(complex))
     L = np.zeros(f.size, dtype=complex)
-    for row, answer in _answers(controller, state):
-        plant = (vectors[row] * inputs / (z[:, None] - values)).sum(axis=1)
-        L -= _of_impulse(answer, z) * plant
-    return L * z**-controller.delay, bool(np.abs(values).max() < 1.0 + 1e-6)
+    for measured_state, response in _impulse_responses(controller, state):
+        plant = (eigenvectors[measured_state] * modal_inputs / (z[:, None] - eigenvalues)).sum(axis=1)
+        L -= _frequency_response(response, z) * plant
+    # 1e-6: the integrators position and angle have eigenvalues of 1, up to the error of the finite differences
+    return L * z**-controller.delay, bool(np.abs(eigenvalues).max() < 1.0 + 1e-6)
 
 
-def _linearised(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
-    from sealscope.physics.rig import packed, rig_numbers
-    from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, nodes_of
+def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
+    """Linearise the rig over a sample at `rate` [Hz] (`margins`): return A (14, 14), B (14,) and the state (14,)."""
+    from sealscope.physics.rig import pack_numbers, rig_numbers
+    from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, step_nodes
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.standstill import initial_state
     from sealscope.physics.state import OUTPUTS, POSITION, VELOCITY
 
     p = rig_numbers(rig) if load == 0.0 else rig_numbers(rig)._replace(pushed=(True,))
-    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))
+    steps = max(2, math.ceil(1.2 / (rate * min(1e-3, longest_step(p)))))  # a sample; with 20 % in reserve
     h, implicit, euler = 1.0 / (rate * steps), IMPLICIT if p.throttled else EXPLICIT, rig.motor.integrator == "euler"
-    nodes = nodes_of(implicit, h).size
+    nodes = step_nodes(implicit, h).size
 
     def advance_state(y: Array, u: float, samples: int = 1) -> Array:
+        """Integrate from the state y (14,) over samples at a constant voltage u [V]; return the new state."""
         n = samples * steps
-        after, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
-        volts, none, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
-        advance(implicit, after, h, volts, none, none, force, packed(p), euler, steps, rows)
-        return after
+        state, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
+        volts, no_leak, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
+        advance(implicit, state, h, volts, no_leak, no_leak, force, pack_numbers(p), euler, steps, rows)
+        return state
 
     y, u = initial_state(rig, 0.0, load), 0.0
     if speed != 0.0:
-        u = drive_of(rig).steady(speed * rig.cylinder.A_A)
+        u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def find_moving_state(u: float) -> tuple[Array, float]:
-            """Simulate a piston that moves; return its state, which may ring, and its mean speed."""
+            """Simulate the piston under a constant voltage; return its last state, and its speed after settling."""
             first_state = advance_state(y, u, samples)
             last_state = advance_state(first_state, u, samples)
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, speed_at_rest = find_moving_state(0.0)  # the load may move a piston whose drive gives way
-        for _ in range(5):  # the drive falls short of its command
+        for _ in range(5):  # raise the voltage until the piston has the speed: the drive falls short of its command
             state, mean_speed = find_moving_state(min(max(u, -limit), limit))
             speed_gain = mean_speed - speed_at_rest
+            # in proportion to the speed, by at most a factor of 5; by 1.5 if the piston does not follow
             u *= min(max((speed - speed_at_rest) / speed_gain, 0.2), 5.0) if speed_gain * speed > 0.0 else 1.5
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
         y = state
         y[VELOCITY], y[POSITION] = speed, 0.0
     columns: list[Array] = []
-    for k, size in enumerate(_SIZES):
+    for k, state_step in enumerate(_STATE_STEPS):
         shift = np.zeros(y.size)
-        shift[k] = size
-        columns.append((advance_state(y + shift, u) - advance_state(y - shift, u)) / (2.0 * size))
-    B = (advance_state(y, u + 1e-3) - advance_state(y, u - 1e-3)) / 2e-3
+        shift[k] = state_step
+        columns.append((advance_state(y + shift, u) - advance_state(y - shift, u)) / (2.0 * state_step))
+    B = (advance_state(y, u + _VOLTAGE_STEP) - advance_state(y, u - _VOLTAGE_STEP)) / (2.0 * _VOLTAGE_STEP)
     return np.stack(columns, axis=1), B, y
 
 
-def _answers(controller: Controller, state: Array) -> list[tuple[int, Array]]:
-    """Compute the controller's answer to a unit impulse of each measured state, with the state's row."""
+def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
+    """Compute the controller's response to a unit impulse of each measured state: (index of the state, response)."""
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
     standstill = Measured(0.0, 0.0, 0.0, 0.0, float(state[P_A]), float(state[P_B]), 0.0)
-    n = round(_MEMORY * controller.rate)
+    n = round(_RESPONSE_DURATION * controller.rate)
 
-    def answer(first: Measured) -> Array:
+    def respond(impulse: Measured) -> Array:
+        """Compute the voltages (n,) of a new run from an impulse of one sample on."""
         voltage = controller.start()
-        for _ in range(round(controller.rate)):
+        for _ in range(round(controller.rate)):  # settle for a second
             voltage(standstill)
-        return np.array([voltage(first), *(voltage(standstill) for _ in range(n - 1))])
+        return np.array([voltage(impulse), *(voltage(standstill) for _ in range(n - 1))])
 
-    quiet = answer(standstill)
+    baseline = respond(standstill)
     impulses = (
         (POSITION, _IMPULSE_X, standstill._replace(x=_IMPULSE_X)),
         (P_A, _IMPULSE_P, standstill._replace(p_A=standstill.p_A + _IMPULSE_P)),
         (P_B, _IMPULSE_P, standstill._replace(p_B=standstill.p_B + _IMPULSE_P)),
         (THETA, _IMPULSE_THETA, standstill._replace(theta=_IMPULSE_THETA)),
     )
-    answers = [(row, (answer(first) - quiet) / size) for row, size, first in impulses]
-    return [(row, values) for row, values in answers if np.any(values)]
+    responses = [(state_index, (respond(impulse) - baseline) / size) for state_index, size, impulse in impulses]
+    return [(state_index, values) for state_index, values in responses if np.any(values)]
 
 
-def _of_impulse(answer: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Compute sum_n a_n z^-n of an answer that stays at its last value: an integrator's."""
-    tail = answer[-1]
-    changing = answer - tail
-    last = int(np.flatnonzero(np.abs(changing) > 1e-9 * np.abs(answer).max())[-1]) + 1 if np.any(changing) else 0
-    blocks = np.zeros((math.ceil(last / _BLOCK), _BLOCK))
-    blocks.ravel()[:last] = changing[:last]
-    within = z[:, None] ** -np.arange(float(_BLOCK)) @ blocks.T
+def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Compute sum_n a_n z^-n of an impulse response a_n that stays at its last value, as an integrator's does."""
+    final = response[-1]
+    transient = response - final
+    is_relevant = np.abs(transient) > 1e-9 * np.abs(response).max()
+    n = int(np.flatnonzero(is_relevant)[-1]) + 1 if np.any(transient) else 0
+    blocks = np.zeros((math.ceil(n / _BLOCK), _BLOCK))
+    blocks.ravel()[:n] = transient[:n]
+    block_sums = z[:, None] ** -np.arange(float(_BLOCK)) @ blocks.T
     total = np.zeros(z.size, dtype=complex)
-    for k in range(len(blocks) - 1, -1, -1):  # Horner, a block at a time
-        total = total * z**-_BLOCK + within[:, k]
-    return np.asarray(total + tail / (1.0 - 1.0 / z))
+    for k in range(len(blocks) - 1, -1, -1):  # Horner's scheme, a block at a time
+        total = total * z**-_BLOCK + block_sums[:, k]
+    return np.asarray(total + final / (1.0 - 1.0 / z))  # geometric series of the last value
 
 
-def margins_of(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
-    """Compute the margins of a loop L (n,) over frequencies `f` (n,) [Hz], linear between them: see `Margins`."""
-    places = np.arange(f.size)
-    unit, turned = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
-    crossover, ahead = np.interp(unit, places, f), np.angle(-np.interp(unit, places, L))
-    real = np.interp(turned, places, L.real)
-    gain = float(np.min(-1.0 / real[(real < 0.0) & (real > -1.0)], initial=math.inf))
-    phase = float(np.min(np.abs(ahead), initial=math.inf))
-    delay = float(np.min(np.mod(ahead, 2.0 * math.pi) / (2.0 * math.pi * crossover), initial=math.inf))
+def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
+    """Compute the `Margins` of a loop L (n,) at the frequencies `f` (n,) [Hz], interpolated linearly.
+
+    `speed`, `damped`: copied to the result.
+    """
+    indices = np.arange(f.size)
+    unit_gain, real_axis = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
+    crossover, phase_margin = np.interp(unit_gain, indices, f), np.angle(-np.interp(unit_gain, indices, L))
+    real = np.interp(real_axis, indices, L.real)
+    gain = float(np.min(-1.0 / real[(real < 0.0) & (real > -1.0)], initial=math.inf))  # a larger gain moves these to -1
+    phase = float(np.min(np.abs(phase_margin), initial=math.inf))
+    delay = float(np.min(np.mod(phase_margin, 2.0 * math.pi) / (2.0 * math.pi * crossover), initial=math.inf))
     peak = float(np.max(1.0 / np.abs(1.0 + L)))
     return Margins(speed, gain, phase, float(np.max(crossover, initial=0.0)), delay, peak, damped)
 
 
 def _crossings(values: Array) -> Array:
-    """Find the places, in fractions of an index, at which a line through the values changes its sign."""
+    """Find the zero crossings of values (n,), as fractional indices by linear interpolation."""
     k = np.flatnonzero(np.diff(values > 0.0))
     return k + values[k] / (values[k] - values[k + 1])

@@ -1,7 +1,7 @@
-"""Controllers by name: those that are built in or installed, and a user's own as `MODULE:NAME` or `FILE.py:NAME`.
+"""Controllers by name: built-in ones, installed ones, and a user's as `MODULE:NAME` or `FILE.py:NAME`.
 
-A distribution installs a controller by an entry point of the group `sealscope.controllers`, of a class or function as
-`controller_named` calls it.
+A distribution installs a controller by an entry point of the group `sealscope.controllers`, which names a class or
+function as `controller_named` calls it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sealscope.calls import closest
+from sealscope.calls import suggestion
 from sealscope.control.controller import Controller
 from sealscope.control.fault_tolerant import FaultTolerant
 from sealscope.control.flatness import Flatness
@@ -26,7 +26,7 @@ from sealscope.errors import InputError
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: What makes each built-in controller for what a rig is said to be.
+#: The functions that build the built-in controllers from a rig, by name.
 CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
     "pi": PositionPI.from_rig,
     "flatness": Flatness.from_rig,
@@ -40,31 +40,32 @@ GROUP = "sealscope.controllers"
 
 @cache
 def _installed() -> Mapping[str, EntryPoint]:
+    """Return the entry points of installed controllers, by name."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def is_installed(name: str) -> bool:
-    """Return True for the name of a controller that is built in or installed, False for a user's own."""
+    """Return True if a name is that of a built-in or installed controller, False for one of a user."""
     return name in CONTROLLERS or name in _installed()
 
 
-def check_name(name: str) -> None:
-    """Raise InputError where no controller can have this name; nothing is imported."""
-    place, mark, attribute = name.rpartition(":")
-    if not is_installed(name) and not (mark and place and attribute):
+def check_controller_name(name: str) -> None:
+    """Check that a controller may have this name, without importing it; raise InputError otherwise."""
+    place, colon, attribute = name.rpartition(":")
+    if not is_installed(name) and not (colon and place and attribute):
         names = (*CONTROLLERS, *_installed())
         raise InputError(
             f"controller must be one of {', '.join(names)}, or MODULE:NAME or FILE.py:NAME of your own, got {name!r}"
-            f"{closest(name, names)}"
+            f"{suggestion(name, names)}"
         )
 
 
 def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller of a name from a rig's parameters.
 
-    `name`: one of `CONTROLLERS` or of an installed one, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function:
-    called with the rig; where it has a method `from_rig`, that is called instead. Raises InputError for an unknown
-    name, and for a controller without `rate`, `delay` and `start`.
+    `name`: that of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function.
+    Its method `from_rig` is called with the rig, or itself if it has none. Raises InputError for an unknown name, and
+    for a controller without `rate`, `delay` and `start`.
 
     Examples
     --------
@@ -75,10 +76,10 @@ def controller_named(name: str, rig: Rig) -> Controller:
     """
     if name in CONTROLLERS:
         return CONTROLLERS[name](rig)
-    check_name(name)
+    check_controller_name(name)
     place, _, attribute = name.rpartition(":")
     try:
-        make: Any = _installed()[name].load() if name in _installed() else getattr(_module(place), attribute)
+        make: Any = _installed()[name].load() if name in _installed() else getattr(_load_module(place), attribute)
         build = getattr(make, "from_rig", None) or getattr(make, "of", make)  # `of`: the former name
         controller = build(rig)
     except InputError:
@@ -91,25 +92,25 @@ def controller_named(name: str, rig: Rig) -> Controller:
     return controller  # type: ignore[no-any-return]
 
 
-def source_of(name: str) -> Path | None:
-    """Find the source file of a user's own or an installed controller; None for a built-in one.
+def find_controller_source(name: str) -> Path | None:
+    """Find the source file of a user's or an installed controller without importing it; None for a built-in one.
 
-    Nothing is imported for that. Raises InputError where there is no such file.
+    Raises InputError if there is no such file.
     """
     if name in CONTROLLERS:
         return None
     place = _installed()[name].module if name in _installed() else name.rpartition(":")[0]
-    path = Path(place) if place.endswith(".py") else _file_of(place)
+    path = Path(place) if place.endswith(".py") else _find_module_file(place)
     if path is None or not path.is_file():
         raise InputError(f"a controller's file must exist, got {place}")
     return path
 
 
-def _file_of(module: str) -> Path | None:
-    """Find the file of a module without importing its packages."""
-    parts, folders = module.split("."), None
-    for count in range(1, len(parts) + 1):
-        name = ".".join(parts[:count])
+def _find_module_file(module: str) -> Path | None:
+    """Find the file of a module without importing the packages that contain it; None if there is none."""
+    parts, folders = module.split("."), None  # `folders`: those of the package that contains the module
+    for depth in range(1, len(parts) + 1):
+        name = ".".join(parts[:depth])
         specs = (finder.find_spec(name, folders) for finder in sys.meta_path)
         spec = next((spec for spec in specs if spec is not None), None)
         if spec is None:
@@ -118,7 +119,8 @@ def _file_of(module: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.origin else None
 
 
-def _module(place: str) -> Any:
+def _load_module(place: str) -> Any:
+    """Import a module by its name, or from a Python file under a name made of the file's hash."""
     if not place.endswith(".py"):
         return importlib.import_module(place)
     path = Path(place)

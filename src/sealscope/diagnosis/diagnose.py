@@ -1,4 +1,8 @@
-"""Diagnosis of a recording: inspect the data, run the detectors that its channels allow, state one verdict."""
+"""Diagnosis of a recording: inspect the data, observe what changed, explain it, decide, state one verdict.
+
+`inspection` inspects, each detector that the channels allow observes (`detectors.observation`), `decision` explains and
+decides, and `Diagnosis` states the result.
+"""
 
 from __future__ import annotations
 
@@ -6,50 +10,49 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.detectors.observation import null_of, run_detector
+from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors
-from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
-from sealscope.diagnosis.inspection import comparable, inspected
-from sealscope.diagnosis.learnt import Healthy, Learnt
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inspection import inspect_recording, select_comparable
+from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
-from sealscope.parameters import Rig
+from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
-_ALLOWED = priors("verdict")["false_alarm"]
-FALSE_ALARM_PROBABILITY: float = _ALLOWED["probability"]
+FALSE_ALARM_PROBABILITY: float = VERDICT.false_alarm.probability
 
 
 def check_probability(probability: float) -> None:
-    """Raise InputError for a false-alarm probability that no threshold can be set for."""
-    least, most = _ALLOWED["rarest"], _ALLOWED["largest"]
-    if not (isinstance(probability, float | int) and least <= probability <= most):
-        raise InputError(f"false-alarm probability must be {least:g} to {most:g}, got {probability!r}")
+    """Check that a threshold can be set for a false-alarm probability; raise InputError otherwise."""
+    min_probability, max_probability = VERDICT.false_alarm.rarest, VERDICT.false_alarm.largest
+    if not (isinstance(probability, float | int) and min_probability <= probability <= max_probability):
+        rule = f"false-alarm probability must be {min_probability:g} to {max_probability:g}"
+        raise InputError(f"{rule}, got {probability!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One recording, gaps bridged and without missing samples, and the other inputs of detectors.
+    """One recording, gaps bridged and without missing samples, judged by single detectors or by all.
 
     `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
-    pressures cannot be judged, None where they can: then no detector is run; `refusal`: why none of the baselines that
-    were given can be compared; `share` of what was to be judged that the recording is.
+    pressures cannot be judged and no detector is run, or None; `refusal`: why it cannot be
+    compared with the healthy recordings given, or None; `share`: fraction of the whole recording's samples in this one;
+    `judged_until`: fraction of the whole recording up to its last sample.
     """
 
     recording: Recording
@@ -60,69 +63,67 @@ class Examination:
     distrust: str | None = None
     refusal: str | None = None
     share: float = 1.0
-    _reports: dict[str, Observed] = field(default_factory=dict)
+    judged_until: float = 1.0
+    _reports: dict[str, Observed] = field(default_factory=dict, init=False)
 
-    def through(self, channels: Iterable[str]) -> Examination:
-        """Return the same recording with these channels alone."""
-        names_wanted = set(channels)
+    def with_channels(self, channels: Iterable[str]) -> Examination:
+        """Return the examination of the same recordings by these channels alone; summarised ones are left out."""
+        names = set(channels)
         recording, *baseline = (
-            healthy.only(name for name in healthy.channels if name in names_wanted)
-            for healthy in (self.recording, *self.baseline)
-            if isinstance(healthy, Recording)
+            entry.only(name for name in entry.channels if name in names)
+            for entry in (self.recording, *self.baseline)
+            if isinstance(entry, Recording)
         )
-        return replace(self, recording=recording, baseline=baseline, _reports={})
+        return replace(self, recording=recording, baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Return a detector's observations, or the reason why it has none.
-
-        Raises KeyError for a detector that is not registered.
-        """
+        """Return the report of one detector, computed once; raise KeyError if it is not registered."""
         if name not in self._reports:
-            self._reports[name] = run_detector(name, self.recording, self.baseline, self.rig, self.distrust)
+            rig = load_rig(self.rig)
+            self._reports[name] = run_detector(name, self.recording, self.baseline, rig, self.distrust)
         return self._reports[name]
 
     @cached_property
     def signals(self) -> Observed:
         """Observations of duty, noise, hum and levels, which no detector of leaks makes."""
-        return Observed(SIGNALS, lack=self.distrust) if self.distrust else observe_signals(self.recording)
+        return observe_rivals(self.recording, self.baseline, self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
         """Distribution of every observable over the healthy recordings."""
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
-        return null_of(self.baseline, self.rig, shut=isinstance(leak, BalanceLeak) and leak.balance.shut)
+        is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
+        return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide by one detector alone; the change of RMS by its own rule, whatever else changed."""
-        context = DecisionContext(
-            false_alarm_probability=self.false_alarm_probability,
-            refusal=self.refusal,
-            is_weighed=name != RMS_CHANGE,
-        )
-        return self._decide(name, [self.signals], context)
+        """Decide by one detector alone; for the change of RMS, other changes are not weighed as its explanations."""
+        return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
-    def fused(self) -> Evidence:
-        """Decide by all registered detectors: the first that measures the leak and can tell judges.
+    def decide_by_all(self) -> Evidence:
+        """Decide by all registered detectors, in the order of `rank`.
 
-        Where one that measures the leak fails, nobody else may say that there is none.
+        Detectors that measure the leak (`ORDER`) are asked until one of them decides. If one fails, no other detector
+        may state that there is no leak.
         """
-        context = DecisionContext(false_alarm_probability=self.false_alarm_probability, refusal=self.refusal)
         names = sorted(detectors(), key=rank)
-        decisions = dict[str, Evidence]()
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
+        decisions = dict[str, Evidence]()
         for name in names:
             if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
-                decisions[name] = self._decide(name, reports, context)
-        failed = next(
-            (self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed), None
-        )
-        return combine(list(decisions.values()), replace(context, refusal=self.refusal or failed))
+                decisions[name] = self._decide_by(name, reports)
+        failures = [self.report(name).lack for name in ORDER if name in decisions and self.report(name).has_failed]
+        return combine(list(decisions.values()), self.refusal or next(iter(failures), None))
 
-    def _decide(self, name: str, reports: Sequence[Observed], context: DecisionContext) -> Evidence:
-        report = self.report(name)
+    def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
+        """Decide whether there is a leak by one detector's report.
+
+        `reports`: others whose observables may explain its alarm; `weigh_rivals`: whether they compete with a leak.
+        """
         with np.errstate(all="ignore"):
-            evidence = decide(report, reports, self.null, context)
-        return replace(evidence, share=self.share * evidence.share)
+            evidence = decide(self.report(name), reports, self.null, self.false_alarm_probability, weigh_rivals)
+        # the detector states fractions of the examined part: convert them to those of the whole recording
+        judged_until = self.judged_until * evidence.judged_until
+        return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
 
 @checked_call
@@ -139,15 +140,15 @@ def diagnose(
     """Decide whether oil bypasses the piston in a recording.
 
     The balance of volumes judges; where the channels allow none, the response of the pressures does, then plug-ins,
-    last the change of RMS. What plug-ins and the change of RMS say is stated beside the verdict.
+    last the change of RMS. The results of plug-ins and the change of RMS are stated in addition to the verdict.
 
     Parameters
     ----------
     recording : Recording
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
-        Leak-free recordings of the same machine; what cannot be compared is left out, and a finding says so. Without
-        any a leak that begins within the recording is looked for.
+        Leak-free recordings of the same machine; those that cannot be compared are left out with a finding. Without
+        baseline, the recording is tested for a leak that begins within it.
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
@@ -176,21 +177,24 @@ def diagnose(
     >>> diagnosis.verdict, round(diagnosis.onset_s)
     ('leak', 30)
     """
-    repair, baselines = RepairLimit.of(limit), _checked(recording, baseline)
+    repair, healthy = RepairLimit.parse(limit), _list_baseline(recording, baseline)
     check_probability(false_alarm_probability)
-    known, machine = assumed_rig(rig, recording)
-    inspection = inspected(recording)
-    compared = comparable(inspection, baselines)
-    evidence = Examination(
-        inspection.part,
-        compared.parts,
-        false_alarm_probability=false_alarm_probability,
-        rig=known,
-        distrust=inspection.distrust,
-        refusal=compared.refusal,
-        share=inspection.share,
-    ).fused()
-    return Diagnosis.of(
+    used_rig, machine = assumed_rig(rig, recording)
+    with limit_threads():
+        inspection = inspect_recording(recording)
+        compared = select_comparable(inspection, healthy)
+        examination = Examination(
+            inspection.part,
+            compared.parts,
+            false_alarm_probability=false_alarm_probability,
+            rig=used_rig,
+            distrust=inspection.distrust,
+            refusal=compared.refusal,
+            share=inspection.share,
+            judged_until=inspection.judged_until,
+        )
+        evidence = examination.decide_by_all()
+    return Diagnosis.from_evidence(
         evidence,
         recording,
         machine,
@@ -202,17 +206,15 @@ def diagnose(
     )
 
 
-def _checked(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
-    """Return the baselines; InputError where they, or the recording, are something else."""
-    single = isinstance(baseline, Recording | str | os.PathLike)
-    try:
-        healthy: list[Any] = [baseline] if single else [*baseline]  # type: ignore[misc]
-    except TypeError:
-        kind = type(baseline).__name__
-        raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {kind}") from None
-    named = [("baseline" if single else f"baseline[{k}]", entry, Recording | Learnt) for k, entry in enumerate(healthy)]
-    for name, value, kinds in (("recording", recording, Recording), *named):
-        if not isinstance(value, kinds):
+def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
+    """List the recordings of a baseline; raise InputError if one of them, or the judged recording, is no Recording."""
+    is_single = isinstance(baseline, Recording | str | os.PathLike)
+    if not is_single and not isinstance(baseline, Iterable):
+        raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}")
+    healthy: list[Any] = [baseline] if is_single else list(cast(Iterable[Any], baseline))
+    names = ["recording", *(["baseline"] if is_single else [f"baseline[{k}]" for k in range(len(healthy))])]
+    for name, value in zip(names, [recording, *healthy], strict=True):
+        if not isinstance(value, Recording if name == "recording" else Recording | SummarisedRecording):
             hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
             raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
     return healthy

@@ -1,7 +1,7 @@
-"""Inspection of recordings before any detector sees them: what of them can be analysed, trusted and compared.
+"""Inspect recordings before any detector runs: which part can be analysed, and what can be trusted and compared.
 
-The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, or that hold the
-samples of another recording, are left out for all detectors alike.
+The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, or that are copies of
+another recording, are left out for all detectors.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from functools import cached_property
 from hashlib import sha256
 from typing import NamedTuple
 
-from sealscope.diagnosis.learnt import Healthy, Learnt
+import numpy as np
+
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
+from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.corrections.samples import correct_samples
-from sealscope.recordings.formats.columns import listed
-from sealscope.recordings.hydraulics import lack_of_chambers, no_readings
+from sealscope.recordings.hydraulics import describe_missing_chambers, find_implausibility
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
-from sealscope.recordings.recording import Recording, remembered
+from sealscope.recordings.recording import Recording, compute_once
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,20 +28,21 @@ class Inspection:
     """A recording as detectors see it.
 
     `part`: its samples on an even clock, from the first to the last with all chamber pressures and the command, as
-    `recordings.corrections` makes them; `findings` on the whole; `distrust`: why the chamber pressures cannot be
-    trusted, None where they can; `share` of the whole that the part is.
+    `recordings.corrections` makes them; `findings` on all samples; `distrust`: why the chamber pressures cannot be
+    trusted, or None; `share`: fraction of the samples in the part; `judged_until`: fraction up to the part's last one.
     """
 
     part: Recording
     findings: tuple[Finding, ...]
     distrust: str | None
     share: float
+    judged_until: float = 1.0
 
     @property
     def defect(self) -> str | None:
-        """Why the recording cannot stand for a leak-free machine; None where it can."""
-        if lack := lack_of_chambers(self.part):
-            return lack
+        """Reason why the recording cannot serve as a baseline, or None."""
+        if missing := describe_missing_chambers(self.part):
+            return missing
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more, got {len(self.part)}"
         return self.distrust
@@ -51,7 +54,7 @@ class Inspection:
 
     @property
     def file(self) -> str | None:
-        """Name of the recording's file, None where it is of none."""
+        """Name of the recording's file, None if it is of none."""
         file = self.part.provenance.get("file")
         return None if file is None else str(file)
 
@@ -61,36 +64,34 @@ class Inspection:
         return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).hexdigest()
 
 
-def inspected(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
-    """Inspect a recording, once for all that ask; `channels`: those to look at for findings, by default all."""
+def inspect_recording(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
+    """Inspect a recording, with the result cached; `channels`: those to check for findings, by default all."""
     names = tuple(name for name in recording.channels if channels is None or name in channels)
-    return remembered(recording, ("inspection", names), lambda whole: _inspection(whole, names))
+    return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
 
 
-def _inspection(recording: Recording, names: Sequence[str]) -> Inspection:
-    findings = list(inspect(recording.only(names)))
-    chambers = chambers_of(recording)
-    part, found, stuck, share = correct_samples(recording)
-    findings += found
-    wrong = [finding for finding in findings if finding.channel in chambers and finding.code == "constant"]
-    wrong += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
-    lost = [
-        finding
-        for finding in findings
-        if finding.channel in chambers and finding.code == "clipped" and finding.count > len(part) / 2
-    ]
-    wrong += lost if len(lost) == len(chambers) else []  # else the other one says what it says
-    distrust = f"the pressures cannot be trusted: {wrong[0].text}" if wrong else None
-    if distrust is None and len(part) >= SHORTEST and (reason := no_readings(part)):
+def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
+    """Correct the samples, and decide by the findings whether the pressures can be trusted."""
+    chambers, (part, corrections, stuck, share) = chambers_of(recording), correct_samples(recording)
+    findings = (*inspect(recording.only(names)), *corrections)
+    on_chambers = [finding for finding in findings if finding.channel in chambers]
+    defects = [finding for finding in on_chambers if finding.code == "constant"]
+    defects += [finding for finding in findings if finding.channel in stuck and finding.code == "stuck"]
+    mostly_clipped = [finding for finding in on_chambers if finding.code == "clipped" and finding.count > len(part) / 2]
+    if len(mostly_clipped) == len(chambers):  # with one chamber clipped, the other one is judged
+        defects += mostly_clipped
+    distrust = f"the pressures cannot be trusted: {defects[0].text}" if defects else None
+    if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
-    return Inspection(part, tuple(findings), distrust, share)
+    judged_until = np.count_nonzero(recording.t <= part.t[-1]) / len(recording) if len(part) else 0.0
+    return Inspection(part, findings, distrust, share, float(judged_until))
 
 
 class Baselines(NamedTuple):
     """Leak-free recordings that a recording can be compared with.
 
-    `parts`: what of them can be analysed; `findings`: which were left out, and why; `refusal`: why none is left, None
-    where some are, or where none was given.
+    `parts`: their samples that can be analysed, or their summaries; `findings`: which were left out, and why;
+    `refusal`: why all given ones were, else None.
     """
 
     parts: tuple[Healthy, ...]
@@ -98,43 +99,45 @@ class Baselines(NamedTuple):
     refusal: str | None
 
 
-def comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
+def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    Left out are baselines that cannot be trusted, that lack a chamber of the recording or state it in another unit, the
-    recording itself, and all but one copy (that with the most channels) of the same recording. What differs in speed,
-    load and temperature is for the detectors to describe.
+    Left out are baselines that cannot be trusted, those that lack a chamber of the recording or have it in another
+    unit, the recording itself, and of several copies all but the one with the most channels. Differences of speed,
+    load and temperature are for the detectors to describe.
     """
-    healthy = [recording if isinstance(recording, Learnt) else inspected(recording) for recording in baseline]
-    chosen: dict[str, int] = {}
-    left_out: dict[tuple[Severity, str], list[int]] = {}
+    healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
+    index_of_digest: dict[str, int] = {}  # of the recordings that can be compared
+    left_out: dict[tuple[Severity, str], list[int]] = {}  # indices by severity and reason
     for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):
-        earlier = healthy[k]
-        same_units = all(earlier.units.get(name) == judged.units[name] for name in chambers_of(judged.part))
-        kind: tuple[Severity, str] | None = None
-        if isinstance(earlier, Inspection) and earlier.defect is not None:
-            kind = "warning", earlier.defect
-        elif earlier.digest == judged.digest:
-            kind = "warning", "the same samples as the recording itself"
-        elif not same_units:
-            kind = "note", "other channels or units"
-        elif earlier.digest in chosen:
-            kind = "note", "the same samples as another baseline recording"
-        if kind is None:
-            chosen[earlier.digest] = k
+        entry = healthy[k]
+        if (reason := _find_obstacle(entry, judged)) is None and entry.digest in index_of_digest:
+            reason = "note", "the same samples as another baseline recording"
+        if reason is None:
+            index_of_digest[entry.digest] = k
         else:
-            left_out.setdefault(kind, []).append(k)
+            left_out.setdefault(reason, []).append(k)
     findings = []
-    for (severity, reason), numbers in left_out.items():
-        names = [healthy[k].file or f"number {k + 1}" for k in sorted(numbers)]
+    for (severity, text), indices in left_out.items():
+        names = [healthy[k].file or f"number {k + 1}" for k in sorted(indices)]
         count = f"{len(names)} of {len(healthy)} baseline recordings {'is' if len(names) == 1 else 'are'}"
-        text = f"{count} left out: {reason} ({listed(names, 3)})"
-        findings.append(Finding("baseline_left_out", severity, None, len(numbers), None, text))
+        note = f"{count} left out: {text} ({join_names(names, 3)})"
+        findings.append(Finding("baseline_left_out", severity, None, len(indices), None, note))
     refusal = None
-    if healthy and not chosen:
-        most = max(left_out, key=lambda kind: len(left_out[kind]))
-        refusal = f"no baseline recording can be used: {most[1]}"
-    parts = (
-        earlier.part if isinstance(earlier := healthy[k], Inspection) else earlier for k in sorted(chosen.values())
-    )
-    return Baselines(tuple(parts), tuple(findings), refusal)
+    if healthy and not index_of_digest:
+        _, most_frequent = max(left_out, key=lambda kind: len(left_out[kind]))
+        refusal = f"no baseline recording can be used: {most_frequent}"
+    entries = [healthy[k] for k in sorted(index_of_digest.values())]
+    parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
+    return Baselines(parts, tuple(findings), refusal)
+
+
+def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
+    """Find the reason, with its severity, why a baseline cannot be compared with the judged recording."""
+    if isinstance(entry, Inspection) and entry.defect is not None:
+        return "warning", entry.defect
+    if entry.digest == judged.digest:
+        return "warning", "the same samples as the recording itself"
+    if any(entry.units.get(name) != judged.units[name] for name in chambers_of(judged.part)):
+        return "note", "other channels or units"
+    return None

@@ -1,1 +1,1 @@
-"""Evaluation of alarms against truth: detection, false alarms, errors of estimates, each with its interval."""
+"""Evaluate alarms and estimates against the truth: detection, false alarms and errors, with confidence intervals."""

@@ -1,4 +1,4 @@
-"""Errors of stated values: quantiles and means with intervals, errors of an onset and of a flow."""
+"""Evaluate the errors of estimates such as an onset or a flow: means and quantiles with confidence intervals."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ import numpy.typing as npt
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
-from sealscope.evaluation.checks import Array, numbers, share
+from sealscope.evaluation.checks import Array, as_numbers, as_probability
 
 
 @dataclass(frozen=True)
 class EstimateErrors:
-    """Errors, estimate less truth, over the `n` records that state an estimate; `without` had none.
+    """Errors (estimate minus truth) over the `n` records with an estimate; `without`: number of the others.
 
-    `bias`: their mean; `rmse`: root mean square; `median` (signed), `median_size` and `ninety_size` of their size;
-    `coverage`: how often the estimate's own interval held the truth.
+    `bias`: mean error; `rmse`: root mean square error; `median`: median of the signed error; `median_size`,
+    `ninety_size`: 50 % and 90 % quantile of the absolute error; `coverage`: fraction of the stated intervals that
+    contain the truth.
     """
 
     n: int
@@ -32,27 +33,27 @@ class EstimateErrors:
 
 
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Find the ranks (r, s) of the order statistics that hold the `order` quantile with at least `confidence`.
+    """Compute the ranks (r, s) of the order statistics between which the `order` quantile lies with `confidence`.
 
-    r is the largest with ``P(X <= r - 1) <= alpha/2``, s the smallest with ``P(X >= s) <= alpha/2``, X binomial (n,
-    order); r = 0 and s = n + 1 stand for no bound. Raises InputError for an impossible order or confidence. Source:
-    Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
+    r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, X binomial
+    (n, order); r = 0 and s = n + 1 mean that there is no bound. Raises InputError for an impossible order or
+    confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
     """
     from scipy.special import betainc
 
-    share(order, "the order of a quantile")
-    tail = (1.0 - share(confidence, "confidence")) / 2.0
+    as_probability(order, "the order of a quantile")
+    tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    reach = betainc(k, n + 1 - k, order)  # P(X >= k), falling in k
-    return int(np.count_nonzero(1.0 - reach <= tail)), int(np.count_nonzero(reach > tail)) + 1
+    p_at_least_k = betainc(k, n + 1 - k, order)  # falls with k
+    return int(np.count_nonzero(1.0 - p_at_least_k <= tail)), int(np.count_nonzero(p_at_least_k > tail)) + 1
 
 
-def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Compute the `order` quantile of a sample, ``x_(ceil(n order))``, and its order-statistic interval.
+def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
+    """Estimate the `order` quantile of a sample as ``x_(ceil(n order))``, with an interval by order statistics.
 
-    The interval holds for any distribution; it is infinite where the sample is too small to bound the quantile.
-    `values` (n,) may hold inf for what was not reached; nan is refused. Raises InputError for an empty sample. Source:
-    as `order_ranks`.
+    The interval is valid for any distribution, and infinite if the sample is too small to bound the quantile. `values`
+    (n,) may contain inf for values beyond all others. Raises InputError for an empty sample or nan. Source: as
+    `order_ranks`.
     """
     array = np.sort(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0 or np.isnan(array).any():
@@ -60,35 +61,38 @@ def quantile_of(values: npt.ArrayLike, order: float, confidence: float = 0.95) -
     n = array.size
     r, s = order_ranks(n, order, confidence)
     padded = np.concatenate([[-math.inf], array, [math.inf]])
-    middle = min(n, max(1, math.ceil(n * order * (1.0 - 1e-12))))
-    return IntervalEstimate(n, float(padded[middle]), float(padded[r]), float(padded[s]))
+    rank = min(n, max(1, math.ceil(n * order * (1.0 - 1e-12))))  # 1e-12: rounding of n * order
+    return IntervalEstimate(n, float(padded[rank]), float(padded[r]), float(padded[s]))
 
 
-def mean_of(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
-    """Compute the mean and its Student interval ``mean -+ t s/sqrt(n)``; infinite from one value, nan from none."""
+def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
+    """Estimate the mean with Student's interval ``mean -+ t s/sqrt(n)``; infinite for one value, nan for none."""
     from scipy.special import stdtrit
 
-    share(confidence, "confidence")
+    as_probability(confidence, "confidence")
     array = np.asarray(values, dtype=np.float64).ravel()
     if array.size == 0:
         return IntervalEstimate(0, math.nan, math.nan, math.nan)
-    array = numbers(array, "values")
+    array = as_numbers(array, "values")
     n, value = array.size, float(array.mean())
     if n == 1:
         return IntervalEstimate(1, value, -math.inf, math.inf)
-    half = float(stdtrit(n - 1, 0.5 + confidence / 2.0) * array.std(ddof=1) / math.sqrt(n))
-    return IntervalEstimate(n, value, value - half, value + half)
+    half_width = float(stdtrit(n - 1, 0.5 + confidence / 2.0) * array.std(ddof=1) / math.sqrt(n))
+    return IntervalEstimate(n, value, value - half_width, value + half_width)
 
 
-def _coverage(low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float) -> Proportion:
-    """Compute the proportion of stated intervals that hold the truth."""
-    low, high = _as_many(low, truth.size, "lower limits"), _as_many(high, truth.size, "upper limits")
+def _interval_coverage(
+    low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float
+) -> Proportion:
+    """Compute the proportion of the stated intervals that contain the truth."""
+    low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))
     covered = (low <= truth) & (truth <= high) & has_interval
     return proportion(int(np.count_nonzero(covered)), int(has_interval.sum()), confidence)
 
 
-def _as_many(values: npt.ArrayLike | None, n: int, what: str) -> Array:
+def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
+    """Convert `values` to n numbers, nan for None; raise InputError for another number of them."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
@@ -102,27 +106,28 @@ def estimate_errors(
     high: npt.ArrayLike | None = None,
     confidence: float = 0.95,
 ) -> EstimateErrors:
-    """Compute the errors of an estimate (a leak in L/min, an onset in s) with intervals.
+    """Compute the errors of estimates, such as leaks [L/min] or onsets [s], with confidence intervals.
 
-    All (n,) in one unit; nan where a record has no estimate or no interval. The interval of the rmse is the square
-    root of the Student interval of the mean square error, cut at 0; those of the quantiles are of order statistics.
-    Coverage is over the records with an interval. Raises InputError where no record has an estimate.
+    All inputs are (n,) in one unit, with nan for a missing estimate or interval; `low`, `high`: stated intervals. The
+    interval of the rmse is the square root of Student's interval of the mean square error, limited to 0; those of the
+    quantiles are by order statistics. Raises InputError if no record has an estimate.
     """
-    true = numbers(truth, "true values")
-    stated = _as_many(estimates, true.size, "estimates")
-    has_estimate = np.isfinite(stated)
+    true_values = as_numbers(truth, "true values")
+    n_records = true_values.size
+    values = _as_matching(estimates, n_records, "estimates")
+    has_estimate = np.isfinite(values)
     if not has_estimate.any():
-        raise InputError(f"errors need at least one estimate, got none in {true.size} records")
-    error = stated[has_estimate] - true[has_estimate]
-    square, size = mean_of(error**2, confidence), np.abs(error)
-    roots = [math.sqrt(max(x, 0.0)) for x in (square.value, square.low, square.high)]
+        raise InputError(f"errors need at least one estimate, got none in {n_records} records")
+    error = values[has_estimate] - true_values[has_estimate]
+    mean_square, absolute_error = estimate_mean(error**2, confidence), np.abs(error)
+    rmse, low_rmse, high_rmse = (math.sqrt(max(x, 0.0)) for x in (mean_square.value, mean_square.low, mean_square.high))
     return EstimateErrors(
         n=error.size,
-        without=true.size - error.size,
-        bias=mean_of(error, confidence),
-        rmse=IntervalEstimate(square.n, *roots),
-        median=quantile_of(error, 0.5, confidence),
-        median_size=quantile_of(size, 0.5, confidence),
-        ninety_size=quantile_of(size, 0.9, confidence),
-        coverage=_coverage(low, high, true, confidence),
+        without=n_records - error.size,
+        bias=estimate_mean(error, confidence),
+        rmse=IntervalEstimate(mean_square.n, rmse, low_rmse, high_rmse),
+        median=estimate_quantile(error, 0.5, confidence),
+        median_size=estimate_quantile(absolute_error, 0.5, confidence),
+        ninety_size=estimate_quantile(absolute_error, 0.9, confidence),
+        coverage=_interval_coverage(low, high, true_values, confidence),
     )

@@ -1,7 +1,7 @@
 """Probability of detection over the size of the leak.
 
-The detection at each size, and the logistic curve through hits and misses with its a50, a90 and a90/95, as
-MIL-HDBK-1823A fits hit/miss data.
+Proportions at each size, and a logistic curve fitted to hits and misses with its a50, a90 and a90/95, as in
+MIL-HDBK-1823A.
 """
 
 from __future__ import annotations
@@ -15,44 +15,43 @@ import numpy.typing as npt
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import Proportion, lower_bound, proportion
-from sealscope.evaluation.checks import Array, flags, share, sizes
+from sealscope.evaluation.checks import Array, as_flags, as_probability, as_sizes
 
-#: Spans of the tested sizes' logarithms beyond which a bound counts as infinite.
-_FARTHEST = 1e4
+#: A bound counts as infinite beyond this many times the range of the tested sizes' logarithms.
+_MAX_SPANS = 1e4
 
 
 @dataclass(frozen=True)
 class SizeDetection:
-    """Detection at one `size`: its `proportion` with a two-sided interval, and the one-sided `lower` bound."""
+    """Detection at one `size`: `proportion` with a two-sided interval, and its one-sided `lower` bound."""
 
     size: float
     proportion: Proportion
     lower: float
 
 
-def by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
-    """Compute the detection at each size of leak, with Clopper-Pearson's bounds, in rising order.
+def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
+    """Compute the proportion of detected leaks at each size, in rising order, with Clopper-Pearson's bounds.
 
-    `leaks` (n,) sizes, any unit; `hits` (n,) whether each was found. Raises InputError for sizes <= 0.
+    `leaks`: sizes (n,) in any unit; `hits`: whether each was detected, (n,). Raises InputError for sizes <= 0.
     """
-    leak = sizes(leaks)
-    hit = flags(hits, leak.size, "hits")
+    sizes = as_sizes(leaks)
+    is_hit = as_flags(hits, sizes.size, "hits")
     rows = []
-    for size in np.unique(leak):
-        hits_at_size = hit[leak == size]
+    for size in np.unique(sizes):
+        hits_at_size = is_hit[sizes == size]
         k, n = int(hits_at_size.sum()), int(hits_at_size.size)
         rows.append(SizeDetection(float(size), proportion(k, n, confidence), lower_bound(k, n, confidence)))
     return rows
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Find the smallest size from which on every tested size has its lower bound >= `detection`.
+    """Find the smallest size such that it and all larger tested sizes have a lower bound >= `detection`.
 
-    Infinite where none has. With 29 hits of 29 at 95 % the size proves 90 % (a90/95 without a model). Nothing is said
-    between the sizes, and the confidence is that of each size alone. Source: Clopper and Pearson (1934), doi
-    10.1093/biomet/26.4.404.
+    Infinite if there is none. For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The
+    confidence applies to each size alone. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
-    share(detection, "the probability of detection")
+    as_probability(detection, "the probability of detection")
     proven = math.inf
     for row in sorted(rows, key=lambda row: -row.size):
         if row.lower < detection:
@@ -62,17 +61,19 @@ def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
 
 
 def _log_odds(p: float) -> float:
+    """Compute the log odds of a probability."""
     return math.log(p / (1.0 - p))
 
 
 def _information(design: Array, n: Array, eta: Array) -> Array:
-    odds = np.exp(-np.abs(eta))
+    """Compute the Fisher information of the coefficients at the log odds `eta` of `n` trials each."""
+    odds = np.exp(-np.abs(eta))  # does not overflow; p (1 - p) is even in eta
     weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
     return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
 
 
-def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, firth: bool) -> float:
-    """Compute ``sum of k eta - n ln(1 + exp eta)``; Firth's penalty adds half the log determinant."""
+def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: bool) -> float:
+    """Compute ``sum of k eta - n ln(1 + exp eta)``; `firth` adds half the log determinant of the information."""
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
         return value
@@ -80,39 +81,40 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, firth: bool) 
     return value + 0.5 * float(log_determinant) if sign > 0 else -math.inf
 
 
-def _fitted(design: Array, n: Array, k: Array, firth: bool) -> Array:
-    """Compute the coefficients at the maximum of the log-likelihood."""
+def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Array:
+    """Maximise the log-likelihood, penalised if `firth`, over the coefficients (intercept, slope)."""
     from scipy.optimize import minimize
     from scipy.special import expit
 
     def loss(beta: Array) -> tuple[float, Array]:
+        """Compute the negative log-likelihood and its gradient."""
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
         if firth:  # leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
             inverse = np.linalg.pinv(_information(design, n, eta))
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
-        return -_log_likelihood(design, n, k, eta, firth), -design.T @ residual
+        return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
 
-    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])
+    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])  # the same detection at all sizes
     return np.asarray(minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-9}).x, dtype=np.float64)
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Return True if misses and hits of rising sizes overlap in one size at most: no maximum at a finite slope."""
-    hits = k / n
-    mixed = np.count_nonzero((hits > 0.0) & (hits < 1.0))
-    steps = np.diff(hits)
-    return bool(mixed <= 1 and (np.all(steps >= 0.0) or np.all(steps <= 0.0)))
+    """Return True if hits and misses overlap in one size at most; the likelihood then has no finite maximum."""
+    hit_fraction = k / n
+    n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))
+    steps = np.diff(hit_fraction)
+    return bool(n_mixed_sizes <= 1 and (np.all(steps >= 0.0) or np.all(steps <= 0.0)))
 
 
 @dataclass(frozen=True)
 class HitMiss:
-    """``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
+    """A fitted logistic curve, ``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
 
-    `covariance` (2, 2) of both; `estimator`: Firth's penalised likelihood where hits and misses are separated by size,
-    else maximum likelihood; `log_likelihood` of the fit and `null` without the size (both with the penalty where there
-    is one); `size`, `tested`, `hits` (m,): the data by size.
+    `covariance`: (2, 2) of intercept and slope; `estimator`: Firth's penalised likelihood if hits and misses are
+    separated by size, else maximum likelihood; `log_likelihood`: maximum, with the penalty if there is one; `null`: the
+    same with slope 0; `size`, `tested`, `hits`: (m,) sizes, numbers of leaks and of hits.
     """
 
     intercept: float
@@ -132,130 +134,134 @@ class HitMiss:
         return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Compute the two-sided pointwise Wald interval, on the log odds, of the detection at each size."""
+        """Compute the pointwise two-sided interval (low, high) of the detection at each size (Wald, on log odds)."""
         from scipy.special import expit, ndtri
 
-        x, v = _log_sizes(size), self.covariance
-        z = float(ndtri(0.5 + share(confidence, "confidence") / 2.0))
-        half = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
+        x, v = _log_sizes(size), self.covariance  # of intercept and slope
+        z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
+        margin = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
-        return np.asarray(expit(eta - half), dtype=np.float64), np.asarray(expit(eta + half), dtype=np.float64)
+        return np.asarray(expit(eta - margin), dtype=np.float64), np.asarray(expit(eta + margin), dtype=np.float64)
 
     def size_at(self, detection: float) -> float:
-        """Compute the size found with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
+        """Compute the size detected with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
 
-        Infinite where detection does not rise with the size.
+        Infinite if detection does not rise with the size.
         """
-        share(detection, "the probability of detection")
-        return _size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
+        as_probability(detection, "the probability of detection")
+        return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
 
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
         """Compute the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
 
-        It is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square, one
-        degree of freedom); infinite where there is none. Source: MIL-HDBK-1823A (2009), appendix G; Cheng and Iles,
-        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, gives the simultaneous counterparts, which
-        are wider.
+        The bound is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square with
+        one degree of freedom), infinite if there is none. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
+        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
 
-        share(detection, "the probability of detection")
+        as_probability(detection, "the probability of detection")
         if not 0.5 <= confidence < 1.0:
             raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
-        odds, drop = _log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2
-        if not self.slope > 0.0 or self.log_likelihood - self.null <= drop:
+        log_odds, allowed_drop = _log_odds(detection), 0.5 * float(ndtri(confidence)) ** 2
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
             return math.inf
 
-        def excess(log_size: float) -> float:
-            return self.log_likelihood - self._profile(odds, log_size) - drop
+        def excess_drop(log_size: float) -> float:
+            """Compute by how much the profile log-likelihood at a size is below the maximum less `allowed_drop`."""
+            return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
-        span = float(np.ptp(_log_sizes(self.size)))
-        near, step = (odds - self.intercept) / self.slope, span / 8.0
-        far = near + step
-        while excess(far) < 0.0:
-            near, step = far, 2.0 * step
-            far += step
-            if step > _FARTHEST * span:
+        # bracket the root with growing steps from the estimate upwards
+        log_range = float(np.ptp(_log_sizes(self.size)))
+        lower, step = (log_odds - self.intercept) / self.slope, log_range / 8.0
+        upper = lower + step
+        while excess_drop(upper) < 0.0:
+            lower, step = upper, 2.0 * step
+            upper += step
+            if step > _MAX_SPANS * log_range:
                 return math.inf
-        return _size(float(brentq(excess, near, far, xtol=1e-10 * max(1.0, abs(far)))))
+        return _exp_size(float(brentq(excess_drop, lower, upper, xtol=1e-10 * max(1.0, abs(upper)))))
 
     @property
     def a50(self) -> float:
-        """The size found half of the time."""
+        """The size detected with probability 50 %."""
         return self.size_at(0.5)
 
     @property
     def a90(self) -> float:
-        """The size found nine times in ten."""
+        """The size detected with probability 90 %."""
         return self.size_at(0.9)
 
     @property
     def a90_95(self) -> float:
-        """The size found nine times in ten, with 95 % confidence (likelihood ratio)."""
+        """The upper 95 % confidence bound of the size detected with probability 90 % (likelihood ratio)."""
         return self.size_bound()
 
-    def _profile(self, odds: float, log_size: float) -> float:
-        """Maximise the log-likelihood over the slope of lines with these log odds at `log_size`."""
+    def _profile_log_likelihood(self, log_odds: float, log_size: float) -> float:
+        """Maximise the log-likelihood over the slope of curves with `log_odds` at `log_size`."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            eta = odds + slope * (x - log_size)
-            value = _log_likelihood(design, self.tested, self.hits, eta, self.estimator == "firth")
+            """Compute the negative log-likelihood of a slope; 1e300 if it is infinite, which the search cannot use."""
+            eta = log_odds + slope * (x - log_size)
+            value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)
+        width = max(float(np.abs(x - log_size).max()), 1e-300)  # above 0 if `log_size` is that of all leaks
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
 def _log_sizes(values: npt.ArrayLike) -> Array:
-    return np.asarray(np.log(sizes(np.atleast_1d(np.asarray(values, dtype=np.float64)), "sizes")), dtype=np.float64)
+    """Compute the natural logarithms of sizes; raise InputError for a size <= 0."""
+    return np.asarray(np.log(as_sizes(np.atleast_1d(np.asarray(values, dtype=np.float64)), "sizes")), dtype=np.float64)
 
 
-def _size(log_size: float) -> float:
-    """Compute the size of a natural logarithm; infinite where it overflows."""
-    return math.exp(log_size) if log_size < 709.0 else math.inf
+def _exp_size(log_size: float) -> float:
+    """Compute the size from its natural logarithm; infinite if it overflows."""
+    return math.exp(log_size) if log_size < 709.0 else math.inf  # exp overflows above 709.78
 
 
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
-    """Fit the logistic curve through hits and misses over the logarithm of the size, by maximum likelihood.
+    """Fit a logistic curve to hits and misses over the logarithm of the size, by maximum likelihood.
 
-    `leaks` (n,) sizes > 0 in any unit; `hits` (n,) whether each was found. Where no finite
-    maximum exists (hits and misses separated by size), Firth's penalised likelihood is used and said so; its bound is
-    the penalised profile's. Raises InputError for a single size, or where all are hits or all misses. The curve goes
-    to 0 for small leaks: it does not know the false-alarm rate. Source: MIL-HDBK-1823A (2009), appendix G; Firth,
-    Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi
-    10.1002/sim.1047.
+    `leaks`: sizes (n,) > 0 in any unit; `hits`: whether each was detected, (n,). If hits and misses are separated by
+    size, the likelihood has no finite maximum and Firth's penalised likelihood is used (`HitMiss.estimator`), also for
+    the bound. The curve goes to 0 for small leaks, as it does not include the false-alarm rate. Raises InputError for a
+    single size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38,
+    doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
-    x = np.log(sizes(leaks))
-    hit = flags(hits, x.size, "hits")
-    if hit.all() or not hit.any():
-        raise InputError(f"a curve needs hits and misses, got {int(hit.sum())} hits of {hit.size}")
-    values, where = np.unique(x, return_inverse=True)
+    x = np.log(as_sizes(leaks))
+    is_hit = as_flags(hits, x.size, "hits")
+    if is_hit.all() or not is_hit.any():
+        raise InputError(f"a curve needs hits and misses, got {int(is_hit.sum())} hits of {is_hit.size}")
+    values, index = np.unique(x, return_inverse=True)
     if values.size < 2:
-        raise InputError(f"a curve needs leaks of at least 2 sizes, got {hit.size} of one size")
-    n, k = (np.asarray(np.bincount(where, counts), dtype=np.float64) for counts in (None, hit.astype(np.float64)))
+        raise InputError(f"a curve needs leaks of at least 2 sizes, got {is_hit.size} of one size")
+    # leaks n and hits k of each size
+    n, k = (np.asarray(np.bincount(index, weights), dtype=np.float64) for weights in (None, is_hit.astype(np.float64)))
     firth = _is_separated(n, k)
-    # centred and scaled while fitting, so that the size's unit does not matter
-    centre, spread = float(values.mean()), float(np.ptp(values)) / 2.0
-    design = np.column_stack([np.ones(values.size), (values - centre) / spread])
-    beta = _fitted(design, n, k, firth)
-    unscale = np.array([[1.0, -centre / spread], [0.0, 1.0 / spread]])
+    # centred and scaled for the fit, so that the unit of the size does not matter
+    centre, half_range = float(values.mean()), float(np.ptp(values)) / 2.0
+    design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
+    beta = _fit_coefficients(design, n, k, firth=firth)
+    unscale = np.array([[1.0, -centre / half_range], [0.0, 1.0 / half_range]])
     covariance = unscale @ np.linalg.inv(_information(design, n, design @ beta)) @ unscale.T
     intercept, slope = (float(b) for b in unscale @ beta)
-    plain = np.column_stack([np.ones(values.size), values])
-    more = 1.0 if firth else 0.0  # with slope 0 Firth's penalty is ln(p(1 - p)) and a constant: a hit and a miss more
-    level = np.full(n.size, _log_odds((k.sum() + more) / (n.sum() + 2.0 * more)))
+    unscaled_design = np.column_stack([np.ones(values.size), values])
+    # with slope 0 Firth's penalty is ln(p(1 - p)) + constant, which acts as one more hit and one more miss
+    n_added = 1.0 if firth else 0.0
+    null_eta = np.full(n.size, _log_odds((k.sum() + n_added) / (n.sum() + 2.0 * n_added)))
     return HitMiss(
         intercept=intercept,
         slope=slope,
         covariance=np.asarray(covariance, dtype=np.float64),
         estimator="firth" if firth else "maximum likelihood",
-        log_likelihood=_log_likelihood(plain, n, k, intercept + slope * values, firth),
-        null=_log_likelihood(plain, n, k, level, firth),
+        log_likelihood=_log_likelihood(unscaled_design, n, k, intercept + slope * values, firth=firth),
+        null=_log_likelihood(unscaled_design, n, k, null_eta, firth=firth),
         size=np.exp(values),
         tested=n,
         hits=k,

@@ -1,4 +1,4 @@
-"""Events per hour, and counts of named against true faults, with exact intervals."""
+"""Compute rates of events per hour and confusion matrices of faults, with exact intervals."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import numpy.typing as npt
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
-from sealscope.evaluation.checks import share
+from sealscope.evaluation.checks import as_probability
 
-#: The verdict that names no fault; it always has a column of its own, the last.
+#: The verdict that names no fault; it is always the last column of a confusion matrix.
 CANNOT_TELL = "cannot tell"
 
 
 def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
     """Compute the exact interval (low, high) of a Poisson mean after `count` events.
 
-    ``low = G(alpha/2; k), high = G(1 - alpha/2; k + 1)``, G the quantile of the gamma distribution of that shape; 0
-    where there was no event. Raises InputError for an impossible count or confidence. Source: Garwood, Biometrika 28
+    ``low = G(alpha/2; k), high = G(1 - alpha/2; k + 1)``, with G the quantile of the gamma distribution of shape k; low
+    is 0 if there was no event. Raises InputError for an impossible count or confidence. Source: Garwood, Biometrika 28
     (1936) 437-442, doi 10.1093/biomet/28.3-4.437.
     """
     from scipy.special import gammainccinv, gammaincinv
 
     if count < 0 or count != int(count):
         raise InputError(f"a number of events must be whole and >= 0, got {count}")
-    tail = (1.0 - share(confidence, "confidence")) / 2.0
+    tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     return 0.0 if count == 0 else float(gammaincinv(count, tail)), float(gammainccinv(count + 1, tail))
 
 
 def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Compute events per operating hour with their exact interval; raise InputError unless `hours` > 0."""
+    """Compute the rate of events per operating hour with its exact interval; raise InputError unless `hours` > 0."""
     if not (math.isfinite(hours) and hours > 0.0):
         raise InputError(f"operating hours must be > 0, got {hours}")
     low, high = poisson_interval(count, confidence)
@@ -42,10 +42,10 @@ def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> Inter
 
 @dataclass(frozen=True)
 class Confusion:
-    """`counts[i, j]`: records with fault `rows[i]` that were called `columns[j]`; the last column is `cannot tell`.
+    """A confusion matrix: `counts[i, j]` records with the fault `rows[i]` have the verdict `columns[j]`.
 
-    `shares[i][j]`: that count over all records of the row, with its interval; `accuracy`: right verdicts over all
-    records, `cannot tell` not among the right ones.
+    The last column is `cannot tell`. `shares[i][j]`: fraction of the row's records with that verdict; `accuracy`:
+    fraction of correct verdicts among all records, with `cannot tell` counted as incorrect.
     """
 
     rows: tuple[str, ...]
@@ -60,8 +60,8 @@ def confusion_matrix(
 ) -> Confusion:
     """Count verdicts by true fault, with Clopper-Pearson's intervals for each row.
 
-    `truth`, `verdicts`: as many names (`none` is a name like any other; `cannot tell` is no truth); `faults`: order of
-    rows and columns, and all names that may occur. Raises InputError for a name outside `faults`.
+    `truth`, `verdicts`: true fault and verdict of each record, `none` for no fault; `faults`: all faults, in the order
+    of rows and columns. Raises InputError for a name that is not in `faults`, or a true fault `cannot tell`.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")
@@ -69,11 +69,11 @@ def confusion_matrix(
         raise InputError(f"{CANNOT_TELL!r} is a verdict and no fault")
     rows = tuple(dict.fromkeys(faults))
     columns = (*rows, CANNOT_TELL)
-    strange = [name for name in truth if name not in rows] + [name for name in verdicts if name not in columns]
-    if strange:
-        raise InputError(f"a fault must be one of {', '.join(rows)}, got {strange[0]!r}")
+    unknown = [name for name in truth if name not in rows] + [name for name in verdicts if name not in columns]
+    if unknown:
+        raise InputError(f"a fault must be one of {', '.join(rows)}, got {unknown[0]!r}")
     counts = np.zeros((len(rows), len(columns)), dtype=np.int_)
-    for true, verdict in zip(truth, verdicts, strict=True):
-        counts[rows.index(true), columns.index(verdict)] += 1
-    shares = tuple(tuple(proportion(int(k), int(line.sum()), confidence) for k in line) for line in counts)
+    for fault, verdict in zip(truth, verdicts, strict=True):
+        counts[rows.index(fault), columns.index(verdict)] += 1
+    shares = tuple(tuple(proportion(int(k), int(row.sum()), confidence) for k in row) for row in counts)
     return Confusion(rows, columns, counts, shares, proportion(int(np.trace(counts)), len(truth), confidence))

@@ -1,6 +1,6 @@
-"""A threshold from leak-free scores, with the distribution of its true false-alarm probability.
+"""Set a threshold from leak-free scores, with the distribution of its true false-alarm probability.
 
-An order statistic: exact, whatever the scores' distribution.
+The threshold is an order statistic, so that the result is exact for any distribution of the scores.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from sealscope.errors import InputError
-from sealscope.evaluation.checks import numbers, share
+from sealscope.evaluation.checks import as_numbers, as_probability
 
-#: `average`: the probability holds on average over sets of leak-free records; `bound`: with the stated confidence.
+#: `average`: the false-alarm probability is kept on average over sets of leak-free records; `bound`: with confidence.
 Promise = Literal["average", "bound"]
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """Alarm where score > `value`, the `rank`-th largest of `n` leak-free scores.
+    """A threshold, the `rank`-th largest of `n` leak-free scores; an alarm is raised if score > `value`.
 
-    The true false-alarm probability is Beta(`rank`, n + 1 - rank) distributed (scores that tie make it smaller):
-    `expected` is its mean, (`low`, `high`) its interval at `confidence`; `false_alarm_probability` is what was asked
-    for, by which `promise`.
+    The true false-alarm probability is distributed as Beta(`rank`, n + 1 - rank), and smaller with ties. `expected`:
+    its mean; (`low`, `high`): its interval at `confidence`; `false_alarm_probability`, `promise`: the requested
+    probability and how it is kept.
     """
 
     value: float
@@ -40,25 +40,25 @@ class Threshold:
 
 
 def records_needed(false_alarm: float, confidence: float | None = None) -> int:
-    """Compute the fewest leak-free records for a false-alarm probability.
+    """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability.
 
-    Without `confidence` on average: ``ceil(1/p) - 1``. With it, the fewest n with ``1 - (1 - p)^n >= confidence``, 299
-    for 1 % at 95 %. Raises InputError for an impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12
-    (1941) 91-96, doi 10.1214/aoms/1177731788.
+    On average, without `confidence`: ``ceil(1/p) - 1``. As a bound with `confidence`: the smallest n with
+    ``1 - (1 - p)^n >= confidence``, such as 299 for 1 % at 95 %. Raises InputError for an impossible probability or
+    confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
     """
-    share(false_alarm, "the false-alarm probability")
+    as_probability(false_alarm, "the false-alarm probability")
     if confidence is None:
-        return max(1, math.ceil(1.0 / false_alarm * (1.0 - 1e-12)) - 1)
-    ratio = math.log1p(-share(confidence, "confidence")) / math.log1p(-false_alarm)
+        return max(1, math.ceil(1.0 / false_alarm * (1.0 - 1e-12)) - 1)  # 1e-12, here and below: rounding
+    ratio = math.log1p(-as_probability(confidence, "confidence")) / math.log1p(-false_alarm)
     return max(1, math.ceil(ratio * (1.0 - 1e-12)))
 
 
-def _rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Find the largest rank, counted from the largest score, that keeps the promise; 0 where none does."""
+def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
+    """Compute the largest rank, counted from the largest score, that keeps the promise; 0 if none does."""
     from scipy.special import betainc
 
     if promise == "average":
-        return min(n, math.floor(false_alarm * (n + 1) * (1.0 + 1e-12)))
+        return min(n, math.floor(false_alarm * (n + 1) * (1.0 + 1e-12)))  # 1e-12, here and below: rounding
     ranks = np.arange(1, n + 1)
     return int(np.count_nonzero(betainc(ranks, n + 1 - ranks, false_alarm) >= confidence * (1.0 - 1e-12)))
 
@@ -66,23 +66,23 @@ def _rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> in
 def quantile_threshold(
     scores: npt.ArrayLike, false_alarm: float, confidence: float = 0.95, promise: Promise = "average"
 ) -> Threshold:
-    """Find the lowest threshold that keeps the false-alarm probability, from the scores of leak-free records.
+    """Compute the lowest threshold that keeps a false-alarm probability, from the scores of leak-free records.
 
-    `scores` (n,), high means leak. `average`: rank ``floor(p (n + 1))``, so that the next record's score exceeds it
-    with probability <= p (split conformal). `bound`: the largest rank whose true probability is <= p with probability
-    >= `confidence` (a tolerance limit). Exact for any continuous distribution of independent records. Raises
-    InputError where the records are too few, saying how many are needed. Source: Wilks (1941), doi
+    `scores`: (n,), high for a leak. `promise` "average": rank ``floor(p (n + 1))``, so that the next record's score
+    exceeds the threshold with probability <= p (split conformal); "bound": the largest rank whose true probability is
+    <= p with probability >= `confidence` (tolerance limit). Exact for independent records of any continuous
+    distribution. Raises InputError with the number needed if there are too few records. Source: Wilks (1941), doi
     10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
     """
     from scipy.special import betaincinv
 
-    values = numbers(scores, "leak-free scores")
-    share(false_alarm, "the false-alarm probability")
-    share(confidence, "confidence")
+    values = as_numbers(scores, "leak-free scores")
+    as_probability(false_alarm, "the false-alarm probability")
+    as_probability(confidence, "confidence")
     if promise not in ("average", "bound"):
         raise InputError(f"the promise must be 'average' or 'bound', got {promise!r}")
     n = values.size
-    rank = _rank(n, false_alarm, promise, confidence)
+    rank = _threshold_rank(n, false_alarm, promise, confidence)
     if rank == 0:
         needed = records_needed(false_alarm, confidence if promise == "bound" else None)
         raise InputError(

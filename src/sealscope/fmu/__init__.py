@@ -1,1 +1,1 @@
-"""The rig as a functional mock-up unit (FMU), and other people's units as machines to record."""
+"""The rig as a functional mock-up unit (FMU), and recordings of other programs' units."""

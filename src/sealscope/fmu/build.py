@@ -1,4 +1,4 @@
-"""Build a unit: machine code of the laws, a thin layer in C around it, a description, one archive."""
+"""Build a functional mock-up unit: an archive of the compiled laws, an interface in C, and a description."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE
-from sealscope.diagnosis.inference.volumes.detector import RESOLVED
+from sealscope.diagnosis.inference.volumes.detector import MIN_STRIDE
 from sealscope.errors import InputError
-from sealscope.fmu.description import description, templates
-from sealscope.fmu.machine import FAILURES, Choice, code, object_code
+from sealscope.fmu.description import format_description, templates
+from sealscope.fmu.machine import FAILURES, RigChoice, object_code, rig_code
 from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, Variable, variables
 from sealscope.parameters import Rig, load_rig
-from sealscope.physics.rig import values_of
+from sealscope.physics.rig import parameter_values
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.plain_values import as_type
+from sealscope.storage.plain_values import convert_type
 
 Version = Literal[2, 3]
-#: What a soft sensor reads: pressures of both chambers, the pump's angle and the piston's position.
+#: Methods of a soft sensor: the volume balance, from both chamber pressures, the pump's angle and the piston's
+#: position.
 Sensor = Literal["volume"]
-#: rms error [Pa] of a pressure by which a unit's step is chosen, and the commands under which.
+#: Default rms error [Pa] of a pressure by which a unit's step is chosen, and the commands of the runs that choose it.
 ERROR = 1.0
-COMMANDS = ("3 sin(4t)", "5 sin(2t)")
+STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
+#: Longest time [s] of the C compiler.
 _COMPILE_TIMEOUT = 300.0
 _README = """\
 The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another
@@ -43,7 +45,7 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 
 
 class Platform(NamedTuple):
-    """A system that a unit runs on: its names in LLVM and the compiler, its folders in the archive, its suffix."""
+    """A system that units run on: LLVM's `triple`, the compiler's `target`, folder by FMI version, library suffix."""
 
     triple: str
     target: str
@@ -51,43 +53,44 @@ class Platform(NamedTuple):
     suffix: str
 
 
-PLATFORMS: Mapping[str, Platform] = as_type(
+PLATFORMS: Mapping[str, Platform] = convert_type(
     dict[str, Platform], tomllib.loads((files("sealscope.fmu") / "platforms.toml").read_text("utf-8"))
 )
 
 
 def this_platform() -> str:
-    """Return the name in `PLATFORMS` of this system.
-
-    Raises InputError on another one.
-    """
+    """Return the name of this system in `PLATFORMS`; raise InputError if it is not there."""
     import platform
 
-    arm = platform.machine().lower() in ("arm64", "aarch64")
+    is_arm = platform.machine().lower() in ("arm64", "aarch64")
     name = {"linux": "linux", "win32": "windows", "darwin": "macos"}.get(sys.platform, sys.platform)
-    name += "-arm" if arm else ""
+    name += "-arm" if is_arm else ""
     if name not in PLATFORMS:
         raise InputError(f"platform must be one of {', '.join(PLATFORMS)}, got {name}; name it")
     return name
 
 
-def compiler() -> tuple[list[str], bool]:
-    """Find a C compiler and whether it compiles for other systems: zig's, else the system's.
+class Compiler(NamedTuple):
+    """A C compiler's command, and whether it compiles for other systems."""
 
-    Raises InputError where there is none.
-    """
+    command: list[str]
+    cross_compiles: bool
+
+
+def find_compiler() -> Compiler:
+    """Find a C compiler, zig's or else the system's; raise InputError if there is none."""
     from importlib.util import find_spec
 
     if find_spec("ziglang") is not None:
-        return [sys.executable, "-P", "-m", "ziglang", "cc"], True
+        return Compiler([sys.executable, "-P", "-m", "ziglang", "cc"], cross_compiles=True)
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
-            return [path], False
+            return Compiler([path], cross_compiles=False)
     raise InputError("an FMU needs a C compiler, and there is none here; pip install 'sealscope[fmu]' brings it")
 
 
 def fmi_headers() -> Path:
-    """Find the folder of the standard's headers, which FMPy carries; raise InputError where it is not installed."""
+    """Find the folder of FMI's C headers in the package FMPy; raise InputError if it is not installed."""
     from importlib.util import find_spec
 
     package = find_spec("fmpy")
@@ -96,90 +99,89 @@ def fmi_headers() -> Path:
     return Path(package.origin).parent / "c-code"
 
 
-def chosen_step(rig: Rig, error: float) -> tuple[float, float]:
-    """Choose a step [s] of the solver by which pressures are off by `error` [Pa rms] at most, and its error.
+def choose_step(rig: Rig, error: float) -> tuple[float, float]:
+    """Choose the solver's step [s] for an rms error of the pressures of at most `error` [Pa]; return it and its error.
 
-    As a run of some seconds under each of `COMMANDS` chooses it, at the piston's mid-stroke.
+    It is the shorter of those that runs of 4 s under each of `STEP_COMMANDS`, from mid-stroke, choose.
     """
     from sealscope.simulation.experiment import Experiment
-    from sealscope.simulation.integrate import trajectory
+    from sealscope.simulation.integrate import integrate_run
 
-    runs = [trajectory(Experiment.of(rig=rig, command=command, duration=4.0, error=error), ()) for command in COMMANDS]
+    experiments = (Experiment.of(rig=rig, command=command, duration=4.0, error=error) for command in STEP_COMMANDS)
+    runs = [integrate_run(experiment, ()) for experiment in experiments]
     return min(run.step for run in runs), max(run.error for run in runs)
 
 
 class MockUp(NamedTuple):
-    """A unit before it is built: its code, its variables, and the sizes and starts that its layer in C needs.
+    """A unit before it is built.
 
-    `modules`: LLVM code of its functions; `values`: parameters at the start, in the order of the code; `inputs`,
-    `results`, `states`: how many; `step` [s]: longest step of its solver; `failures`: words for the codes that its
-    functions return.
+    `summary`: its description; `modules`: LLVM code by function; `variable_list`: its variables; `values`: initial
+    values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: sizes of its arrays; `step`
+    [s]: longest step of the solver; `failures`: messages for the codes that the functions return.
     """
 
-    words: str
+    summary: str
     modules: Mapping[str, str]
-    listed: tuple[Variable, ...]
+    variable_list: tuple[Variable, ...]
     values: tuple[float, ...]
-    inputs: int
-    results: int
-    states: int
+    n_inputs: int
+    n_results: int
+    n_states: int
     step: float
     failures: Mapping[int, str]
 
     @property
     def token(self) -> str:
-        """The unit's identity in the description and the library."""
-        return hashlib.sha256("".join([self.words, str(self.listed), *self.modules.values()]).encode()).hexdigest()[:32]
+        """A hash of the unit, by which the description and the library identify each other."""
+        texts = [self.summary, str(self.variable_list), *self.modules.values()]
+        return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
-        """Write the unit's archive; raise InputError where the compiler refuses."""
+        """Write the unit's archive, with a library for each platform; raise InputError if the compiler fails."""
         name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
-        identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # of C
+        identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # must be valid in C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
-            place = Path(folder)
-            sources = self._sources(place, version)
+            source_folder = Path(folder)
+            sources = self._write_sources(source_folder, version)
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                xml = description(version, identifier, self.token, self.words, self.listed)
+                xml = format_description(version, identifier, self.token, self.summary, self.variable_list)
                 archive.writestr("modelDescription.xml", xml)
                 for system in platforms:
                     target = f"binaries/{PLATFORMS[system].folders[version]}/{identifier}{PLATFORMS[system].suffix}"
-                    archive.writestr(target, self._library(place, system, version))
+                    archive.writestr(target, self._compile_library(source_folder, system, version))
                 for source in sources:
-                    archive.write(source, f"sources/{source.relative_to(place).as_posix()}")
+                    archive.write(source, f"sources/{source.relative_to(source_folder).as_posix()}")
 
-    def _sources(self, place: Path, version: Version) -> list[Path]:
-        """Write the sources of the unit below `place`, and return their paths."""
-        layer = files("sealscope.fmu") / "c"
-        present = {variable.reference - REFERENCES["value"] for variable in self.listed}
-        config = (
-            templates()
-            .get_template("config.h.j2")
-            .render(unit=self, references=REFERENCES, present=[int(k in present) for k in range(len(self.values))])
-        )
-        texts = {name: (layer / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
+    def _write_sources(self, folder: Path, version: Version) -> list[Path]:
+        """Write the sources of the unit to a folder; return their paths."""
+        interface = files("sealscope.fmu") / "c"
+        value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
+        present = [int(k in value_indices) for k in range(len(self.values))]  # 1: a parameter is a variable of the unit
+        config = templates().get_template("config.h.j2").render(unit=self, references=REFERENCES, present=present)
+        texts = {name: (interface / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
         texts |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
         texts |= {"config.h": config} | {f"{function}.ll": module for function, module in self.modules.items()}
         texts["README.txt"] = _README
-        (place / "headers").mkdir()
+        (folder / "headers").mkdir()
         for name, text in texts.items():
-            (place / name).write_text(text, encoding="utf-8")
-        return [place / name for name in texts]
+            (folder / name).write_text(text, encoding="utf-8")
+        return [folder / name for name in texts]
 
-    def _library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Build the shared library of the unit for a platform, from the sources in `folder`."""
-        platform, (call, crosses) = PLATFORMS[system], compiler()
+    def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
+        """Compile the unit's shared library for a platform, from the sources in `folder`; return its bytes."""
+        platform, compiler = PLATFORMS[system], find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
             inputs.append(folder / f"{function}-{system}.o")
             inputs[-1].write_bytes(object_code(module, platform.triple))
         output = folder / f"{system}{platform.suffix}"
-        target = ["-target", platform.target] if crosses else []
+        target = ["-target", platform.target] if compiler.cross_compiles else []
         flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
-        command = [*call, *target, *flags, *map(str, inputs), "-lm"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
-        if done.returncode:
-            caller, messages = " ".join(call), done.stderr[-500:]
-            raise InputError(f"the C compiler ({caller}) could not build the unit for {system}: {messages}")
+        command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
+        process = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+        if process.returncode:
+            name, messages = " ".join(compiler.command), process.stderr[-500:]
+            raise InputError(f"the C compiler ({name}) could not build the unit for {system}: {messages}")
         return output.read_bytes()
 
 
@@ -195,9 +197,8 @@ def write_fmu(
 ) -> tuple[Variable, ...]:
     """Write a rig as a functional mock-up unit for co-simulation.
 
-    Its code is that of the laws which `simulate` runs, compiled; there is no Python in it. Inputs are the command, a
-    leak, leakage outwards and a load; every parameter that the rig's laws take can be tuned; outputs are the states,
-    the flows and the powers.
+    The unit contains the compiled laws of `simulate`, and needs no Python. Its inputs are the command, a leak, external
+    leakage and a load; every parameter that the rig's laws take can be tuned; its outputs are states, flows and powers.
 
     Parameters
     ----------
@@ -208,17 +209,17 @@ def write_fmu(
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
-        Systems that it shall run on: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm"; by
-        default the one that runs. Others need the compiler that ``pip install 'sealscope[fmu]'`` brings.
+        Systems that it runs on: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm"; by default
+        this one. Others need the compiler that ``pip install 'sealscope[fmu]'`` installs.
     error : float, optional
-        rms error [Pa] that a pressure may have, by which the longest step of the unit's solver is chosen.
+        Largest rms error of a pressure [Pa], by which the solver's step is chosen.
     step : float, optional
-        That step [s], instead of one chosen by `error`.
+        Longest step of the solver [s], in place of one chosen by `error`.
 
     Returns
     -------
     tuple of Variable
-        What the unit lists: name, unit, causality, value at the start.
+        The unit's variables: name, unit, causality, initial value.
 
     Raises
     ------
@@ -232,28 +233,28 @@ def write_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['u', 'G', 'C', 'F', 'G_ext_A', 'G_ext_B']
     """
-    path, chosen_platforms = Path(path), _checked(path, fmi, platforms)
-    machine = _pump_controlled(rig)
+    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
+    machine = _load_pump_controlled_rig(rig)
     if step is None:
-        step, error_found = chosen_step(machine, error)
-        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {error_found:.2g} Pa rms"
+        step, found_error = choose_step(machine, error)
+        accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {found_error:.2g} Pa rms"
     elif step > 0:
         accuracy = f"steps of at most {step:.3g} s"
     else:
         raise InputError(f"step must be > 0 s, got {step}")
     unit = MockUp(
-        f"{machine.title}; {accuracy}",
-        code(Choice.from_rig(machine)),
-        tuple(variables(machine, step)),
-        values_of(machine),
-        len(INPUTS),
-        len(RESULTS),
-        len(STATES),
-        step,
-        FAILURES,
+        summary=f"{machine.title}; {accuracy}",
+        modules=rig_code(RigChoice.from_rig(machine)),
+        variable_list=tuple(variables(machine, step)),
+        values=parameter_values(machine),
+        n_inputs=len(INPUTS),
+        n_results=len(RESULTS),
+        n_states=len(STATES),
+        step=step,
+        failures=FAILURES,
     )
     unit.write(path, fmi, chosen_platforms)
-    return unit.listed
+    return unit.variable_list
 
 
 @checked_call
@@ -268,28 +269,28 @@ def write_sensor_fmu(
 ) -> tuple[Variable, ...]:
     """Write a soft sensor of leakage as a functional mock-up unit for co-simulation.
 
-    Readings go in, the leakage in m^3/s with its 95 % interval comes out, and its rise over the first minute. Its code
-    is that of the live volume balance, compiled; there is no Python in it.
+    Its inputs are readings; its outputs are the leakage in m^3/s with its 95 % interval, and its rise over that of the
+    first blocks. The unit contains the compiled live volume balance, and needs no Python.
 
     Parameters
     ----------
     path : str or path-like
         File to write (.fmu).
     sensor : {"volume"}, optional
-        What it reads beside the chamber pressures: the pump's angle and the piston's position.
+        Method: the volume balance, which reads chamber pressures, the pump's angle and the piston's position.
     rig : Rig, str or path-like, optional
         The assumed machine: a rig, the name of a packaged one, or the path of a TOML file.
     rate : float, optional
-        Sampling rate [Hz], 16 at least, whatever the communication steps are.
+        Sampling rate [Hz], at least 16; it does not depend on the communication steps.
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
-        Systems that it shall run on, as of `write_fmu`.
+        Systems that it runs on, as in `write_fmu`.
 
     Returns
     -------
     tuple of Variable
-        What the unit lists: name, unit, causality, value at the start.
+        The unit's variables: name, unit, causality, initial value.
 
     Raises
     ------
@@ -303,40 +304,43 @@ def write_sensor_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['p_A', 'p_B', 'theta', 'x']
     """
-    from sealscope.fmu import sensor as own
+    from sealscope.fmu import sensor as sensor_unit
 
-    path, chosen_platforms = Path(path), _checked(path, fmi, platforms)
+    path, chosen_platforms = Path(path), _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
-    if not rate >= RESOLVED / STRIDE:
-        raise InputError(f"rate of a soft sensor must be >= {RESOLVED / STRIDE:g} Hz, got {rate:g}")
-    machine = _pump_controlled(rig)
-    choice = own.SensorChoice.from_rig(machine, float(rate))
+    if not rate >= MIN_STRIDE / STRIDE:
+        raise InputError(f"rate of a soft sensor must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
+    machine = _load_pump_controlled_rig(rig)
+    choice = sensor_unit.SensorChoice.from_rig(machine, float(rate))
     unit = MockUp(
-        f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
-        own.sensor_code(choice),
-        tuple(own.variables(machine)),
-        values_of(machine),
-        len(own.INPUTS),
-        len(SENSOR_RESULTS),
-        own.memory_of(choice).itemsize // 8,
-        1.0 / rate,
-        own.FAILURES,
+        summary=f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
+        modules=sensor_unit.sensor_code(choice),
+        variable_list=tuple(sensor_unit.variables(machine)),
+        values=parameter_values(machine),
+        n_inputs=len(sensor_unit.INPUTS),
+        n_results=len(SENSOR_RESULTS),
+        n_states=sensor_unit.memory_layout(choice).itemsize // 8,  # a record of doubles
+        step=1.0 / rate,
+        failures=sensor_unit.FAILURES,
     )
     unit.write(path, fmi, chosen_platforms)
-    return unit.listed
+    return unit.variable_list
 
 
-def _pump_controlled(rig: Rig | str | os.PathLike[str]) -> Rig:
-    """Load the rig of a unit; raise InputError for one with a servo valve."""
+def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
+    """Load the rig of a unit; raise InputError if it has a servo valve."""
     machine = load_rig(rig)
-    if machine.valve.spool == "present":
+    if not machine.circuit.pump_feeds_chambers:
         raise InputError(f"a unit must be of a pump-controlled rig (valve.spool = absent), got {machine.name}")
     return machine
 
 
-def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
-    """Check name, version and platforms of a unit; return the platforms."""
+def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
+    """Choose the platforms of a unit, by default this one; check them, the file's name and the FMI version.
+
+    Raises InputError for a wrong one, or for a platform that the compiler cannot build for.
+    """
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")
     if fmi not in (2, 3):
@@ -346,6 +350,6 @@ def _checked(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | 
         if name not in PLATFORMS or fmi not in PLATFORMS[name].folders:
             platform_names = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
             raise InputError(f"a platform of FMI {fmi} must be one of {platform_names}, got {name!r}")
-        if name != this_platform() and not compiler()[1]:
+        if name != this_platform() and not find_compiler().cross_compiles:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
     return chosen_platforms

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Load the templates of a unit's texts."""
+    """Return the jinja2 environment that loads a unit's templates: its XML description and its C configuration."""
     import jinja2
 
     return jinja2.Environment(
@@ -30,30 +30,33 @@ def templates() -> jinja2.Environment:
 
 
 def base_units(unit: str) -> dict[str, str] | None:
-    """Convert a unit to FMI's exponents of SI's base units and a factor; None where one is not whole.
+    """Convert a unit to FMI's exponents of the SI base units and factor; None if an exponent is not whole.
 
-    Raises InputError for a unit that is not known.
+    Raises InputError for an unknown unit.
     """
     parsed = parse_unit(unit)
     if any(power.denominator != 1 for _, power in parsed.powers):
         return None
-    base = {name: str(power) for name, power in parsed.powers if name != "count"}
+    base = {name: str(power) for name, power in parsed.powers if name != "count"}  # FMI has no unit of counts
     factor = float(parsed.factor) * math.pi ** float(parsed.pi_power)
     return base if factor == 1.0 else base | {"factor": repr(factor)}
 
 
-def description(fmi: int, identifier: str, token: str, words: str, variables: Sequence[Variable]) -> str:
-    """Format modelDescription.xml of FMI 2.0 or 3.0."""
+def format_description(fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable]) -> str:
+    """Format modelDescription.xml of FMI 2.0 or 3.0.
+
+    `identifier`: prefix of the C functions; `token`: hash by which the library recognises its description.
+    """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]
-    units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # that of the time is always needed
+    units = sorted({"s", *(variable.unit for variable in variables)} - {"1"})  # s is the unit of the time
     return (
         templates()
         .get_template(f"fmi{fmi}.xml.j2")
         .render(
             identifier=identifier,
             token=token,
-            words=words,
+            summary=summary,
             sealscope=version("sealscope"),
             units=[(unit, base_units(unit)) for unit in units],
             variables=variables,

@@ -1,21 +1,22 @@
 """The code of a soft sensor: the live volume balance, sample by sample, as functions that C can call.
 
-Its laws are those of a running machine's balance (`diagnosis.inference`): each sample adds the increments of the terms
-to the open rows of the weak form, a block's rows are weighted and summed, and the sums tell the conductance of the
-block. No samples are kept but those of `HALF_DIFFERENCE` around the present one.
+Its laws are those of the live balance (`diagnosis.inference`): each sample adds the increments of the terms to the open
+rows of the weak form, the rows of a block are weighted and summed, and the block's conductance is estimated from the
+sums. Only the samples within `HALF_DIFFERENCE` of the present one are stored.
 
-The mean conductance of the last n blocks (`WINDOW` at most) has the interval
+The mean conductance of the last n blocks (at most `WINDOW`) has the interval
 
     G +- hypot(t_(n-1) sqrt(v/n), 1.96 o),    v = max(s^2, mean of sd^2)
 
-with the scatter s of the blocks, the deviations sd that the sums tell, Student's t, and the deviation o of the level,
-by the other coefficients and the size of the machine. Its rise over the first N = `WINDOW` blocks, d blocks before, is
-uncertain by theirs and by the walk of a healthy machine, w times a block's noise a block:
+with the standard deviation s of the blocks' estimates, their standard errors sd, Student's t, and the systematic
+standard error o due to the other coefficients and the size of the machine. Its rise over the mean of the first N =
+`WINDOW` blocks, d blocks before, adds their variance and the random walk of a healthy machine, whose variance a block
+is w times that of a block's noise:
 
     variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
 
-(N blocks of such a walk scatter by w (N + 1)/6 beside their noise). The flow is G times the mean of abs(p_A - p_B) as
-recorded; the live balance takes the sensors' noise off it, a few per cent.
+(in the variance v_0 of N blocks such a walk adds w (N + 1)/6 to the noise). The flow is G times the mean of
+abs(p_A - p_B) as recorded; the live balance also subtracts the sensors' noise from it, a few per cent.
 """
 
 from __future__ import annotations
@@ -29,386 +30,475 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import carray
 
-from sealscope.compiled import large_law, law, layout_of, record_at
-from sealscope.diagnosis.inference.blocks import Columns
+from sealscope.compiled import large_law, law, record_dtype, record_view
+from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.inference.rows.row_weights import SUPPORT, Workspace, median, weigh, workspace_shapes
-from sealscope.diagnosis.inference.rows.weak_form import LARGEST, SPAN, STRIDE, stride_samples, test_function
-from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, LEAST_ABSOLUTE
-from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED, TELLS, WAKES, live_equations, size_error
-from sealscope.diagnosis.live.known import (
+from sealscope.diagnosis.inference.rows.row_weights import SUPPORT, Workspace, median, weigh_rows, workspace_shapes
+from sealscope.diagnosis.inference.rows.weak_form import MAX_READING, SPAN, STRIDE, stride_samples, test_function
+from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, MIN_ABSOLUTE_PRESSURE
+from sealscope.diagnosis.live.balance import (
+    BLOCK_SECONDS,
+    LEARNED,
+    MIN_REST_PRECISION,
+    N_WAKING,
+    live_equations,
+    size_error,
+)
+from sealscope.diagnosis.live.coefficients import (
     MISFIT,
     STANDSTILL,
     TINY,
-    Known,
-    add,
-    begin,
-    known_shapes,
-    motion,
-    says,
-    take,
+    Coefficients,
+    add_block,
+    coefficient_shapes,
+    estimate_leak,
+    fit_coefficients,
+    load_block,
+    relative_motion,
 )
 from sealscope.errors import InputError
 from sealscope.fmu.machine import unit_code
-from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, inputs, outputs, parameter
+from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, input_variables, output_variables, rig_variable
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 from sealscope.units import P_ATM
 
 #: Channels that a soft sensor reads, in the order of the samples.
 INPUTS = ("p_A", "p_B", "theta", "x")
-#: What a function of a soft sensor returns where it fails.
-FAILURES = MappingProxyType({1: "pump.q_b must be > 0 m^3/rev"})
-#: The parameter of the rig that the balance reads.
-READ = "pump.q_b"
-#: Blocks of a mean, and of the baseline.
+_P_A, _P_B, _THETA, _X = range(len(INPUTS))
+#: Results of a function of a soft sensor: success, or a code of `FAILURES` with its message.
+_SUCCESS, _NO_DISPLACEMENT = 0, 1
+FAILURES = MappingProxyType({_NO_DISPLACEMENT: "pump.q_b must be > 0 m^3/rev"})
+#: The only parameter of the rig that the balance reads: the pump's displacement [m^3/rev], and its index in `VALUES`.
+DISPLACEMENT = "pump.q_b"
+_DISPLACEMENT_INDEX = VALUES.index(DISPLACEMENT)
+#: Number of blocks of a mean, and of the baseline.
 WINDOW = 20
-#: Walk of a block over its noise (variances) in a healthy machine: the oil's warming shows from block to block.
+#: Variance of a healthy machine's random walk a block, over that of a block's noise; the warming oil causes it.
 WALK = 3.0
-_SIZE = VALUES.index(READ)
-#: The columns in the order of `_increments`: the terms' names, and the left side.
+#: Columns of a row in the order of `_compute_increments`: the regressors, and the response, the pump's flow.
 COLUMNS = (
     *(f"motion {way}, {side} carries" for way in ("out", "in") for side in "AB"),
     *(name for s in "AB" for name in (f"compliance {s}", f"compliance {s} over the stroke", f"free air {s}",
                                       f"dissolving air {s}")),
-    "lag", "bias", "leak", "left",
+    "lag", "bias", "leak", "response",
 )  # fmt: skip
-_WIDTH, _LEAK, _LEFT = len(COLUMNS), len(COLUMNS) - 2, len(COLUMNS) - 1
-_PLACE = tuple(range(_WIDTH))
-#: Numbers of a soft sensor's memory.
-_COUNTERS = (
-    "clock", "sample_count", "sign", "closed", "pending", "row_count", "wait_count", "precision", "woken", "blocks",
-    "base", "base_square", "base_variance",
+_N_COLUMNS, _MOTION, _COMPLIANCE = len(COLUMNS), 0, (COLUMNS.index("compliance A"), COLUMNS.index("compliance B"))
+_LAG, _BIAS, _LEAK, _RESPONSE = (COLUMNS.index(name) for name in ("lag", "bias", "leak", "response"))
+_ALL_COLUMNS = tuple(range(_N_COLUMNS))
+#: Columns of `history`, the results of the last blocks: conductance G by the present coefficients [m^3/(s Pa)], the
+#: conductance g that is comparable between blocks, its variance, the systematic variance of G, and the mean of
+#: abs(p_A - p_B) [Pa].
+_G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
+#: Indices of the outputs.
+(
+    _OUT_Q, _OUT_Q_LOW, _OUT_Q_HIGH, _OUT_RISE, _OUT_RISE_LOW, _OUT_RISE_HIGH, _OUT_G, _OUT_MISFIT, _OUT_BLOCKS,
+    _OUT_SETTLED,
+) = range(len(SENSOR_RESULTS))  # fmt: skip
+#: Columns of `pressure_sums`: the sum of abs(p_A - p_B) [Pa] over a block's samples, and their number.
+_SUM, _NUMBER = 0, 1
+#: Columns of `waiting_sizes`: number of rows, and mean abs(p_A - p_B) [Pa], of a block.
+_BLOCK_ROWS, _BLOCK_PRESSURE = 0, 1
+#: Scalars of a soft sensor's memory: time to the next sample [s]; samples; direction of the angle's counts, 1 or -1;
+#: blocks weighted; open blocks and their rows; waiting blocks; usual precision; successive blocks of larger motion;
+#: blocks estimated; sums of g, g^2 and its variance over the baseline.
+_SCALARS = (
+    "clock", "sample_count", "angle_sign", "n_weighted", "n_open", "n_rows", "n_waiting", "usual_precision", "n_moving",
+    "n_estimated", "base_sum", "base_square_sum", "base_variance_sum",
 )  # fmt: skip
 
 
 def variables(rig: Rig) -> Iterator[Variable]:
     """Yield the variables of a soft sensor."""
-    yield from inputs({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in INPUTS})
-    yield from filter(None, [parameter(rig, READ, "fixed")])
-    yield from outputs(SENSOR_RESULTS)
+    yield from input_variables({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in INPUTS})
+    yield from filter(None, [rig_variable(rig, DISPLACEMENT, "fixed")])
+    yield from output_variables(SENSOR_RESULTS)
 
 
 class SensorChoice(NamedTuple):
-    """The parameters that the code of a soft sensor depends on.
+    """The settings that are compiled into a soft sensor.
 
-    `rate` [Hz]; `size_error`: how far the machine's size is known; `place`, `fast`: columns as `weigh` takes them.
+    `rate`: samples per second [Hz]; `size_error`: relative uncertainty of the machine's size; `column_order`: indices
+    into `COLUMNS`, the `n_fast` coefficients fitted to each block first, the response last (`weigh_rows`).
     """
 
     rate: float
     size_error: float
-    place: tuple[int, ...]
-    fast: int
+    column_order: tuple[int, ...]
+    n_fast: int
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Return a rig's choice; raise InputError where its balance has other terms than the code."""
+        """Return the settings for a rig; raise InputError if its balance has other terms than `COLUMNS`."""
         (balance,) = live_equations(rig, INPUTS)
-        columns = Columns(balance)
+        columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
             raise InputError(f"a soft sensor's terms must be {', '.join(COLUMNS[:-1])}, got {', '.join(columns.names)}")
         fast = columns.fast
-        return cls(rate, size_error(rig), (*fast, *columns.support, columns.left), len(fast))
+        return cls(rate, size_error(rig), (*fast, *columns.slow, columns.left), len(fast))
 
 
-class _Numbers(NamedTuple):
-    """Counts of the code: samples of a stride, strides of a block, half the samples of a difference."""
+class _Lengths(NamedTuple):
+    """Number of samples in a stride, of strides in a block, and of samples in half a central difference."""
 
-    stride: int
-    strides: int
-    half: int
+    stride_samples: int
+    block_strides: int
+    half_difference: int
 
     @classmethod
-    def from_rate(cls, rate: float) -> _Numbers:
+    def from_rate(cls, rate: float) -> _Lengths:
+        """Round the lengths to the samples at a rate [Hz]."""
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
-def memory_of(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory.
+def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
+    """Build the layout of a soft sensor's memory: `_SCALARS`, and these arrays.
 
-    `ring`: the last samples; `increments`, `opened`: of an interval, and the rows that it is part of; `rows`, `ends`,
-    `gram`: of the blocks that are weighted together; `sizes`: sum and number of abs(p_A - p_B) in the last blocks;
-    `support`: what supports the weights; `waits`, `waiting`, `ordered`: sums, rows and size, and precisions of the
-    blocks that are learned from; `last`: of each of the last blocks total, conductance, its variance, that of the
-    level, and abs(p_A - p_B); `workspace`, `known`: a `Workspace` and a `Known`.
+    Samples: `ring`, the last samples, one column each; `increments` of all terms over one sample interval.
+    Rows of the weak form: `unfinished`, the `SPAN` rows to which the present interval adds; `rows`, finished ones of
+    the open blocks, and `ends`, the index past the last row of each; `gram` matrices of these; `pressure_sums` of the
+    last blocks (`_SUM`, `_NUMBER`); `slow_sums`, sums for the slow coefficients over earlier blocks (`weigh_rows`).
+    Blocks before the first fit: `waiting_grams`, `waiting_sizes` (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions`.
+    Results: `history` of the last blocks (`_G` ... `_PRESSURE`). `workspace`: a `Workspace`; `model`: `Coefficients`.
     """
-    n, slow = _Numbers.from_rate(choice.rate), len(choice.place) - choice.fast - 1
-    rows = SUPPORT * n.strides
-    workspace = workspace_shapes(rows, SUPPORT, len(choice.place), slow)
-    return layout_of(
-        *_COUNTERS,
-        ring=(len(INPUTS), 2 * n.half + 3),
-        increments=(_WIDTH,),
-        opened=(SPAN, _WIDTH),
-        rows=(rows, _WIDTH),
+    lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
+    max_rows = SUPPORT * lengths.block_strides
+    workspace = workspace_shapes(max_rows, SUPPORT, len(choice.column_order), n_slow)
+    return record_dtype(
+        *_SCALARS,
+        ring=(len(INPUTS), 2 * lengths.half_difference + 3),
+        increments=(_N_COLUMNS,),
+        unfinished=(SPAN, _N_COLUMNS),
+        rows=(max_rows, _N_COLUMNS),
         ends=(SUPPORT,),
-        gram=(SUPPORT, _WIDTH, _WIDTH),
-        sizes=(SUPPORT + 1, 2),
-        support=(slow + 1, slow + 1),
-        waits=(LEARNED, _WIDTH, _WIDTH),
-        waiting=(LEARNED, 3),
-        ordered=(LEARNED,),
-        last=(WINDOW, 5),
-        workspace=layout_of(**dict(zip(Workspace._fields, workspace, strict=True))),
-        known=layout_of(**dict(zip(Known._fields, known_shapes(_LEAK), strict=True))),
+        gram=(SUPPORT, _N_COLUMNS, _N_COLUMNS),
+        pressure_sums=(SUPPORT + 1, 2),
+        slow_sums=(n_slow + 1, n_slow + 1),
+        waiting_grams=(LEARNED, _N_COLUMNS, _N_COLUMNS),
+        waiting_sizes=(LEARNED, 2),
+        precisions=(LEARNED,),
+        history=(WINDOW, 5),
+        workspace=record_dtype(**dict(zip(Workspace._fields, workspace, strict=True))),
+        model=record_dtype(**dict(zip(Coefficients._fields, coefficient_shapes(_LEAK), strict=True))),
     )
 
 
-def functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
-    """Build the functions of a soft sensor: ``start``, ``advance`` and ``report`` as of a machine."""
+def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
+    """Build the functions of a soft sensor: ``start``, ``advance`` and ``report``, as for a rig (`fmu.machine`)."""
     from scipy.special import stdtrit
 
-    layout = memory_of(choice)
-    sample, memory, length, interval = _sample(choice), record_at(layout), layout.itemsize // 8, 1.0 / choice.rate
+    layout, interval = memory_layout(choice), 1.0 / choice.rate
+    add_sample, memory = _build_sample_law(choice), record_view(layout)
+    n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
-    error = choice.size_error
-    quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t
+    size_error = choice.size_error
+    quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t, 95 %
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        carray(y, length)[:] = 0.0
-        return 0 if carray(values, n_values)[_SIZE] > 0.0 else 1
+        """Clear the sensor's memory `y`; return a failure if the pump has no displacement."""
+        carray(y, n_memory)[:] = 0.0
+        return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        m, displacement = memory(y), carray(values, n_values)[_SIZE] / (2.0 * math.pi)
-        a, b = carray(inputs, n_inputs), carray(slopes, n_inputs)
+        """Add the samples of the next `span` [s], in which the inputs change linearly by their slopes [1/s]."""
+        m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
+        first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
         t = m.clock
         while t < span - 1e-6 * interval:  # a sample at the end is the next step's first
-            sample(m, displacement, a[0] + b[0] * t, a[1] + b[1] * t, a[2] + b[2] * t, a[3] + b[3] * t)
+            add_sample(
+                m,
+                displacement,
+                p_A=first[_P_A] + slope[_P_A] * t,
+                p_B=first[_P_B] + slope[_P_B] * t,
+                theta=first[_THETA] + slope[_THETA] * t,
+                x=first[_X] + slope[_X] * t,
+            )
             t += interval
         m.clock = t - span
-        return 0
+        return _SUCCESS
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        _write_results(memory(y), error, quantiles, carray(results, n_results))
-        return 0
+        """Write the sensor's outputs to `results`."""
+        _write_results(memory(y), size_error, quantiles, carray(results, n_results))
+        return _SUCCESS
 
     return {"start": start, "advance": advance, "report": report}
 
 
-def _sample(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the law that takes a sample of the channels `INPUTS`."""
-    (stride, strides, half), rate = _Numbers.from_rate(choice.rate), choice.rate
-    support, weight = SPAN * stride, float(test_function(rate)[0, 0]) / (1.0 - (1.0 / (SPAN * stride) - 1.0) ** 2) ** 4
-    close, length = _close(choice), stride * strides
+def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
+    """Build the law that adds a sample of the channels `INPUTS` to the memory."""
+    (n_stride, block_strides, half), rate = _Lengths.from_rate(choice.rate), choice.rate
+    n_support, n_block = SPAN * n_stride, n_stride * block_strides
+    # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
+    peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
+    finish_block = _build_block_law(choice)
 
     @law
-    def sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
-        count, width = int(m.sample_count), m.ring.shape[1]
-        newest = count % width
-        m.ring[0, newest], m.ring[1, newest], m.ring[2, newest], m.ring[3, newest] = p_A, p_B, theta, x
+    def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
+        """Add a sample to memory m; finish a row at the end of each stride, a block at the end of its last row."""
+        n_samples, width = int(m.sample_count), m.ring.shape[1]
+        newest = n_samples % width
+        m.ring[_P_A, newest], m.ring[_P_B, newest], m.ring[_THETA, newest], m.ring[_X, newest] = p_A, p_B, theta, x
         m.sample_count += 1.0
-        k = count - half - 1  # the interval from sample k on, which half a difference is known after
+        k = n_samples - half - 1  # the newest interval with half a difference of samples behind it
         if k < 0:
             return
-        _increments(m.ring, k, half, rate, displacement, m.increments)
-        piece, inside, slot = k // stride, k % stride, (k // length) % (SUPPORT + 1)
-        if k % length == 0:
-            m.sizes[slot, 0] = m.sizes[slot, 1] = 0.0
-        if not math.isnan(m.increments[_WIDTH - 2] + m.increments[_WIDTH - 1]):
-            m.sizes[slot, 0] += abs(m.increments[_WIDTH - 2]) * rate
-            m.sizes[slot, 1] += 1.0
-        for p in range(SPAN):
-            row = (piece - p) % SPAN
-            s = (p * stride + inside + 0.5) * 2.0 / support - 1.0
-            phi = weight * (1.0 - s * s) ** 4
-            for j in range(_WIDTH):
-                before = 0.0 if p == 0 and inside == 0 else m.opened[row, j]
-                m.opened[row, j] = before + phi * m.increments[j]
-        row = piece - SPAN + 1
-        if inside < stride - 1 or row < 0:
+        _compute_increments(m.ring, k, half, rate, displacement, m.increments)
+        _add_pressure_difference(m, k, n_block, rate)
+        stride, k_in_stride = k // n_stride, k % n_stride
+        for age in range(SPAN):  # add to the row that began `age` strides ago, weighted by its test function phi(s)
+            row = (stride - age) % SPAN
+            s = (age * n_stride + k_in_stride + 0.5) * 2.0 / n_support - 1.0  # -1 .. 1 over the row
+            phi = peak * (1.0 - s * s) ** 4
+            for j in range(_N_COLUMNS):
+                row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[row, j]  # a new row begins at 0
+                m.unfinished[row, j] = row_sum + phi * m.increments[j]
+        row = stride - SPAN + 1  # finished at the end of this stride
+        if k_in_stride < n_stride - 1 or row < 0:
             return
-        finite, place = True, int(m.row_count)
-        for j in range(_WIDTH):
-            m.rows[place, j] = m.opened[row % SPAN, j]
-            finite = finite and abs(m.rows[place, j]) < LARGEST
-        m.row_count += finite
-        if row % strides == strides - 1:
-            close(m, m.rows[: int(m.row_count)], m.ends[: int(m.pending) + 1], row // strides)
+        is_finite, place = True, int(m.n_rows)
+        for j in range(_N_COLUMNS):
+            m.rows[place, j] = m.unfinished[row % SPAN, j]
+            is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
+        m.n_rows += is_finite
+        if row % block_strides == block_strides - 1:
+            finish_block(m, m.rows[: int(m.n_rows)], m.ends[: int(m.n_open) + 1], row // block_strides)
 
-    return sample  # type: ignore[no-any-return]
-
-
-@large_law
-def _increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
-    """Write the increments of the interval from sample k on, in the order of `COLUMNS`, into `out`."""
-    width = ring.shape[1]
-    slot, next_slot = k % width, (k + 1) % width
-    dx, x = ring[3, next_slot] - ring[3, slot], 0.5 * (ring[3, next_slot] + ring[3, slot])
-    out_A, outward, by_A = 0.0, 0.0, 0.0
-    for i in range(k, k + 2):
-        moves = 0.5 * (ring[3, (i + half) % width] >= ring[3, max(i - half, 0) % width])
-        carries = ring[0, i % width] > ring[1, i % width]
-        out_A, outward, by_A = out_A + moves * carries, outward + moves, by_A + 0.5 * carries
-    out[0], out[1] = out_A * dx, (outward - out_A) * dx
-    out[2], out[3] = (by_A - out_A) * dx, (1.0 - outward - by_A + out_A) * dx
-    for side in range(2):
-        before, after = ring[side, slot], ring[side, next_slot]
-        low, high = max(before + P_ATM, LEAST_ABSOLUTE), max(after + P_ATM, LEAST_ABSOLUTE)
-        column = 4 + 4 * side
-        out[column], out[column + 1] = after - before, x * (after - before)
-        out[column + 2], out[column + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
-    earlier, later = max(k - 1, 0), k + 1
-    slope = ring[3, (later + 1) % width] - ring[3, later % width]
-    slope -= ring[3, (earlier + 1) % width] - ring[3, earlier % width]
-    out[12] = rate * slope / (later - earlier)
-    out[13] = 1.0 / rate
-    out[14] = 0.5 * (ring[0, slot] + ring[0, next_slot] - ring[1, slot] - ring[1, next_slot]) / rate
-    out[15] = displacement * (ring[2, next_slot] - ring[2, slot])
+    return add_sample  # type: ignore[no-any-return]
 
 
 @law
-def _orient(m: Any, count: int) -> None:
-    """Determine the sign of the left side's counts (`BlockStream`) from the first rows."""
-    mean, work = 0.0, 0.0
-    for r in range(count):
-        mean += m.rows[r, _LEAK] / count
-    for r in range(count):
-        work += (m.rows[r, _LEAK] - mean) * m.rows[r, _LEFT]
-    m.sign = -1.0 if work < 0.0 else 1.0
+def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
+    """Add abs(p_A - p_B) of sample interval k to the sums in memory m of its block of `n_block` samples, if not NaN."""
+    slot = (k // n_block) % (SUPPORT + 1)
+    if k % n_block == 0:
+        m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
+    # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate; an interval without the
+    # pump's angle counts in no row of the balance, either
+    if not math.isnan(m.increments[_LEAK] + m.increments[_RESPONSE]):
+        m.pressure_sums[slot, _SUM] += abs(m.increments[_LEAK]) * rate
+        m.pressure_sums[slot, _NUMBER] += 1.0
 
 
 @large_law
-def _show(m: Any, error: float, rows: float, size: float, adds: bool) -> None:
-    """Append the result of the block `known.own` to the last ones."""
-    known = m.known
-    movement = motion(known.own[-1, -1], rows, known.numbers)
-    precision, lead, shift, leaning = says(known, rows, adds)
-    if not precision > (TELLS * m.precision if movement < STANDSTILL else 0.0):
+def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
+    """Compute the increments of all terms over the interval from sample k to k + 1 into `out`, as `COLUMNS` lists them.
+
+    `ring`: the last samples; `half`: samples in half a central difference; `rate` [Hz]; `displacement` [m^3/rad].
+    """
+    width = ring.shape[1]
+    slot, next_slot = k % width, (k + 1) % width
+    dx, x = ring[_X, next_slot] - ring[_X, slot], 0.5 * (ring[_X, next_slot] + ring[_X, slot])
+    # each end of the interval assigns half of its motion to a direction and to the side with the higher pressure, which
+    # carries the load
+    out[_MOTION : _MOTION + 4] = 0.0
+    for i in range(k, k + 2):
+        is_inward = 0 if ring[_X, (i + half) % width] >= ring[_X, max(i - half, 0) % width] else 1
+        B_carries = 0 if ring[_P_A, i % width] > ring[_P_B, i % width] else 1
+        out[_MOTION + 2 * is_inward + B_carries] += 0.5 * dx
+    for side in (_P_A, _P_B):
+        before, after = ring[side, slot], ring[side, next_slot]
+        low, high = max(before + P_ATM, MIN_ABSOLUTE_PRESSURE), max(after + P_ATM, MIN_ABSOLUTE_PRESSURE)
+        column = _COMPLIANCE[side]  # then compliance over the stroke, free air and dissolving air of this side
+        out[column], out[column + 1] = after - before, x * (after - before)
+        out[column + 2], out[column + 3] = 1.0 / high - 1.0 / low, math.log(high) - math.log(low)
+    earlier, later = max(k - 1, 0), k + 1
+    velocity_change = ring[_X, (later + 1) % width] - ring[_X, later % width]
+    velocity_change -= ring[_X, (earlier + 1) % width] - ring[_X, earlier % width]
+    out[_LAG] = rate * velocity_change / (later - earlier)  # of the position behind the angle, or ahead of it
+    out[_BIAS] = 1.0 / rate
+    out[_LEAK] = 0.5 * (ring[_P_A, slot] + ring[_P_A, next_slot] - ring[_P_B, slot] - ring[_P_B, next_slot]) / rate
+    out[_RESPONSE] = displacement * (ring[_THETA, next_slot] - ring[_THETA, slot])
+
+
+@law
+def _find_angle_sign(m: Any, n_rows: int) -> None:
+    """Find the sign of the angle's counts by which the pump's flow in memory m's first rows rises with p_A - p_B."""
+    mean, covariance = 0.0, 0.0
+    for r in range(n_rows):
+        mean += m.rows[r, _LEAK] / n_rows
+    for r in range(n_rows):
+        covariance += (m.rows[r, _LEAK] - mean) * m.rows[r, _RESPONSE]
+    m.angle_sign = -1.0 if covariance < 0.0 else 1.0
+
+
+@large_law
+def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
+    """Append the conductance of the block `model.block` to the history, unless it stands still and is imprecise.
+
+    `m`: memory; `size_error`: relative uncertainty of the machine's size; `n_rows`, `pressure` [Pa]: number of rows and
+    mean abs(p_A - p_B) of the block; `is_learned`: update the other coefficients with the block.
+    """
+    model = m.model
+    motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
+    precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
+    if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
         return
-    total, last, k = lead / precision, m.last, int(m.blocks) % WINDOW
-    g = total - shift / precision
-    last[k, 0], last[k, 1], last[k, 2], last[k, 4] = total, g, 1.0 / precision, size
-    last[k, 3] = leaning / precision**2 + (error * total) ** 2
-    m.blocks += 1.0
-    if m.blocks <= WINDOW:
-        m.base += g
-        m.base_square += g * g
-        m.base_variance += 1.0 / precision
+    G, history, k = weighted_G / precision, m.history, int(m.n_estimated) % WINDOW
+    comparable_G = G - weighted_shift / precision
+    history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
+    history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (size_error * G) ** 2
+    history[k, _PRESSURE] = pressure
+    m.n_estimated += 1.0
+    if m.n_estimated <= WINDOW:
+        m.base_sum += comparable_G
+        m.base_square_sum += comparable_G * comparable_G
+        m.base_variance_sum += 1.0 / precision
 
 
 @large_law
-def _learn(m: Any, error: float) -> None:
-    """Learn from the waiting blocks, and append their results."""
-    known = m.known
-    for again in range(3):
-        for k in range(LEARNED):
-            rows, size = m.waiting[k, 0], m.waiting[k, 1]
-            take(known, m.waits[k], _PLACE)
-            if again == 0:
-                add(known, rows, 1.0, False)
-            elif again == 1:
-                m.ordered[k] = says(known, rows, False)[0]
-            else:
-                _show(m, error, rows, size, False)
-        if again == 0:
-            begin(known)
-        elif again == 1:
-            m.precision = median(m.ordered, LEARNED)
-    m.wait_count = 0.0
+def _fit_to_waiting(m: Any, size_error: float) -> None:
+    """Fit the coefficients to the blocks that wait in memory m, find the usual precision, and append their results."""
+    model = m.model
+    for k in range(LEARNED):
+        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        add_block(model, m.waiting_sizes[k, _BLOCK_ROWS], weight=1.0, has_stepped=False)
+    fit_coefficients(model)
+    for k in range(LEARNED):
+        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        m.precisions[k] = estimate_leak(model, m.waiting_sizes[k, _BLOCK_ROWS], is_learned=False)[0]
+    m.usual_precision = median(m.precisions, LEARNED)
+    for k in range(LEARNED):
+        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        n_rows, pressure = m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE]
+        _append_conductance(m, size_error, n_rows, pressure, is_learned=False)
+    m.n_waiting = 0.0
+
+
+@law
+def _forget_standstill(m: Any) -> None:
+    """Clear all sums and results in memory m: those of a machine at standstill cannot be compared with later ones."""
+    model = m.model
+    model.sums[:, :] = 0.0
+    model.leak_products[:] = 0.0
+    model.numbers[:] = 0.0
+    m.usual_precision = m.n_moving = m.n_estimated = m.base_sum = m.base_square_sum = m.base_variance_sum = 0.0
 
 
 @large_law
-def _take(m: Any, error: float, b: int, rows: float, size: float) -> None:
-    """Take the sums of a block: the first `LEARNED` blocks are learnt from together, the others one by one."""
-    known = m.known
-    if m.precision > 0.0:
-        movement = motion(m.gram[b, _LEFT, _LEFT], rows, known.numbers)
-        m.woken = m.woken + 1.0 if movement > 1.0 / STANDSTILL else 0.0
-        if m.woken >= WAKES:  # all before were of a machine at standstill: nothing is compared with them
-            known.sums[:, :] = 0.0
-            known.along[:] = 0.0
-            known.numbers[:] = 0.0
-            m.precision = m.woken = m.blocks = m.base = m.base_square = m.base_variance = 0.0
+def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
+    """Estimate block b from `gram[b]` in memory m; the first `LEARNED` blocks wait until all can be fitted together.
+
+    After `N_WAKING` successive blocks of far larger motion than before, start again. Arguments: `_append_conductance`.
+    """
+    model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
+    if m.usual_precision > 0.0:
+        motion = relative_motion(motion_square, n_rows, model.numbers)
+        m.n_moving = m.n_moving + 1.0 if motion > 1.0 / STANDSTILL else 0.0
+        if m.n_moving >= N_WAKING:
+            _forget_standstill(m)
             return
-        take(known, m.gram[b], _PLACE)
-        _show(m, error, rows, size, True)
+        load_block(model, m.gram[b], _ALL_COLUMNS)
+        _append_conductance(m, size_error, n_rows, pressure, is_learned=True)
         return
-    waiting = int(m.wait_count)
-    if waiting == 0 and not m.gram[b, _LEFT, _LEFT] > 0.0:
+    k = int(m.n_waiting)
+    if k == 0 and not motion_square > 0.0:  # the first motion starts the blocks that are fitted together
         return
-    m.waiting[waiting, 0], m.waiting[waiting, 1] = rows, size
-    for i in range(_WIDTH):
-        for j in range(_WIDTH):
-            m.waits[waiting, i, j] = m.gram[b, i, j]
-    m.wait_count += 1.0
-    if waiting + 1 == LEARNED:
-        _learn(m, error)
+    m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE] = n_rows, pressure
+    for i in range(_N_COLUMNS):
+        for j in range(_N_COLUMNS):
+            m.waiting_grams[k, i, j] = m.gram[b, i, j]
+    m.n_waiting += 1.0
+    if k + 1 == LEARNED:
+        _fit_to_waiting(m, size_error)
 
 
-def _close(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the law that closes a block."""
-    place, fast, error = choice.place, choice.fast, choice.size_error
+def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
+    """Build the law that finishes a block."""
+    column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
-    def close(m: Any, rows: Any, ends: Any, block: int) -> None:
-        count, pending, first = len(rows), len(ends), m.closed == 0.0
-        ends[pending - 1] = count
-        m.pending = pending
-        if first and pending < SUPPORT:
-            return
-        if first:
-            _orient(m, count)
-        for r in range(count):
-            rows[r, _LEFT] *= m.sign
-        m.closed += pending
-        weigh(rows, ends, place, fast, m.support, min(1.0, SUPPORT / m.closed), m.workspace, m.gram)
-        m.pending = m.row_count = 0.0
-        for b in range(pending):
-            of_block = ends[b] - (ends[b - 1] if b else 0.0)
-            slot = (block - pending + 1 + b) % (SUPPORT + 1)
-            if of_block > 0.0:
-                _take(m, error, b, of_block, max(m.sizes[slot, 0] / max(m.sizes[slot, 1], 1.0), TINY))
+    def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
+        """Weight the rows of memory m's open blocks, the newest of which is `block`, and estimate each of these blocks.
 
-    return close  # type: ignore[no-any-return]
+        The first `SUPPORT` blocks are weighted together, all later ones as they end. `ends` has room for this block's.
+        """
+        n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
+        ends[n_open - 1] = n_rows
+        m.n_open = n_open
+        if is_first and n_open < SUPPORT:
+            return
+        if is_first:
+            _find_angle_sign(m, n_rows)
+        for r in range(n_rows):
+            rows[r, _RESPONSE] *= m.angle_sign
+        m.n_weighted += n_open
+        weigh_rows(
+            rows,
+            ends,
+            column_order=column_order,
+            n_fast=n_fast,
+            earlier_sums=m.slow_sums,
+            update_fraction=min(1.0, SUPPORT / m.n_weighted),
+            workspace=m.workspace,
+            gram=m.gram,
+        )
+        m.n_open = m.n_rows = 0.0
+        for b in range(n_open):
+            block_rows = ends[b] - (ends[b - 1] if b else 0.0)
+            slot = (block - n_open + 1 + b) % (SUPPORT + 1)
+            mean_pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
+            if block_rows > 0.0:
+                _update_with_block(m, size_error, b, block_rows, max(mean_pressure, TINY))
+
+    return finish_block  # type: ignore[no-any-return]
 
 
 @large_law
-def _mean(last: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of a column of the last n blocks up to the `newest`."""
+def _mean(history: Any, newest: int, n: int, column: int) -> float:
+    """Compute the mean of a column of the history over the n blocks up to the `newest`."""
     total = 0.0
     for k in range(n):
-        total += last[(newest - k) % WINDOW, column] / n
+        total += history[(newest - k) % WINDOW, column] / n
     return float(total)
 
 
 @large_law
-def _variance(last: Any, newest: int, n: int) -> float:
-    """Compute the variance of the mean conductance of the last n blocks up to the `newest`."""
-    mean, square = _mean(last, newest, n, 1), 0.0
+def _variance_of_mean(history: Any, newest: int, n: int) -> float:
+    """Compute the variance of the mean comparable conductance of the n blocks up to the `newest`.
+
+    The larger of the sample variance between the blocks and the mean of their variances, divided by n.
+    """
+    mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
-        square += (last[(newest - k) % WINDOW, 1] - mean) ** 2 / (n - 1.0)
-    return float(max(square, _mean(last, newest, n, 2)) / n)
+        sample_variance += (history[(newest - k) % WINDOW, _COMPARABLE_G] - mean) ** 2 / (n - 1.0)
+    return float(max(sample_variance, _mean(history, newest, n, _VARIANCE)) / n)
 
 
 @law
-def _write_results(m: Any, error: float, quantiles: Any, out: Any) -> None:
-    """Write the outputs (`SENSOR_RESULTS`).
+def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
+    """Write the outputs (`SENSOR_RESULTS`) from memory m by the formulas of the module's docstring.
 
-    `error`: that of the machine's size, relative; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
+    `size_error`: relative error of the machine's size; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
     """
     out[:] = 0.0
-    last, count, newest = m.last, int(m.blocks), int(m.blocks) - 1
-    out[7], out[8], n = m.known.numbers[MISFIT], m.blocks, min(count, WINDOW)
+    history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1
+    out[_OUT_MISFIT], out[_OUT_BLOCKS] = m.model.numbers[MISFIT], m.n_estimated
+    n = min(n_estimated, WINDOW)
     if n < 2:
         return
-    G, flow = _mean(last, newest, n, 0), _mean(last, newest, n, 4)
-    half = math.hypot(
-        quantiles[n - 2] * math.sqrt(_variance(last, newest, n)), WITHIN_95 * math.sqrt(_mean(last, newest, n, 3))
+    G, pressure = _mean(history, newest, n, _G), _mean(history, newest, n, _PRESSURE)
+    half_width = math.hypot(
+        quantiles[n - 2] * math.sqrt(_variance_of_mean(history, newest, n)),
+        WITHIN_95 * math.sqrt(_mean(history, newest, n, _SYSTEMATIC_VARIANCE)),
     )
-    out[0], out[1], out[2], out[6] = flow * G, flow * (G - half), flow * (G + half), G
-    n = min(count - WINDOW, WINDOW)
+    out[_OUT_G], out[_OUT_Q] = G, pressure * G
+    out[_OUT_Q_LOW], out[_OUT_Q_HIGH] = pressure * (G - half_width), pressure * (G + half_width)
+    n = min(n_estimated - WINDOW, WINDOW)  # blocks after the baseline
     if n < 2:
         return
-    base, flow = m.base / WINDOW, _mean(last, newest, n, 4)
-    rise = _mean(last, newest, n, 1) - base
-    before = max((m.base_square - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance / WINDOW)
-    walked = WALK * (count - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
-    variance = _variance(last, newest, n) + before * (1.0 / WINDOW + walked)
-    half = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * error * rise)
-    out[3], out[4], out[5], out[9] = flow * rise, flow * (rise - half), flow * (rise + half), 1.0
+    base, pressure = m.base_sum / WINDOW, _mean(history, newest, n, _PRESSURE)
+    rise = _mean(history, newest, n, _COMPARABLE_G) - base
+    base_variance = max((m.base_square_sum - WINDOW * base**2) / (WINDOW - 1.0), m.base_variance_sum / WINDOW)
+    # variance of the random walk from the baseline's middle to that of the last n blocks, over `base_variance`
+    walk = WALK * (n_estimated - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
+    variance = _variance_of_mean(history, newest, n) + base_variance * (1.0 / WINDOW + walk)
+    half_width = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * size_error * rise)
+    out[_OUT_SETTLED], out[_OUT_RISE] = 1.0, pressure * rise
+    out[_OUT_RISE_LOW], out[_OUT_RISE_HIGH] = pressure * (rise - half_width), pressure * (rise + half_width)
 
 
 @lru_cache(maxsize=8)
 def sensor_code(choice: SensorChoice) -> Mapping[str, str]:
-    """Compile the LLVM code of a soft sensor (`unit_code`)."""
-    return unit_code(functions(choice))
+    """Compile the functions of a soft sensor to LLVM code (`unit_code`)."""
+    return unit_code(build_functions(choice))

@@ -1,4 +1,4 @@
-"""The variables of a unit: inputs, tunable parameters and outputs, with units and words."""
+"""The variables of a unit: inputs, tunable parameters and outputs, with their units and descriptions."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
 from sealscope.parameters import Rig
-from sealscope.parameters.fields import absent_of, leaves, unit_of
+from sealscope.parameters.fields import absent_of, iter_fields, unit_of
 from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
 from sealscope.physics.state import OUTPUTS
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
-#: Parameters of a unit in the order of its code: those that the laws take, and those that their numbers follow from.
+#: Parameters of a unit in the order of its code: those that the laws take, and those from which numbers are derived.
 VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
-#: Inputs, outputs and a soft sensor's outputs in the order of the code: unit, words.
+#: Inputs, outputs and a soft sensor's outputs in the order of the code: (unit, description).
 INPUTS: Mapping[str, tuple[str, str]] = _TABLES["inputs"]
 RESULTS: Mapping[str, tuple[str, str]] = {
     **{name: _TABLES["outputs"].get(name) or (CHANNEL_UNITS[name], LONG_NAMES[name]) for name in OUTPUTS},
     **_TABLES["powers"],
 }
 SENSOR_RESULTS: Mapping[str, tuple[str, str]] = _TABLES["sensor"]
-#: The inputs that an output follows without delay.
+#: The inputs on which an output depends without delay.
 DIRECT: Mapping[str, list[str]] = _TABLES["direct"]
-#: Where the references of a kind of variable begin.
+#: First value reference of each kind of variable.
 REFERENCES: Mapping[str, int] = _TABLES["references"]
-#: Outputs of laws that no unit has.
-_NONE = ("x_s", "v_s")
+#: Outputs of the servo valve, which no unit has.
+_VALVE_OUTPUTS = ("x_s", "v_s")
 
 
 class Variable(NamedTuple):
-    """A variable of a unit, in the words of FMI; `start` in SI units, None for what the unit computes."""
+    """A variable of a unit, in the terms of FMI; `start` in SI units, None for an output."""
 
     reference: int
     name: str
@@ -44,32 +44,34 @@ class Variable(NamedTuple):
     start: float | None
 
 
-def inputs(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield inputs of these units and words, by name."""
-    for k, (name, (unit, words)) in enumerate(rows.items()):
-        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, words, 0.0)
+def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
+    """Yield input variables; `rows`: (unit, description) by name."""
+    for k, (name, (unit, description)) in enumerate(rows.items()):
+        yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, 0.0)
 
 
-def outputs(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield outputs of these units and words, by name."""
-    for k, (name, (unit, words)) in enumerate(rows.items()):
-        if name not in _NONE:
-            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, words, None)
+def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
+    """Yield output variables, except the servo valve's; `rows`: (unit, description) by name."""
+    for k, (name, (unit, description)) in enumerate(rows.items()):
+        if name not in _VALVE_OUTPUTS:
+            yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, None)
 
 
-def parameter(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Describe a parameter of a rig as a variable; None for one without a law in the unit."""
-    value, field = float(attrgetter(name)(rig)), dict(leaves(Rig))[name]
-    reference, words = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
-    absent = value == absent_of(field)
-    return None if absent else Variable(reference, name, "parameter", variability, unit_of(field), words, value)
+def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
+    """Make the variable of a rig's parameter; None if its law is absent from the rig."""
+    value, field = float(attrgetter(name)(rig)), dict(iter_fields(Rig))[name]
+    reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
+    is_absent = value == absent_of(field)
+    return (
+        None if is_absent else Variable(reference, name, "parameter", variability, unit_of(field), description, value)
+    )
 
 
 def variables(rig: Rig, step: float) -> Iterator[Variable]:
-    """Yield the variables of a rig's unit; `step` [s]: the longest of its solver."""
-    yield from inputs(INPUTS)
-    yield from filter(None, (parameter(rig, name, "tunable") for name in VALUES))
-    reference, words = REFERENCES["start_position"], "piston position at the start, from mid-stroke"
-    yield Variable(reference, "start_position", "parameter", "fixed", "m", words, 0.0)
+    """Yield the variables of a rig's unit; `step` [s]: longest step of its solver."""
+    yield from input_variables(INPUTS)
+    yield from filter(None, (rig_variable(rig, name, "tunable") for name in VALUES))
+    reference, description = REFERENCES["start_position"], "piston position at the start, from mid-stroke"
+    yield Variable(reference, "start_position", "parameter", "fixed", "m", description, 0.0)
     yield Variable(REFERENCES["step"], "step", "parameter", "fixed", "s", "longest step of the solver", step)
-    yield from outputs(RESULTS)
+    yield from output_variables(RESULTS)

@@ -1,8 +1,8 @@
-"""Alarms: from estimates to alarms by thresholds in L/min, debounce and hysteresis, and what a person says of them.
+"""Alarms: raised from estimates by thresholds in L/min, debounce and hysteresis, and marked by persons.
 
-An alarm is new until a person acknowledges it. A person finds it valid or, with a reason, invalid. It is closed when
-its cause is over and a person has seen it, or by a repair; an invalid one is over at once. (New with its cause over is
-what ISA-18.2, Management of Alarm Systems for the Process Industries, calls returned to normal, unacknowledged.)
+An alarm is new until a person acknowledges it. A person finds it valid or, with a reason, invalid. It closes when its
+cause has ended and a person has seen it, or by a repair; an invalid alarm ends at once. (A new alarm whose cause has
+ended is "returned to normal, unacknowledged" in ISA-18.2, Management of Alarm Systems for the Process Industries.)
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
 from sealscope.monitor.verdicts import RecordingVerdict
-from sealscope.storage.plain_state import saved
+from sealscope.storage.plain_state import save_attributes
 
 Level = Literal["warning", "error"]
 AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
-#: Number that a control or a plant's catalogue of messages knows a level by, and the level's condition of NE 107.
+#: Message number of each level in a control or a plant's catalogue of messages, and its condition of NE 107.
 DIAGNOSTIC_NUMBERS: dict[Level, int] = {"warning": 4101, "error": 4102}
 _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limit"}
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
-#: What a person may say of an alarm.
+#: Marks that a person may give an alarm.
 MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm of an actuator; clocks are those of the samples [s], intervals of 95 %.
+    """An alarm of an actuator; times are on the clock of the samples [s], intervals have 95 % confidence.
 
-    `id`: actuator and a running number; `raised_s`, `updated_s`: when it was raised, and changed last; `onset_s`: since
-    when it leaks; `cause`, `evidence`, `next_check`: where the oil goes, why that is believed, and what to look at;
-    `baseline`: version of what it is compared with; `returned_s`: when its cause was over, None while it lasts; `mark`,
-    `reason`: "valid", "invalid" or "repaired" as a person said last, and why it is invalid; `shelved_until_s`: it is
-    not announced before; `by_chance_per_1000_h`: alarms as strong as this that a healthy actuator raises per 1000
-    operating hours, at most.
+    `id`: actuator and a running number; `raised_s`, `updated_s`: times of the start and of the last change; `onset_s`:
+    start of the leak; `cause`, `evidence`, `next_check`: path of the leaking oil, the reason for it, and the inspection
+    that comes next; `baseline`: version of the healthy baseline; `returned_s`: time at which the cause ended, None
+    while it lasts; `mark`, `reason`: the last mark of a person ("valid", "invalid" or "repaired"), and why it is
+    invalid; `shelved_until_s`: time before which the alarm is not announced; `by_chance_per_1000_h`: upper limit of
+    the false alarms of this strength that a healthy actuator raises per 1000 operating hours.
     """
 
     id: str
@@ -64,50 +64,45 @@ class Alarm:
     by_chance_per_1000_h: float | None = None
 
     @property
-    def over(self) -> bool:
-        """Test whether the alarm is closed or invalid, with nothing left to do."""
+    def is_over(self) -> bool:
+        """Test whether the alarm is closed or invalid."""
         return self.state in ("invalid", "closed")
 
     @property
     def active(self) -> bool:
         """Test whether the cause of the alarm lasts."""
-        return self.returned_s is None and not self.over
+        return self.returned_s is None and not self.is_over
 
     @property
     def shelved(self) -> bool:
-        """Test whether the alarm was shelved at its last change, and so not to be announced."""
+        """Test whether the alarm was shelved at its last change; a shelved alarm is not announced."""
         return self.shelved_until_s > self.updated_s
 
     @property
     def condition(self) -> str:
-        """The condition of the alarm in the states of NE 107."""
+        """The condition of NE 107 that the alarm stands for."""
         return _CONDITIONS[self.level] if self.active else "watched"
 
     @property
     def status_word(self) -> int:
-        """Status bits of its actuator: 1 a warning lasts, 2 an error lasts, 4 it is new."""
+        """Status bits of the actuator: 1 active warning, 2 active error, 4 new alarm."""
         level = 0 if not self.active else ERROR_BIT if self.level == "error" else WARNING_BIT
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
-    def plain(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain values, with the machine state and diagnostic number derived from them."""
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
-        number = DIAGNOSTIC_NUMBERS[self.level]
-        return {
-            **vars(self),
-            "diagnostic_number": number,
-            "shelved": self.shelved,
-            "machine_state": machine_state.as_dict(),
-        }
+        derived = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
+        return {**vars(self), **derived, "machine_state": machine_state.as_dict()}
 
 
 @dataclass
 class AlarmJudge:
-    """The alarm of one actuator as block follows block: at most one at a time.
+    """The alarm of one actuator, updated with each block; at most one is open at a time.
 
-    `alarm`: the last one that is not over; `raised`: alarms so far; `above`, `error`, `below`: successive blocks over
-    the warning's and the error's threshold, and below what lets it return; `over_s`: clock when the last one was over
-    [s].
+    `alarm`: the open alarm; `raised`: number of alarms so far; `above`, `error`, `below`: successive blocks above the
+    warning threshold, above the error threshold, and below the return threshold; `over_s`: time at which the last alarm
+    ended [s].
     """
 
     actuator: str
@@ -118,87 +113,91 @@ class AlarmJudge:
     below: int = 0
     over_s: float | None = None
 
-    def take(
+    def update(
         self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Return the alarm and what happened to it ("raised", "error", "warning", "returned"), None for nothing.
+        """Update the alarm with a block; return it and its event, None if nothing changed.
 
-        A leak without L/min is a warning; blocks that are not judged change nothing. One that rises again before
-        anybody saw it is the same alarm. No leak while an alarm lasts: the detector began anew, the leak may last.
+        The event is "raised", "error", "warning", "returned" or "". A leak without L/min is a warning; blocks that are
+        not judged change nothing. A leak that returns before anybody saw the alarm continues that alarm. `leak` is None
+        during an alarm if the detector was restarted; the alarm then stays, for the leak may last.
         """
         if not estimate.judged:
             return None
         lpm = estimate.leak_lpm
-        above = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
-        error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
-        self.above = self.above + 1 if above or error else 0
-        self.error = self.error + 1 if error else 0
-        by_chance = None if leak is None else settings.false_alarms_per_1000_h * leak.rarity
+        is_warning = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
+        is_error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
+        self.above = self.above + 1 if is_warning or is_error else 0
+        self.error = self.error + 1 if is_error else 0
         if self.alarm is None or not self.alarm.active:
             if leak is None or self.above < settings.debounce_blocks:
                 return None
-            self.raised, self.below = self.raised + (self.alarm is None), 0
+            self.below = 0
             level: Level = "error" if self.error >= settings.debounce_blocks else "warning"
-            self.alarm = Alarm(
-                id=f"{self.actuator}-{self.raised}",
-                actuator=self.actuator,
+            alarm = self._raise_alarm(
                 level=level,
-                state="new",
                 raised_s=estimate.t,
                 updated_s=estimate.t,
                 onset_s=leak.onset_s,
                 onset_interval_s=leak.onset_interval_s,
-                leak_lpm=estimate.leak_lpm,
+                leak_lpm=lpm,
                 leak_interval_lpm=estimate.leak_interval_lpm,
                 cause=leak.cause,
                 evidence=leak.reason,
                 next_check=state_of(_CONDITIONS[level], leak.cause).action,
                 baseline=baseline,
-                shelved_until_s=0.0 if self.alarm is None else self.alarm.shelved_until_s,
-                by_chance_per_1000_h=by_chance,
+                by_chance_per_1000_h=settings.false_alarms_per_1000_h * leak.rarity,
             )
-            return self.alarm, "raised"
+            return alarm, "raised"
         limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or math.inf)
-        low = leak is not None and lpm is not None and lpm < settings.return_share * limit
-        self.below = self.below + 1 if low else 0
-        back = min(0.0, estimate.t - self.alarm.updated_s)  # where the clock was set back, so is the end of the shelf
-        until = self.alarm.shelved_until_s + back
-        now, happened = replace(self.alarm, updated_s=estimate.t, shelved_until_s=until), ""
+        is_below = leak is not None and lpm is not None and lpm < settings.return_share * limit
+        self.below = self.below + 1 if is_below else 0
+        clock_jump = min(0.0, estimate.t - self.alarm.updated_s)  # a clock set back moves the end of the shelving too
+        shelved_until_s = self.alarm.shelved_until_s + clock_jump
+        updated, event = replace(self.alarm, updated_s=estimate.t, shelved_until_s=shelved_until_s), ""
         if self.below >= settings.debounce_blocks:
             self.below = 0
-            if now.level == "error" and above and not error:
-                now, happened = replace(now, level="warning"), "warning"
+            if updated.level == "error" and is_warning and not is_error:
+                updated, event = replace(updated, level="warning"), "warning"
             else:
-                over: AlarmState = "new" if now.state == "new" else "closed"
-                now, happened = replace(now, state=over, returned_s=estimate.t), "returned"
-        elif now.level == "warning" and self.error >= settings.debounce_blocks:
-            # a higher level is a new call: it must be seen again, unless it is known to be a leak
-            to_state: AlarmState = "valid" if now.state == "valid" else "new"
-            now, happened = replace(now, level="error", state=to_state), "error"
+                end_state: AlarmState = "new" if updated.state == "new" else "closed"
+                updated, event = replace(updated, state=end_state, returned_s=estimate.t), "returned"
+        elif updated.level == "warning" and self.error >= settings.debounce_blocks:
+            # a person must acknowledge the higher level again, unless the leak is confirmed
+            error_state: AlarmState = "valid" if updated.state == "valid" else "new"
+            updated, event = replace(updated, level="error", state=error_state), "error"
         if leak is not None:
-            leak_lpm, interval = estimate.leak_lpm, estimate.leak_interval_lpm
-            now = replace(now, leak_lpm=leak_lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
-        return self._keep(now), happened
+            by_chance, interval = settings.false_alarms_per_1000_h * leak.rarity, estimate.leak_interval_lpm
+            updated = replace(updated, leak_lpm=lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
+        return self._set_alarm(updated), event
 
-    def take_verdict(
+    def _raise_alarm(self, **findings: Any) -> Alarm:
+        """Raise a new alarm with these fields, or raise again the one whose cause had ended; return it."""
+        self.raised += self.alarm is None
+        shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
+        id = f"{self.actuator}-{self.raised}"
+        self.alarm = Alarm(id, self.actuator, state="new", shelved_until_s=shelved_until_s, **findings)
+        return self.alarm
+
+    def update_from_verdict(
         self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Return the alarm and what happened to it, as `take` does, by the verdict on a whole recording.
+        """Update the alarm with the verdict on a whole recording; return the same as `update`.
 
-        A leak is an alarm where a healthy machine looks like this as seldom as stated, or the recording before, whose
-        verdict is `earlier`, leaks as well. It is over with the first recording without a leak.
+        A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the recording
+        before, of verdict `earlier`, leaks as well. The first recording without a leak ends the alarm.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
-        lasts = alarm is not None and alarm.active
-        above = verdict.leaks and (lpm is None or lpm >= settings.warning_lpm)
-        if not above:
-            if alarm is None or not lasts or not (verdict.clears or verdict.leaks):
+        is_active = alarm is not None and alarm.active
+        is_above = verdict.leaks and (lpm is None or lpm >= settings.warning_lpm)
+        if not is_above:
+            if alarm is None or not is_active or not (verdict.clears or verdict.leaks):
                 return None
-            over: AlarmState = "new" if alarm.state == "new" else "closed"
+            end_state: AlarmState = "new" if alarm.state == "new" else "closed"
             end_s = verdict.end_s
-            return self._keep(replace(alarm, state=over, returned_s=end_s, updated_s=end_s)), "returned"
+            return self._set_alarm(replace(alarm, state=end_state, returned_s=end_s, updated_s=end_s)), "returned"
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
-        found: dict[str, Any] = {
+        findings: dict[str, Any] = {
             "level": level,
             "updated_s": verdict.end_s,
             "leak_lpm": lpm,
@@ -207,42 +206,32 @@ class AlarmJudge:
             "next_check": verdict.state["action"],
             "by_chance_per_1000_h": verdict.by_chance_per_1000_h,
         }
-        if alarm is not None and lasts:
+        if alarm is not None and is_active:
             is_worse = level == "error" and alarm.level == "warning"
             state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
-            return self._keep(replace(alarm, **found, state=state)), "" if level == alarm.level else level
+            return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
         is_repeated = earlier is not None and earlier.leaks
         if not (is_repeated or verdict.is_rare(settings.false_alarms_per_1000_h)):
             return None
-        self.raised += alarm is None
-        since = verdict.start_s if verdict.onset_s is None else verdict.onset_s
-        # what leaks from the first sample on began after the last recording that did not
-        before = verdict.start_s if earlier is None or not earlier.clears else min(earlier.end_s, verdict.start_s)
-        self.alarm = Alarm(
-            id=f"{self.actuator}-{self.raised}",
-            actuator=self.actuator,
-            state="new",
-            raised_s=verdict.end_s,
-            onset_s=since,
-            onset_interval_s=verdict.onset_interval_s or (before, since),
-            cause=verdict.cause,
-            baseline=baseline,
-            shelved_until_s=0.0 if alarm is None else alarm.shelved_until_s,
-            **found,
-        )
-        return self.alarm, "raised"
+        onset_s = verdict.start_s if verdict.onset_s is None else verdict.onset_s
+        # a leak present from the first sample on began after the last recording without a leak
+        min_onset_s = verdict.start_s if earlier is None or not earlier.clears else min(earlier.end_s, verdict.start_s)
+        interval = verdict.onset_interval_s or (min_onset_s, onset_s)
+        findings |= {"raised_s": verdict.end_s, "onset_s": onset_s, "onset_interval_s": interval}
+        return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
-    def _keep(self, alarm: Alarm) -> Alarm:
+    def _set_alarm(self, alarm: Alarm) -> Alarm:
+        """Set the open alarm, None if it is closed or invalid, and the time at which its cause ended; return it."""
         if not alarm.active:
             self.over_s = alarm.updated_s
-        self.alarm = None if alarm.over else alarm
+        self.alarm = None if alarm.is_over else alarm
         return alarm
 
-    def marked(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
-        """Return the alarm after a person's word, one of `MARKS`, at clock `t` [s].
+    def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
+        """Apply a person's mark, one of `MARKS`, at time `t` [s], and return the alarm.
 
-        `until`: clock until which it is shelved [s]; `reason`: why it is invalid. Raises InputError where there is no
-        alarm, it is so marked already, or an invalid one has no reason.
+        `until`: time until which the alarm is shelved [s]; `reason`: why it is invalid. Raises InputError if there is
+        no open alarm, if it has this mark already, or if ``invalid`` comes without a reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -255,35 +244,38 @@ class AlarmJudge:
             raise InputError(f"{alarm.id} is {alarm.state} already")
         if mark == "invalid" and not reason.strip():
             raise InputError(f"{alarm.id} must be invalid for a reason, got none: state it as the comment")
-        last: AlarmState = "valid" if mark == "valid" else "acknowledged"
+        open_state: AlarmState = "valid" if mark == "valid" else "acknowledged"
         by_mark: dict[str, dict[str, Any]] = {
             "shelved": {"shelved_until_s": until},
             "invalid": {"state": "invalid", "mark": mark, "reason": reason},
             "repaired": {"state": "closed", "mark": mark},
-            "valid": {"state": last if alarm.active else "closed", "mark": mark},
-            "acknowledged": {"state": last if alarm.active else "closed"},
+            "valid": {"state": open_state if alarm.active else "closed", "mark": mark},
+            "acknowledged": {"state": open_state if alarm.active else "closed"},
         }
         self.above = self.error = self.below = 0
-        return self._keep(replace(alarm, updated_s=t, **by_mark[mark]))
+        return self._set_alarm(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return the fields as plain values for `restored`."""
-        return saved(self, vars(self))
+        """Return the fields as plain values for `restore`."""
+        return save_attributes(self, vars(self))
 
 
-def ranked(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the actuators with their open alarm: by severity of their state, new alarms first, then by evidence.
+def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Sort the actuators, each with its open alarm, by severity of state, then new alarms first, then by evidence.
 
-    The alarm that healthy actuators raise least often comes first, so that all compete for one budget of false alarms;
-    among equals the one whose leak is larger for sure (the lower end of its interval), then the larger leak, then the
-    name. `alarms`: those that are not over.
+    Evidence is the rate at which healthy actuators raise such an alarm, lowest first, so that all actuators share one
+    budget of false alarms. Ties go to the larger lower end of the leak's interval, then the larger leak, then the name.
+    `alarms`: the open ones.
     """
 
-    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        low, chance = (row["leak_interval_lpm"] or (0.0,))[0], (row["alarm"] or {}).get("by_chance_per_1000_h")
-        evidence = math.inf if chance is None else chance, -low, -(row["leak_lpm"] or 0.0)
-        return -row["state"]["severity"], -(row["status_word"] & NEW_BIT), *evidence, row["name"]
+    def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return the sorting key of an actuator."""
+        low_lpm = (row["leak_interval_lpm"] or (0.0,))[0]
+        by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
+        evidence = math.inf if by_chance is None else by_chance
+        is_new = row["status_word"] & NEW_BIT
+        return -row["state"]["severity"], -is_new, evidence, -low_lpm, -(row["leak_lpm"] or 0.0), row["name"]
 
-    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}  # of several the latest
+    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}  # the first of several is the latest
     rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
-    return sorted(rows, key=order)
+    return sorted(rows, key=rank)

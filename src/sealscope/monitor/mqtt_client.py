@@ -12,25 +12,25 @@ from sealscope.monitor.settings import BrokerSettings
 
 _log = logging.getLogger(__name__)
 _log.setLevel(logging.WARNING)  # paho tells each packet
-#: Silence after which the broker is asked for a sign of life [s]; half of it later the connection counts as lost.
+#: Silence after which the client pings the broker [s]; the connection counts as lost half of it later.
 KEEP_ALIVE_S = 20
 #: Topic and payload.
 _Message = tuple[str, bytes | str]
-#: How long a message that is published is waited for [s].
-_SENT_S = 3.0
+#: Timeout for a message to be published [s].
+_PUBLISH_TIMEOUT_S = 3.0
 
 
 def check_mqtt() -> None:
-    """Raise MissingExtra where the library for MQTT is not installed: before the service starts."""
+    """Check that the MQTT library is installed; raise MissingExtra otherwise."""
     if find_spec("paho") is None:
         raise MissingExtra("MQTT needs paho-mqtt: pip install 'sealscope[mqtt]'")
 
 
 class MqttLink:
-    """A connection to a broker by MQTT 5, with paho's `client`, which acknowledges by hand.
+    """A connection to a broker by MQTT 5; paho's `client` leaves acknowledging messages to its user.
 
-    `will`: topic and payload that the broker publishes where the connection is lost, asked for before each connection;
-    `close` publishes the same; `retain`: whether the broker keeps it.
+    `will`: returns topic and payload of the last will, which the broker publishes when the connection is lost; called
+    before each connection. `close` publishes the same. `retain`: whether the broker retains the will.
     """
 
     def __init__(
@@ -56,39 +56,40 @@ class MqttLink:
         client.suppress_exceptions = True  # an error of a callback ends no connection; paho logs it
         client.enable_logger(_log)
         self.client: Any = client
-        client.on_pre_connect = self._before_connection
+        client.on_pre_connect = self._set_will
 
-    def _before_connection(self, client: Any, userdata: Any) -> None:
+    def _set_will(self, client: Any, userdata: Any) -> None:
+        """Set the last will of the connection that the client is about to make."""
         if self._will is not None:
             self._last_will = self._will()
             client.will_set(*self._last_will, qos=1, retain=self._retain)
 
     def open(self, **options: Any) -> None:
-        """Connect in a thread, again whenever the connection is lost."""
+        """Connect in a background thread, which reconnects whenever the connection is lost."""
         self.client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, **options)
         self.client.loop_start()
         self.is_open = True
 
-    def check(self) -> None:
-        """Close and raise RuntimeError if the thread has ended, for example after a malformed packet."""
-        if getattr(self.client, "_thread", self) is None:  # there is no public way to ask
+    def check_thread(self) -> None:
+        """Close the connection and raise RuntimeError if the thread has ended, for example after a malformed packet."""
+        if getattr(self.client, "_thread", self) is None:  # private, as paho has no public attribute for it
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")
 
-    def published(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message; return whether it went out in time, to the broker's knowledge with a `qos` of 1."""
+    def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
+        """Publish a message; return whether it was sent in time, and with a `qos` of 1 acknowledged by the broker."""
         message = self.client.publish(topic, payload, **options)
         try:
-            message.wait_for_publish(_SENT_S)
+            message.wait_for_publish(_PUBLISH_TIMEOUT_S)
         except (RuntimeError, ValueError):  # the connection is lost, or its queue is full
             return False
         return bool(message.is_published())
 
     def close(self) -> None:
-        """Publish the last will, and disconnect."""
+        """Publish the last will and disconnect; do nothing if the connection is not open."""
         if self.is_open:
             self.is_open = False
             if self._last_will is not None and self.client.is_connected():
-                self.published(*self._last_will, qos=1, retain=self._retain)
+                self.publish(*self._last_will, qos=1, retain=self._retain)
             self.client.disconnect()
             self.client.loop_stop()

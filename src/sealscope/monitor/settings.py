@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
 from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.diagnosis.live.joining import CHANNELS, in_words, ways_to_watch
+from sealscope.diagnosis.live.joining import CHANNELS, format_ways, ways_to_watch
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.formats.headings.labels import Label
@@ -19,19 +19,19 @@ from sealscope.recordings.formats.headings.proposal import split_unit
 from sealscope.storage.toml_file import read_model, read_toml
 from sealscope.units import same_dimension, to_si
 
-_Place = TypeVar("_Place", Path, str)
+_PathLike = TypeVar("_PathLike", Path, str)
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
-_Level = Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)]  # of a topic
+_Level = Annotated[str, Field(pattern=r"^[^/+#\x00]+$", max_length=100)]  # of an MQTT topic
 _Words = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-def _in_folder(place: _Place, info: ValidationInfo) -> _Place:
-    """Return a path as taken from the folder of the file of settings, where there is one; names and URLs stay."""
-    name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
-    return place if name or not info.context else type(place)(Path(info.context["folder"]) / place)
+def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
+    """Resolve a path relative to the folder of the settings file, if there is one; rig names and URLs stay."""
+    is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
+    return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
 
 
-_File = Annotated[Path, AfterValidator(_in_folder)]
+_File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
 class _Part(BaseModel):
@@ -41,7 +41,7 @@ class _Part(BaseModel):
 class WatchSettings(_Part):
     """Settings of a watched actuator."""
 
-    rig: Annotated[_Text, AfterValidator(_in_folder)] = "thesis"
+    rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
     learn_hours: float = Field(default=8.0, gt=0, le=1000)
     warning_lpm: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -53,12 +53,12 @@ class WatchSettings(_Part):
 
     @property
     def watched_with(self) -> WatchSettings:
-        """The settings of the watch, without name and source."""
+        """The settings without name and source."""
         return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
 class SimulateSettings(_Part):
-    """The simulated rig in the place of an actuator's samples, in the words of ``sealscope simulate``.
+    """A simulated rig that replaces an actuator's samples; fields as the options of ``sealscope simulate``.
 
     `speed`: as a multiple of real time.
     """
@@ -74,7 +74,7 @@ class SimulateSettings(_Part):
 
 
 class ActuatorSettings(WatchSettings):
-    """An actuator: its name, where its samples come from, and what differs from the defaults."""
+    """An actuator: its name, the source of its samples, and settings that differ from the defaults."""
 
     name: _Text
     folder: _File | None = None
@@ -89,34 +89,35 @@ class ActuatorSettings(WatchSettings):
 
     @model_validator(mode="before")
     @classmethod
-    def _machine_states_the_rest(cls, values: Any, info: ValidationInfo) -> Any:
-        """Take rate, map, units and limit from the machine's file where the table does not state them.
+    def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
+        """Fill rate, map, units and limit from the machine's file if the table does not state them.
 
-        `machine`, which must be such a file, stands for `rig`, which may be one. Units are those of the columns of its
-        logs; messages state their own, and files too.
+        The key `machine` is another name of `rig`, and must name a commissioned machine's file. The units are those in
+        the headings of its logs; they are used for Sparkplug and OPC UA, whose values need not state any.
         """
         if not isinstance(values, dict):
             return values
-        commissioned = values.get("machine")
-        if isinstance(commissioned, str):
-            values = {name: value for name, value in values.items() if name != "machine"} | {"rig": commissioned}
-        rig, is_machine = values.get("rig"), isinstance(commissioned, str)
+        machine_file = values.get("machine")
+        is_machine = isinstance(machine_file, str)
+        if is_machine:
+            values = {name: value for name, value in values.items() if name != "machine"} | {"rig": machine_file}
+        rig = values.get("rig")
         if not isinstance(rig, str) or not (rig.endswith(".toml") or is_machine):
             return values
-        place = Path(info.context["folder"]) / rig if info.context else Path(rig)
-        machine = load_watched(os.fspath(place))
-        if is_machine and machine.machine is None:
+        path = Path(info.context["folder"]) / rig if info.context else Path(rig)
+        watched = load_watched(os.fspath(path))
+        if is_machine and watched.machine is None:
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
-        columns = {} if isinstance(machine.channel_map, str) else dict(machine.channel_map)
-        units = {name: unit for name, column in columns.items() if (unit := _unit_of_column(name, column))}
-        by_signals = units and (values.get("nodes") or values.get("sparkplug"))
-        stated = {"map": columns or None, "rate": machine.rate, "error_lpm": machine.limit_lpm}
-        stated |= {"units": units if by_signals else None}
-        return {**{name: value for name, value in stated.items() if value is not None}, **values}
+        columns = {} if isinstance(watched.channel_map, str) else dict(watched.channel_map)
+        units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
+        needs_units = units and (values.get("nodes") or values.get("sparkplug"))
+        of_machine = {"map": columns or None, "rate": watched.rate, "error_lpm": watched.limit_lpm}
+        of_machine |= {"units": units if needs_units else None}
+        return {**{name: value for name, value in of_machine.items() if value is not None}, **values}
 
 
 class PageSettings(_Part):
-    """The page; `proxies`: addresses that are believed for whom they forward a request."""
+    """The page; `proxies`: addresses whose forwarded client addresses are trusted."""
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)
@@ -150,7 +151,7 @@ class OpcUaSettings(_Part):
 
 
 class SparkplugSettings(_Part):
-    """The edge node of Sparkplug B as which the alarms go out."""
+    """The Sparkplug B edge node that publishes the alarms."""
 
     group: _Level = "Sealscope"
     node: _Level = "monitor"
@@ -158,7 +159,7 @@ class SparkplugSettings(_Part):
 
 
 class WebhookSettings(_Part):
-    """The address that events are posted to."""
+    """The web address that receives the events by POST."""
 
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
     token_file: _File | None = None
@@ -168,7 +169,7 @@ class WebhookSettings(_Part):
 class MonitorSettings(_Part):
     """All settings of a monitor."""
 
-    database: Annotated[str, AfterValidator(_in_folder)] = Field(default="monitor.db", validate_default=True)
+    database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
     lines: bool = False
     settle_s: float = Field(default=5.0, ge=0, le=3600)
     keep_days: float = Field(default=90.0, gt=0)
@@ -183,7 +184,8 @@ class MonitorSettings(_Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _defaults_reach_actuators(cls, values: Any) -> Any:
+    def _apply_defaults(cls, values: Any) -> Any:
+        """Merge the defaults into each actuator, and divide the fleet's rate of false alarms among them."""
         if not isinstance(values, dict):
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
@@ -194,11 +196,12 @@ class MonitorSettings(_Part):
             if any(isinstance(part, dict) and rate in part for part in (defaults, *actuators)):
                 raise ValueError(f"state {rate} of actuators, or fleet_{rate}, which they share in equal parts")
             defaults = {**defaults, rate: budget / len(actuators)}
-        spread = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
-        return {**values, "actuator": spread}
+        merged = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
+        return {**values, "actuator": merged}
 
     @model_validator(mode="after")
-    def _fits_together(self) -> MonitorSettings:
+    def _check_consistency(self) -> MonitorSettings:
+        """Check the rules between tables: unique names and topics, needed tables, units and nodes of channels."""
         actuators, mqtt, page = self.actuator, self.mqtt, self.page
         topics = [actuator.topic for actuator in actuators if actuator.topic is not None]
         paths = [actuator.sparkplug for actuator in actuators if actuator.sparkplug is not None]
@@ -212,49 +215,52 @@ class MonitorSettings(_Part):
                     raise ValueError(f"{rule}, got {value!r}" + (" twice" if count > 1 else ""))
         if (topics or paths or self.sparkplug is not None) and mqtt is None:
             raise ValueError("an actuator with a topic, or Sparkplug B, needs the table [mqtt]")
-        for watched in actuators:
-            if watched.nodes and (self.opcua is None or watched.rate is None):
-                raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {watched.name!r}")
-            for table, channels in (("nodes", watched.nodes), ("units", watched.units)):
-                for channel in channels:
-                    if channel not in CHANNELS:
-                        raise ValueError(f"{table} must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
-            for channel, unit in watched.units.items():
-                to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=watched.name)
-            if watched.units and watched.folder is not None:
-                raise ValueError(f"units of files stand in their headings, got units of {watched.name!r}, a folder")
-            ways = ways_to_watch(load_watched(watched.rig).rig) if watched.nodes else ()
-            if watched.nodes and not any(watched.nodes.keys() >= {*way} for way in ways):
-                raise ValueError(
-                    f"nodes of {watched.name!r} must give {in_words(ways)}, got {', '.join(watched.nodes)}"
-                )
-        sends = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
-        if sends and len({topic_part(actuator.name) for actuator in actuators}) < len(actuators):
+        for actuator in actuators:
+            _check_channels(actuator, has_opcua=self.opcua is not None)
+        publishes = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
+        if publishes and len({topic_level(actuator.name) for actuator in actuators}) < len(actuators):
             raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
         node_path = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
-        if any(path.split("/")[:2] == node_path for path in paths):
+        if any(path.split("/")[:2] == node_path for path in paths):  # "group/node" or "group/node/device"
             raise ValueError("the node of the alarms must be none of the actuators' nodes")
         if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
             raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")
         return self
 
 
-def _unit_of_column(channel: str, column: str) -> str | None:
-    """Return the unit in the heading of a channel's column, None where there is none that the channel may have."""
+def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
+    """Check nodes and units of an actuator's channels; raise ValueError or InputError if one breaks a rule."""
+    if actuator.nodes and (not has_opcua or actuator.rate is None):
+        raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
+    for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):
+        for channel in channels:
+            if channel not in CHANNELS:
+                raise ValueError(f"{table} must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+    for channel, unit in actuator.units.items():  # raises if the unit has another dimension
+        to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=actuator.name)
+    if actuator.units and actuator.folder is not None:
+        raise ValueError(f"units of files stand in their headings, got units of {actuator.name!r}, a folder")
+    ways = ways_to_watch(load_watched(actuator.rig).rig) if actuator.nodes else ()
+    if actuator.nodes and not any(actuator.nodes.keys() >= {*way} for way in ways):
+        raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(actuator.nodes)}")
+
+
+def _column_unit(channel: str, column: str) -> str | None:
+    """Return the unit in a column's heading, None if it has none of the channel's dimension."""
     label = Label.parse(column)
     unit = label.unit or split_unit(label.name)[1]
     return unit if unit and channel in CHANNELS and same_dimension(unit, CHANNEL_UNITS[channel]) else None
 
 
-def topic_part(name: str) -> str:
-    """Return a name as one level of a topic."""
+def topic_level(name: str) -> str:
+    """Convert a name to one level of an MQTT topic: +, #, / and NUL become underscores."""
     return "".join("_" if letter in "+#/\0" else letter for letter in name)
 
 
 def read_settings(path: Path) -> MonitorSettings:
-    """Return the settings of a file, paths in it taken from its folder.
+    """Read a file of settings; its paths are relative to its folder.
 
-    Raises InputError of one line where it cannot be read or breaks a rule.
+    Raises InputError of one line if it cannot be read or breaks a rule.
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
@@ -262,18 +268,21 @@ def read_settings(path: Path) -> MonitorSettings:
 
 
 def template() -> str:
-    """Return a commented file of settings."""
+    """Return the text of a commented settings file."""
     return (files("sealscope.monitor") / "template.toml").read_text("utf-8")
 
 
-def secret_of(path: Path | None, what: str) -> str | None:
-    """Return the first line of a file that holds a secret; raises InputError where it cannot be read or is empty."""
+def read_secret(path: Path | None, name: str) -> str | None:
+    """Read a secret from a file's first line; return None if `path` is None. Raise InputError if it is missing.
+
+    `name`: name of the setting, for the error.
+    """
     if path is None:
         return None
     try:
         secret = path.read_text(encoding="utf-8").strip().splitlines()[:1]
     except (OSError, ValueError) as error:
-        raise InputError(f"{what} must be a readable file: {getattr(error, 'strerror', None) or error}") from None
+        raise InputError(f"{name} must be a readable file: {getattr(error, 'strerror', None) or error}") from None
     if not secret:
-        raise InputError(f"{what} must hold a secret in its first line, got an empty file ({path})")
+        raise InputError(f"{name} must hold a secret in its first line, got an empty file ({path})")
     return secret[0]

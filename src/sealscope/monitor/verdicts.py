@@ -1,8 +1,8 @@
-"""Verdicts of whole recordings: a watched folder's files are judged against their machine's healthy recordings.
+"""Verdicts on whole recordings: a watched folder's files are judged against their machine's healthy recordings.
 
-The verdict is that of `sealscope diagnose --machine`. It is the actuator's headline on every surface; blocks stay in
-the chart. A recording against healthy ones shows a leak that is there from its first sample, which a watch that begins
-with it cannot.
+The verdict is that of `sealscope diagnose --machine`. Page, metrics and messages state it as the actuator's result; the
+chart shows the blocks. Compared with healthy recordings, a leak shows that is present from the first sample on; a watch
+that learns from the same samples cannot see it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.reporting.messages import how_much
@@ -23,18 +23,19 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
     from sealscope.recordings.recording import Recording
 
-_FALSE_ALARM = priors("verdict")["false_alarm"]
+_FALSE_ALARM = VERDICT.false_alarm
 
 
 @dataclass(frozen=True)
 class RecordingVerdict:
-    """The verdict on one recording, on the clock of the monitor, as plain values that a database holds.
+    """The verdict on one recording, on the clock of the monitor, as plain values for the database.
 
-    `file`: its name; `summary`, `size`, `odds`: the verdict, the leak's size or bound, and the share of healthy
-    recordings that look like this, in the words of `diagnose`; `reason`, `cause`: as in a Diagnosis; `state`: of NE
-    107; `start_s`, `end_s`: of its samples, `onset_s`, `onset_interval_s`: None where it leaks from the first sample,
-    or not at all [s]; `leak_lpm`, `total_lpm` and their 95 % intervals, `bound_lpm`: None where not stated [L/min];
-    `chance`: probability that a leak-free recording scores as high; `mark`: of a person who ended its alarm.
+    `file`: name of the file; `summary`, `size`, `odds`: texts of `diagnose` for the verdict, for the leak's size or
+    bound, and for the fraction of healthy recordings that look like this; `reason`, `cause`: as in a Diagnosis;
+    `state`: of NE 107; `start_s`, `end_s`: times of the first and last sample [s]; `onset_s`, `onset_interval_s`: start
+    of the leak [s], None if it leaks from the first sample, or not at all; `leak_lpm`, `total_lpm` with their 95 %
+    intervals, `bound_lpm` [L/min]: None if not stated; `chance`: probability that a leak-free recording scores as high;
+    `mark`: a person's mark that ended the alarm.
     """
 
     file: str
@@ -59,9 +60,10 @@ class RecordingVerdict:
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
-        """Return the verdict of a diagnosis, its times moved by `shift` [s]; `start_s`, `end_s`: after the move."""
-        plain = diagnosis.as_dict()  # numbers that are not finite are None
-        onset, ends, leaks = plain["onset_s"], _interval(plain["onset_interval_s"]), diagnosis.verdict == LEAK
+        """Convert a diagnosis, adding `shift` [s] to its times; `start_s` and `end_s` include the shift already."""
+        plain = diagnosis.as_dict()  # has None for numbers that are not finite
+        onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
+        leaks = diagnosis.verdict == LEAK
         total = plain["total_leakage"] or {}
         since = None if not leaks else start_s if onset is None else onset + shift
         return cls(
@@ -76,11 +78,11 @@ class RecordingVerdict:
             start_s=start_s,
             end_s=end_s,
             onset_s=None if onset is None else onset + shift,
-            onset_interval_s=None if ends is None else (ends[0] + shift, ends[1] + shift),
+            onset_interval_s=None if onset_ends is None else (onset_ends[0] + shift, onset_ends[1] + shift),
             leak_lpm=plain["leak_lpm"] if leaks else None,
-            leak_interval_lpm=_interval(plain["leak_interval_lpm"]) if leaks else None,
+            leak_interval_lpm=_parse_interval(plain["leak_interval_lpm"]) if leaks else None,
             total_lpm=total.get("lpm"),
-            total_interval_lpm=_interval(total.get("interval_lpm")),
+            total_interval_lpm=_parse_interval(total.get("interval_lpm")),
             bound_lpm=plain["bound_lpm"],
             chance=plain["chance"],
         )
@@ -97,48 +99,40 @@ class RecordingVerdict:
 
     @property
     def decides(self) -> bool:
-        """Test whether the verdict or a person's mark says how the machine is; else its blocks do."""
+        """Test whether the verdict or a person's mark states the condition of the machine; else its blocks do."""
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Test whether a healthy machine looks like this no more often than its share of a rate of false alarms.
+        """Test whether the chance is at most the number of false alarms allowed in this recording's time.
 
-        No chance is known below the rarest one of `priors.toml`.
+        `false_alarms_per_1000_h`: the allowed rate; `rarest` of `priors.toml` is the smallest chance that can be known.
         """
-        share = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6
-        return self.chance is None or self.chance <= max(_FALSE_ALARM["rarest"], share)
+        allowed = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
+        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """Return the number of healthy recordings in 1000 h that look like this, None where no chance is known."""
+        """The number of healthy recordings in 1000 h that score as high by chance, None if the chance is not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
-    def mark_over(self, mark: str) -> RecordingVerdict:
-        """Return the verdict after a person's mark that ends its alarm: the next recording tells how the machine is."""
-        return RecordingVerdict(
-            file=self.file,
-            verdict=CANNOT_TELL,
-            summary=f"marked {mark}",
-            size="",
-            reason="the next recording is judged anew",
-            cause="",
-            state=state_of("watched").as_dict(),
-            start_s=self.start_s,
-            end_s=self.end_s,
-            mark=mark,
-        )
+    def neutral_after_mark(self, mark: str) -> RecordingVerdict:
+        """Return the neutral verdict that replaces this one after a person's mark, until the next recording."""
+        state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
+        texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
+        texts |= {"size": "", "cause": "", "mark": mark}
+        return RecordingVerdict(self.file, CANNOT_TELL, state=state, start_s=start_s, end_s=end_s, **texts)
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Return a block's estimate with the leak of the recording that it is part of, from its onset on."""
+        """Replace the leak of a block's estimate by the recording's leak from its onset on, else by its bound."""
         lpm, interval = self.leak_lpm, self.leak_interval_lpm
         if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):
             lpm, interval = None, None if self.bound_lpm is None else (0.0, self.bound_lpm)
         return replace(block, leak_lpm=lpm, leak_interval_lpm=interval)
 
 
-def _interval(ends: Any) -> Interval | None:
-    """Return an interval's ends as a pair, None where one of them is not known."""
+def _parse_interval(ends: Any) -> Interval | None:
+    """Return the ends of an interval as a pair, None if one of them is unknown."""
     return None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
 
 
@@ -147,12 +141,12 @@ def judge_recording(
 ) -> RecordingVerdict:
     """Judge a recording as `sealscope diagnose --machine` does.
 
-    `shift`: from its time axis to the monitor's clock [s]; `limit_lpm`: leak from which the actuator is to be repaired
-    [L/min], None for the machine's own limit.
+    `shift`: added to the recording's times to give the monitor's clock [s]; `limit_lpm`: leak that calls for a repair
+    [L/min], None for the limit in the machine's file.
     """
     if limit_lpm is not None:
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")
     diagnosis = replace(machine.diagnose(recording), file=file)
-    known = recording.t[np.isfinite(recording.t)]
-    start_s, end_s = (float(known[0]), float(known[-1])) if known.size else (0.0, 0.0)
+    times = recording.t[np.isfinite(recording.t)]
+    start_s, end_s = (float(times[0]), float(times[-1])) if times.size else (0.0, 0.0)
     return RecordingVerdict.from_diagnosis(diagnosis, start_s + shift, end_s + shift, shift)

@@ -32,6 +32,6 @@ _NAMES = {
 
 def __getattr__(name: str) -> Any:
     for module, names in _NAMES.items():
-        if name in names:  # pydantic loads with the first name used
+        if name in names:  # imported late: pydantic is slow to load
             return getattr(importlib.import_module(f"sealscope.parameters.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,14 +6,14 @@ from typing import Literal
 
 from sealscope.parameters.fields import Part, choice, quantity
 
-#: Areas of a double rod are alike within this share of their mean.
-_UNEVEN = 0.1
+#: Largest difference of a double-rod cylinder's areas over their mean: makers' tolerances.
+_MAX_DOUBLE_ROD_UNEVENNESS = 0.1
 
 
 class Cylinder(Part):
-    """Cylinder between two caps, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke.
+    """Cylinder with end stops, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke.
 
-    Double-rod where A_A = A_B, single-rod where not.
+    It is double-rod if A_A = A_B, else single-rod.
     """
 
     A_A: float = quantity("piston area on side A", "m^2", gt=0, le=10)
@@ -41,13 +41,13 @@ class Cylinder(Part):
 
     @property
     def unevenness(self) -> float:
-        """Difference of both areas over their mean: 0 of a double rod."""
+        """Difference of the areas over their mean; 0 for a double rod."""
         return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B))
 
     @property
     def single_rod(self) -> bool:
         """True if the areas differ by more than makers' tolerances do."""
-        return self.unevenness > _UNEVEN
+        return self.unevenness > _MAX_DOUBLE_ROD_UNEVENNESS
 
 
 class Friction(Part):

@@ -1,7 +1,7 @@
-"""Declaration of a parameter: the field's name is the symbol; human name, SI unit and range stand in the model.
+"""Declaration of parameters as fields of pydantic models: symbol, human name, SI unit and range.
 
-A model holds SI numbers and choices only. It has no default: every value comes from a rig's file, with its source. A
-parameter may declare the value at which it is `absent` from the model; a file that does not state it means that one.
+A model contains SI numbers and choices only. Values have no default: each comes from a rig's file, with its source. A
+parameter may declare the value that switches its law off (`absent`), which a file that does not state it implies.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from sealscope.errors import InputError
-from sealscope.storage.plain_values import one_line
+from sealscope.storage.plain_values import format_error
 
 
 def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
-    """Declare a number: human `name`, SI `unit` ("1" where it has none), bounds `gt`, `ge`, `lt`, `le` in that unit.
+    """Declare a number: human `name`, SI `unit` ("1" if it has none), bounds `gt`, `ge`, `lt`, `le` in that unit.
 
-    `absent`: the value that leaves what it stands for out of the model.
+    `absent`: the value for a rig without the part or effect that the number describes.
     """
     return Field(title=name, json_schema_extra={"unit": unit, "absent": absent}, **bounds)  # type: ignore[call-overload]
 
@@ -28,7 +28,7 @@ def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: flo
 def choice(name: str, *, absent: str | None = None) -> Any:
     """Declare a choice between readings of the source, or between laws; the annotation is a Literal of the values.
 
-    `absent`: the value that leaves all other laws out of the model.
+    `absent`: the value for a rig whose file does not state the choice.
     """
     return Field(title=name, json_schema_extra={"unit": "", "absent": absent})
 
@@ -40,7 +40,7 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value at which a parameter is absent from the model, None where it never is."""
+    """Return the value at which a parameter is absent from the model; None if it must be stated."""
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
@@ -52,21 +52,21 @@ def choices_of(field: FieldInfo) -> tuple[str, ...]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Format `number` with its unit, bare where it has none."""
+    """Format `number` with its unit, if it has one."""
     return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
 
 
-def rule_broken(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format pydantic's first message on values of `model` as "SYMBOL must be ..., got ...", bounds with their unit."""
+def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
+    """Format the first of pydantic's errors on `model` as "SYMBOL must be ..., got ...", with the unit of a bound."""
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
-    bounded = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
-    unit = unit_of(model.model_fields[symbol]) if bounded else ""
-    return one_line(error, unit="" if unit in ("", "1") else f" {unit}")
+    has_bound = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
+    unit = unit_of(model.model_fields[symbol]) if has_bound else ""
+    return format_error(error, unit="" if unit in ("", "1") else f" {unit}")
 
 
 class PartsDisagreeError(InputError):
-    """A rule across several parameters is broken; no single one of them is to blame."""
+    """A rule on several parameters together is broken, so that no single one can be named as the cause."""
 
 
 class Part(BaseModel):
@@ -75,24 +75,25 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
+        """Validate the parameters `values` by name; raise InputError for the first broken rule."""
         try:
             super().__init__(**values)
         except ValidationError as error:
-            across = error.errors(include_url=False)[0]["type"] == "value_error"
-            raise (PartsDisagreeError if across else InputError)(rule_broken(error, type(self))) from None
+            is_joint_rule = error.errors(include_url=False)[0]["type"] == "value_error"
+            raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy; with `update` it raises InputError, because pydantic would not validate the new values."""
+        """Return a copy; raise InputError for an `update`, whose values pydantic would not validate."""
         if update:
             raise InputError("a rig must be changed by Rig.with_overrides, got model_copy(update=...)")
         return super().model_copy(deep=deep)
 
 
-def leaves(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """List dotted name and declaration of every parameter below `model`, in the order of declaration."""
+def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Yield the dotted name and the declaration of every parameter of `model` and its parts, in order."""
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            yield from leaves(annotation, f"{prefix}{symbol}.")
+            yield from iter_fields(annotation, f"{prefix}{symbol}.")
         elif field.json_schema_extra is not None:
             yield prefix + symbol, field

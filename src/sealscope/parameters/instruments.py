@@ -10,7 +10,7 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 
 
 class PressureTransducer(Part):
-    """One pressure channel; its white noise is independent of the other channels' and of `sensors.common_noise`."""
+    """A pressure channel; its white noise is independent of the other channels' and of `sensors.common_noise`."""
 
     range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
     range_hi: float = quantity("upper end of the range", "Pa", gt=0, le=1e9)
@@ -29,7 +29,8 @@ class PressureTransducer(Part):
     )
 
     @model_validator(mode="after")
-    def _range_is_a_range(self) -> Self:
+    def _check_range(self) -> Self:
+        """Check that the range is not empty; raise ValueError otherwise."""
         if self.range_lo >= self.range_hi:
             raise ValueError(f"range_lo must be < range_hi = {with_unit(self.range_hi, 'Pa')}, got {self.range_lo}")
         return self
@@ -71,7 +72,7 @@ class Sensors(Part):
 
 
 class Daq(Part):
-    """Data acquisition board; a transducer's range is spread over `sensor_volts_lo` .. `sensor_volts_hi`."""
+    """Data acquisition board; a transducer's range corresponds to `sensor_volts_lo` .. `sensor_volts_hi`."""
 
     bits: int = quantity("resolution of the conversion", "bit", ge=2, le=32)
     range: float = quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)
@@ -82,7 +83,8 @@ class Daq(Part):
     u_max: float = quantity("largest command: plus and minus this voltage", "V", gt=0, le=1e3)
 
     @model_validator(mode="after")
-    def _outputs_fit_the_input(self) -> Self:
+    def _check_output_volts(self) -> Self:
+        """Check that the transducers' outputs are within the input range; raise ValueError otherwise."""
         lo, hi = self.sensor_volts_lo, self.sensor_volts_hi
         if lo >= hi:
             raise ValueError(f"sensor_volts_lo must be < sensor_volts_hi = {with_unit(hi, 'V')}, got {lo}")

@@ -1,4 +1,4 @@
-"""Rigs as files: one TOML a rig, packaged by name or a user's own, which may extend another."""
+"""Rigs as TOML files: packaged ones by name, and a user's, each of which may extend another."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import os
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
-from sealscope.calls import checked_call, closest
+from sealscope.calls import checked_call, suggestion
 from sealscope.errors import InputError
-from sealscope.parameters.rig import ParameterEntry, Rig, flatten
+from sealscope.parameters.rig import ParameterEntry, Rig, flatten_entries
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.opening import names_a_file
+from sealscope.storage.opening import is_file_path
 from sealscope.storage.toml_file import read_toml
 
 _PACKAGED = Path(__file__).parent / "rigs"
-_DEEPEST = 8
+_MAX_LAYERS = 8
 _MAP = "[map]"
-#: Tables that the file of a commissioned machine has beside its rig.
-OF_MACHINES = ("machine", "learnt", "healthy", "alarms")
+#: Tables in the file of a commissioned machine in addition to its rig.
+MACHINE_TABLES = ("machine", "learnt", "healthy", "alarms")
 
 
 def rig_names() -> tuple[str, ...]:
@@ -82,61 +83,76 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
         raise InputError(f"rig must be a Rig, the name of a rig or a path, got {rig!r}")
     text = os.fspath(rig)
     if text in rig_names():
-        return _packaged(text)
+        return _load_packaged(text)
     if "\0" in text or not _is_path(text):
         raise InputError(
-            f"{text!r} is no packaged rig ({', '.join(rig_names())}) and no .toml file{closest(text, rig_names())}"
+            f"{text!r} is no packaged rig ({', '.join(rig_names())}) and no .toml file{suggestion(text, rig_names())}"
         )
-    return _build(Path(text), text)
+    return _load_file(Path(text), text)
 
 
 @lru_cache(maxsize=32)
-def _packaged(name: str) -> Rig:
-    return _build(_PACKAGED / f"{name}.toml", f"rigs/{name}.toml")
+def _load_packaged(name: str) -> Rig:
+    """Load a packaged rig by its name, once."""
+    return _load_file(_PACKAGED / f"{name}.toml", f"rigs/{name}.toml")
 
 
 def _is_path(text: str) -> bool:
-    return text.endswith(".toml") or "/" in text or os.sep in text or names_a_file(text)
+    """Return True if a text names a file and not a packaged rig."""
+    return text.endswith(".toml") or "/" in text or os.sep in text or is_file_path(text)
 
 
-def _build(path: Path, place: str) -> Rig:
-    head, entries, columns = _collect(path, place, ())
+def _load_file(path: Path, place: str) -> Rig:
+    """Load a rig from its file and those that it extends; `place` names the file in messages."""
+    head, entries, columns = _read_layers(path, place, ())
     rig = Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
     return rig.with_channel_map(columns) if columns else rig
 
 
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
-    """Write channel -> column into the table `[map]` of a rig's file, in place of the former one.
+    """Replace the table `[map]` (channel = column) in a rig's file.
 
-    Raises InputError where the file is no rig's, or cannot be written; then it stays as it was.
+    Raises InputError if the file is not a rig's or cannot be written, and leaves it unchanged.
     """
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
     file = Path(path)
     load_rig(file)
     lines = file.read_text(encoding="utf-8-sig").splitlines()
-    starts = [number for number, line in enumerate(lines) if line.strip() == _MAP]
-    if starts:
-        end = next((k for k in range(starts[0] + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
-        lines[starts[0] : end] = []
+    map_lines = [number for number, line in enumerate(lines) if line.strip() == _MAP]
+    if map_lines:
+        start = map_lines[0]
+        end = next((k for k in range(start + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))
+        del lines[start:end]
     while lines and not lines[-1].strip():
         lines.pop()
     table = [f"{json.dumps(channel)} = {json.dumps(column)}" for channel, column in columns.items()]
     with atomic_write(file) as temporary:
         temporary.write_text("\n".join([*lines, "", _MAP, *table]) + "\n", encoding="utf-8")
-        _collect(temporary, os.fspath(path), ())
+        _read_layers(temporary, os.fspath(path), ())  # raises if the result is not a rig's file
 
 
-def _collect(
-    path: Path, place: str, visited: tuple[Path, ...]
-) -> tuple[dict[str, str], dict[str, ParameterEntry], dict[str, str]]:
-    """Read head, entries and map of columns of a file, over those of the rig it extends."""
+class _RigFile(NamedTuple):
+    """A rig's file: its `[rig]`; entries of its parameters by dotted name; columns of its logs by channel."""
+
+    head: dict[str, str]
+    entries: dict[str, ParameterEntry]
+    columns: dict[str, str]
+
+
+def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
+    """Read a rig's file over the rig that it extends, whose entries and columns it replaces.
+
+    `place` names the file in messages; `visited`: the files that led to it.
+    """
     file = path.resolve()
-    if file in visited or len(visited) >= _DEEPEST:
-        raise InputError(f"extends must end at a rig of its own, got a circle or more than {_DEEPEST} files ({place})")
+    if file in visited or len(visited) >= _MAX_LAYERS:
+        raise InputError(
+            f"extends must end at a rig of its own, got a circle or more than {_MAX_LAYERS} files ({place})"
+        )
     tree = read_toml(path, "a rig file", place)
     if "machine" in tree:
-        tree = {name: table for name, table in tree.items() if name not in OF_MACHINES}
+        tree = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
         if not set(tree) - {"map"}:
             raise InputError(f"a machine's file must state an area to be a rig, got none: commission it anew ({place})")
     head = tree.pop("rig", {})
@@ -158,11 +174,11 @@ def _collect(
     columns: dict[str, str] = {}
     base = head.get("extends")
     if base in rig_names():
-        _, entries, columns = _collect(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*visited, file))
+        _, entries, columns = _read_layers(_PACKAGED / f"{base}.toml", f"rigs/{base}.toml", (*visited, file))
     elif base is not None and "\0" not in base and _is_path(base):
-        _, entries, columns = _collect(path.parent / base, os.fspath(Path(place).parent / base), (*visited, file))
+        _, entries, columns = _read_layers(path.parent / base, os.fspath(Path(place).parent / base), (*visited, file))
     elif base is not None:
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
-    return head, entries | flatten(tree.items(), place), channel_map or columns
+    return _RigFile(head, entries | flatten_entries(tree.items(), place), channel_map or columns)

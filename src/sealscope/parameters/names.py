@@ -1,13 +1,13 @@
-"""Names of parameters: bare where unique, dotted otherwise; and overrides as typed on a command line."""
+"""Names of parameters (bare if unique, else dotted), and overrides as typed on a command line."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sealscope.calls import closest
+from sealscope.calls import suggestion
 from sealscope.errors import InputError
 
-#: What textbooks and other programs call a parameter, without case and underscores.
+#: Names of parameters in textbooks and other programs, in lower case and without underscores.
 _OTHER_NAMES = {
     **dict.fromkeys(("beta", "betae", "bulkmodulus"), "fluid.K_oil"),
     **dict.fromkeys(("ap", "area", "pistonarea"), "cylinder.A_A"),
@@ -18,14 +18,14 @@ _OTHER_NAMES = {
 }
 
 
-def resolve(name: str, dotted: Sequence[str]) -> str:
-    """Find the dotted name of `name`: itself, or the only one that ends with it (`V_1`, `p_A.noise`).
+def resolve_name(name: str, dotted: Sequence[str]) -> str:
+    """Find a parameter's dotted name from that name itself or from a unique ending of it (`V_1`, `p_A.noise`).
 
-    Raises InputError where no parameter has the name, or several have.
+    Raises InputError if no parameter has the name, or several have.
     """
     if name in dotted:
         return name
-    matches = [full for full in dotted if full.endswith("." + name)] if name else []
+    matches = [full_name for full_name in dotted if full_name.endswith("." + name)] if name else []
     if len(matches) == 1:
         return matches[0]
     if matches:
@@ -34,14 +34,16 @@ def resolve(name: str, dotted: Sequence[str]) -> str:
     synonym = _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", ""))
     if synonym in dotted:
         raise InputError(f"{name!r} is not a parameter; did you mean {synonym}?")
-    bare = [full.rpartition(".")[2] for full in dotted]
-    raise InputError(f"{name!r} is not a parameter{closest(name, dotted if '.' in name else [*dict.fromkeys(bare)])}")
+    bare = [full_name.rpartition(".")[2] for full_name in dotted]
+    raise InputError(
+        f"{name!r} is not a parameter{suggestion(name, dotted if '.' in name else [*dict.fromkeys(bare)])}"
+    )
 
 
 def parse_override(text: str) -> tuple[str, str]:
-    """Parse one `NAME=VALUE[unit]`; the value stays text, for `Rig.with_overrides` to read.
+    """Split an override `NAME=VALUE[unit]` into name and value; the value stays text, for `Rig.with_overrides`.
 
-    Raises InputError where there is no name, no equals sign or no value.
+    Raises InputError if the name, the equals sign or the value is missing.
     """
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
@@ -51,7 +53,7 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
-    """Parse all overrides of one command; raise InputError for a name with two values."""
+    """Split all overrides of one command; raise InputError for a name with two values."""
     overrides: dict[str, str] = {}
     for text in texts:
         name, value = parse_override(text)

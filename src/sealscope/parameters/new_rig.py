@@ -1,4 +1,4 @@
-"""A new rig's file from the numbers of a data sheet: what they do not tell is assumed, and marked as such."""
+"""The file of a new rig from the numbers of a data sheet; all other values are assumed, and marked as such."""
 
 from __future__ import annotations
 
@@ -8,35 +8,33 @@ from string import Template
 
 from sealscope.errors import InputError
 from sealscope.parameters.load import load_rig
-from sealscope.parameters.rig import Rig
+from sealscope.parameters.rig import GAS_OVER_ROD, Rig
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
-#: Dead volume of each side, over the larger swept volume.
-_DEAD = 0.25
-#: Gas in the accumulator over the oil that the rod displaces.
-_GAS = 5.0
-#: Speed of a supply's pump [rev/s], pressure above its setting at which the relief valve takes all of its flow [Pa],
-#: and pressure of the accumulator's gas over the setting.
-_SUPPLY_SPEED, _ABOVE_SETTING, _CHARGE = 25.0, 2.5e5, 0.7
+#: Dead volume of each side over the larger swept volume.
+_DEAD_VOLUME_RATIO = 0.25
+#: Speed of a supply's pump [rev/s]; pressure [Pa] above the setting at which the relief valve passes the pump's whole
+#: flow; precharge of the accumulator over the setting.
+_SUPPLY_SPEED, _RELIEF_RANGE, _PRECHARGE_RATIO = 25.0, 2.5e5, 0.7
 _STATED = "stated when this file was written: replace by drawing or data sheet"
 
 
-def piston_areas(bore: float, rod: float, *, both: bool = False) -> tuple[float, float]:
-    """Compute the piston areas [m^2] of sides A and B from bore and rod [m]; `both`: the rod leaves both sides.
+def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[float, float]:
+    """Compute the piston areas [m^2] of sides A and B from the diameters of bore and rod [m].
 
-    Raises InputError where the rod is not thinner than the bore.
+    Raises InputError if the rod is not thinner than the bore.
     """
     if not (math.isfinite(bore) and 0.0 <= rod < bore):
         raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
-    ring = 0.25 * math.pi * (bore**2 - rod**2)
-    return (ring if both else 0.25 * math.pi * bore**2), ring
+    ring_area = 0.25 * math.pi * (bore**2 - rod**2)
+    return (ring_area if double_rod else 0.25 * math.pi * bore**2), ring_area
 
 
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
     """Format the file of a pump-controlled rig, with comments.
 
-    What the four numbers do not tell is taken from `thesis` (equal areas) or `single-rod-eha`, scaled where the size of
-    the machine says how: friction with the bore, moving mass with the oil displaced, valves with the volumes.
+    All other parameters are those of `thesis` (equal areas) or `single-rod-eha`. Some are scaled with the machine's
+    size: friction with the bore, moving mass and valves with the volume.
 
     Parameters
     ----------
@@ -54,19 +52,19 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     InputError
         A number is not > 0, or the name has more than letters, digits, `-`, `_` and blanks.
     """
-    _check_sizes(name, {"area-A": area_A, "area-B": area_B, "stroke": stroke, "displacement": displacement})
-    single = area_A != area_B
-    base = load_rig("single-rod-eha" if single else "thesis")
-    sizes = _cylinder_sizes(base, area_A, area_B, stroke)
-    text = _template("new_rig.toml.txt").substitute(
+    _check_arguments(name, {"area-A": area_A, "area-B": area_B, "stroke": stroke, "displacement": displacement})
+    is_single_rod = area_A != area_B
+    base = load_rig("single-rod-eha" if is_single_rod else "thesis")
+    sizes = _cylinder_parameters(base, area_A, area_B, stroke)
+    text = _read_template("new_rig.toml.txt").substitute(
         sizes,
         name=name,
         q_b=f"{1e6 * displacement:g}",
         displacement=f"{1e6 * displacement:.6g}",
-        V_gas=f"{1e3 * _GAS * abs(area_A - area_B) * stroke:.4g}",
-        G_check=f"{base.makeup.G_check * _size(base, area_A, area_B, stroke):.4g}",
+        V_gas=f"{1e3 * GAS_OVER_ROD * abs(area_A - area_B) * stroke:.4g}",
+        G_check=f"{base.makeup.G_check * _volume_ratio(base, area_A, area_B, stroke):.4g}",
     )
-    return text if single else text[: text.index("\n[makeup]")]
+    return text if is_single_rod else text[: text.index("\n[makeup]")]  # equal areas need no make-up valves
 
 
 def valve_rig_text(
@@ -78,9 +76,9 @@ def valve_rig_text(
     rated_drop: float | None = None,
     pressure: float | None = None,
 ) -> str:
-    """Return the text of the file of a valve-controlled rig, with comments.
+    """Format the file of a valve-controlled rig, with comments.
 
-    What the numbers do not tell is taken from `servo-valve`, scaled where the size of the machine says how.
+    All other parameters are those of `servo-valve`, some of them scaled with the machine's size.
 
     Parameters
     ----------
@@ -106,52 +104,54 @@ def valve_rig_text(
     drop = base.valve.dp_N if rated_drop is None else rated_drop
     setting = base.supply.p_set if pressure is None else pressure
     sizes = {"area-A": area_A, "area-B": area_B, "stroke": stroke, "valve": rated_flow, "drop": drop, "supply": setting}
-    _check_sizes(name, sizes)
+    _check_arguments(name, sizes)
     assumed = f"assumed: that of {base.name}"
-    torques = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)  # so many motors on one shaft
-    motor = {name: f"{base[f'motor.{name}'] * torques:.4g}" for name in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
-    motor |= {name: f"{base[f'motor.{name}'] / torques:.4g}" for name in ("R_c", "L_c")}  # type: ignore[operator]
-    return _template("new_valve_rig.toml.txt").substitute(
-        _cylinder_sizes(base, area_A, area_B, stroke),
+    usual_drop = "assumed: usual of servo valves; proportional valves are rated at 5 bar"
+    # the motor is scaled like several equal ones on one shaft, connected in parallel
+    n_motors = rated_flow / _SUPPLY_SPEED * setting / (base.pump.q_b * base.supply.p_set)
+    motor = {key: f"{base[f'motor.{key}'] * n_motors:.4g}" for key in ("i_max", "J_M", "B_M")}  # type: ignore[operator]
+    motor |= {key: f"{base[f'motor.{key}'] / n_motors:.4g}" for key in ("R_c", "L_c")}  # type: ignore[operator]
+    return _read_template("new_valve_rig.toml.txt").substitute(
+        _cylinder_parameters(base, area_A, area_B, stroke),
         name=name,
         flow=f"{rated_flow / LITRE_PER_MINUTE:.6g}",
         drop=f"{drop / BAR:.6g}",
-        drop_source="assumed: usual of servo valves; proportional valves are rated at 5 bar"
-        if rated_drop is None
-        else _STATED,
+        drop_source=usual_drop if rated_drop is None else _STATED,
         pressure=f"{setting / BAR:.6g}",
         pressure_source=assumed if pressure is None else _STATED,
-        charge=f"{_CHARGE * setting / BAR:.4g}",
-        G_set=f"{rated_flow / _ABOVE_SETTING:.4g}",
+        charge=f"{_PRECHARGE_RATIO * setting / BAR:.4g}",
+        G_set=f"{rated_flow / _RELIEF_RANGE:.4g}",
         V_acc=f"{1e3 * base.supply.V_acc * rated_flow / base.valve.Q_N:.4g}",
         q_b=f"{1e6 * rated_flow / _SUPPLY_SPEED:.4g}",
         **motor,
     )
 
 
-def _check_sizes(name: str, sizes: dict[str, float]) -> None:
-    for what, value in sizes.items():
+def _check_arguments(name: str, sizes: dict[str, float]) -> None:
+    """Check that the rig's name is valid and its sizes are > 0 and finite; raise InputError otherwise."""
+    for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
-            raise InputError(f"{what} must be > 0, got {value:g}")
+            raise InputError(f"{argument} must be > 0, got {value:g}")
     if not name.strip() or not all(letter.isalnum() or letter in "-_ " for letter in name):
         raise InputError(f"name of a rig must be of letters, digits, '-', '_' and blanks, got {name!r}")
 
 
-def _template(file: str) -> Template:
+def _read_template(file: str) -> Template:
+    """Read the template of a rig's file."""
     return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
 
 
-def _size(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute the volume of a side at mid-stroke over that of the rig `base`."""
-    return (0.5 + _DEAD) * max(area_A, area_B) * stroke / base.cylinder.V
+def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
+    """Compute the volume of a side at mid-stroke, dead volume included, over that of the rig `base`."""
+    return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 
-def _cylinder_sizes(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
-    """Return the parameters of cylinder and friction, by the keys of the templates."""
-    larger, size = max(area_A, area_B), _size(base, area_A, area_B, stroke)
-    bore = math.sqrt(larger / max(base.cylinder.A_A, base.cylinder.A_B))
-    mass, friction = base.cylinder.M_eq * size, base.friction
-    # side B is the smaller one in V_rod; a rod on side A leaves V to B
+def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
+    """Format the parameters of cylinder and friction, by the keys of the templates, scaled from the rig `base`."""
+    volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
+    bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))
+    mass, friction = base.cylinder.M_eq * volume_ratio, base.friction
+    # V is the larger side's volume and V_rod what the rod takes from side B; a rod on side A takes nothing from it
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
     return {
         "kind": "Double" if area_A == area_B else "Single",
@@ -161,11 +161,11 @@ def _cylinder_sizes(base: Rig, area_A: float, area_B: float, stroke: float) -> d
         "area_A": f"{1e6 * area_A:.6g}",
         "area_B": f"{1e6 * area_B:.6g}",
         "stroke": f"{1e3 * stroke:.6g}",
-        "V": f"{1e6 * size * base.cylinder.V:.6g}",
+        "V": f"{1e6 * volume_ratio * base.cylinder.V:.6g}",
         "V_rod": f"{1e6 * V_rod:.6g}",
         "M_eq": f"{mass:.4g}",
-        "d_stop": f"{math.sqrt(base.cylinder.k_stop * mass):.4g}",
-        "F_pr": f"{friction.F_pr * bore:.4g}",
-        "F_cfr": f"{friction.F_cfr * bore**2:.4g}",
-        "F_v": f"{friction.F_v * bore:.4g}",
+        "d_stop": f"{math.sqrt(base.cylinder.k_stop * mass):.4g}",  # damping ratio 1/2
+        "F_pr": f"{friction.F_pr * bore_ratio:.4g}",
+        "F_cfr": f"{friction.F_cfr * bore_ratio**2:.4g}",
+        "F_v": f"{friction.F_v * bore_ratio:.4g}",
     }

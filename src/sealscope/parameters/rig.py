@@ -11,26 +11,27 @@ import numpy as np
 from pydantic import PrivateAttr, model_validator
 from pydantic.fields import FieldInfo
 
-from sealscope.calls import closest
+from sealscope.calls import suggestion
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
+from sealscope.parameters.circuit import PUMP_CIRCUIT, VALVE_CIRCUIT, HydraulicCircuit
 from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
-from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, leaves, unit_of, with_unit
+from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.names import resolve
+from sealscope.parameters.names import resolve_name
 from sealscope.parameters.valve import ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str
 P = TypeVar("P", bound=Part)
-#: Begins the source of a value that nobody has stated of this machine.
+#: Prefix of the source of a value that is not stated for this machine.
 ASSUMED = "assumed:"
-#: Gas of an accumulator over the oil that the rod displaces over the stroke.
-_GAS_OVER_ROD = 5.0
+#: Gas of an accumulator over the oil that the rod displaces in a stroke.
+GAS_OVER_ROD = 5.0
 
 
 class ParameterEntry(NamedTuple):
-    """One value as stated: number or choice, unit ("" for a choice), source, and its file or option."""
+    """A parameter as stated: number or choice, unit ("" for a choice), source, and the file or option it is from."""
 
     value: Value
     unit: str
@@ -38,12 +39,12 @@ class ParameterEntry(NamedTuple):
     place: str
 
     def text(self) -> str:
-        """Value and unit as given."""
+        """Format value and unit as stated."""
         return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
 
 
 class ParameterRow(NamedTuple):
-    """One line of the table of parameters; `value` in the SI unit `unit`, `given` as the file states it."""
+    """A row of the table of parameters; `value` in the SI unit `unit`, `given` as the file states it."""
 
     symbol: str
     name: str
@@ -88,7 +89,7 @@ class Rig(Part):
     Raises
     ------
     InputError
-        Where parts do not fit together.
+        A rule on several parameters is broken.
 
     Examples
     --------
@@ -117,47 +118,47 @@ class Rig(Part):
     _channel_map: tuple[tuple[str, str], ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
-    def _parts_fit_together(self) -> Self:
-        c = self.cylinder
-        if c.V_rod >= c.V:
-            raise ValueError(f"cylinder.V_rod must be < V = {with_unit(c.V, 'm^3')}, got {with_unit(c.V_rod, 'm^3')}")
-        for symbol, volume in (("A_A", c.V), ("A_B", c.V - c.V_rod)) if c.volumes == "position" else ():
-            swept = getattr(c, symbol) * c.L / 2.0
+    def _check_parts(self) -> Self:
+        """Check the rules on several parameters; raise ValueError, as pydantic requires, if one is broken."""
+        cylinder, makeup, friction = self.cylinder, self.makeup, self.friction
+        V, V_rod = cylinder.V, cylinder.V_rod
+        if V_rod >= V:
+            raise ValueError(f"cylinder.V_rod must be < V = {with_unit(V, 'm^3')}, got {with_unit(V_rod, 'm^3')}")
+        for symbol, volume in (("A_A", V), ("A_B", V - V_rod)) if cylinder.volumes == "position" else ():
+            swept = getattr(cylinder, symbol) * cylinder.L / 2.0
             if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
-                less = " - V_rod" if volume < c.V else ""
-                raise ValueError(f"cylinder.V{less} {rule}, got {with_unit(volume, '') if less else volume}")
-        m = self.makeup
-        if m.G_relief > 0 and m.check_valves == "absent":
+                minus_rod = " - V_rod" if volume < V else ""
+                raise ValueError(f"cylinder.V{minus_rod} {rule}, got {with_unit(volume, '') if minus_rod else volume}")
+        if makeup.G_relief > 0 and makeup.check_valves == "absent":
             raise ValueError(
-                f"makeup.G_relief = {m.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open into "
-                "(makeup.check_valves = present or pilot-operated), got check_valves = absent"
+                f"makeup.G_relief = {makeup.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open "
+                "into (makeup.check_valves = present or pilot-operated), got check_valves = absent"
             )
-        self._valve_fits()
-        self._lines_hold_what_is_in_them()
-        rod = abs(c.A_A - c.A_B) * c.L
-        if m.check_valves == "pilot-operated" and m.V_gas <= rod:
+        self._check_valve()
+        self._check_lines()
+        displaced = abs(cylinder.A_A - cylinder.A_B) * cylinder.L
+        if makeup.check_valves == "pilot-operated" and makeup.V_gas <= displaced:
             raise ValueError(
                 f"makeup.V_gas must be > the oil that the rod displaces over the stroke, |A_A - A_B| L = "
-                f"{with_unit(rod, 'm^3')}, got {with_unit(m.V_gas, 'm^3')}"
+                f"{with_unit(displaced, 'm^3')}, got {with_unit(makeup.V_gas, 'm^3')}"
             )
-        f = self.friction
-        if f.law != "stribeck" and (f.coulomb_pressure != "sum" or f.F_pr <= 0):
+        if friction.law != "stribeck" and (friction.coulomb_pressure != "sum" or friction.F_pr <= 0):
             raise ValueError(
-                f'friction.law = "{f.law}" must have coulomb_pressure = "sum" and F_pr > 0, for its force must be > 0, '
-                f"got {f.coulomb_pressure} and {with_unit(f.F_pr, 'N')}"
+                f'friction.law = "{friction.law}" must have coulomb_pressure = "sum" and F_pr > 0, for its force must '
+                f"be > 0, got {friction.coulomb_pressure} and {with_unit(friction.F_pr, 'N')}"
             )
         return self
 
-    def _valve_fits(self) -> None:
-        """Raise ValueError for a valve without a supply, a supply without a valve, and parts that neither can have."""
+    def _check_valve(self) -> None:
+        """Check that a servo valve has a supply, a supply a valve, and both a rig that suits them; else ValueError."""
         valve, supply = self.valve, self.supply
-        if (valve.spool == "present") != (supply.drive != "absent"):
+        if self.circuit.valve_controlled != (supply.drive != "absent"):
             raise ValueError(
                 "a servo valve must have a supply, and a supply a valve (valve.spool = present and supply.drive = "
                 f"constant-speed), got valve.spool = {valve.spool} and supply.drive = {supply.drive}"
             )
-        if valve.spool == "absent":
+        if not self.circuit.valve_controlled:
             return
         for name, value in (("line.orifices", self.line.orifices), ("makeup.check_valves", self.makeup.check_valves)):
             if value != "absent":
@@ -172,8 +173,8 @@ class Rig(Part):
                 f"the accumulator takes oil, got {with_unit(supply.p_pre, 'Pa')}"
             )
 
-    def _lines_hold_what_is_in_them(self) -> None:
-        """Raise ValueError for shut-off valves or filters in absent lines, and for an oil that thickens."""
+    def _check_lines(self) -> None:
+        """Check that valves and filters are in lines, and that warm oil is thinner; raise ValueError otherwise."""
         line, oil = self.line, self.fluid
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
@@ -181,11 +182,12 @@ class Rig(Part):
                     f"a {'filter' if absent == 0.0 else 'shut-off valve'} must be in a line (line.orifices = present), "
                     f"got line.{name} = {getattr(line, name):g} and line.orifices = absent"
                 )
-        for name, needed in (("k_clog_A", line.R_A), ("k_clog_B", line.R_B), ("G_bypass", max(line.R_A, line.R_B))):
-            if getattr(line, name) > 0.0 and needed == 0.0:
+        R_A, R_B = line.R_A, line.R_B
+        for name, R_name, R in (("k_clog_A", "R_A", R_A), ("k_clog_B", "R_B", R_B), ("G_bypass", "R_A", max(R_A, R_B))):
+            if getattr(line, name) > 0.0 and R == 0.0:
                 raise ValueError(
-                    f"line.{name} must stand with a filter ({name.replace('k_clog', 'R').replace('G_bypass', 'R_A')} > "
-                    f"0), got line.{name} = {getattr(line, name):g} and none"
+                    f"line.{name} must stand with a filter ({R_name} > 0), got line.{name} = "
+                    f"{getattr(line, name):g} and none"
                 )
         if not oil.nu_100 < oil.nu_40:
             raise ValueError(
@@ -202,9 +204,9 @@ class Rig(Part):
         return hash(tuple(getattr(self, part) for part in Rig.model_fields))
 
     def __repr__(self) -> str:
-        overrides = sum(entry.source.startswith("set by") for _, entry in self._entries)
-        changed = f", {overrides} overridden" if overrides else ""
-        return f"<Rig {self._name}: {self._title or 'no title'}, {len(self._entries)} parameters{changed}>"
+        n_overrides = sum(entry.source.startswith("set by") for _, entry in self._entries)
+        overridden = f", {n_overrides} overridden" if n_overrides else ""
+        return f"<Rig {self._name}: {self._title or 'no title'}, {len(self._entries)} parameters{overridden}>"
 
     __str__ = __repr__
 
@@ -217,6 +219,11 @@ class Rig(Part):
     def title(self) -> str:
         """Description of the rig in words."""
         return self._title
+
+    @property
+    def circuit(self) -> HydraulicCircuit:
+        """Connection of pump and chambers."""
+        return VALVE_CIRCUIT if self.valve.spool == "present" else PUMP_CIRCUIT
 
     @property
     def channel_map(self) -> dict[str, str]:
@@ -232,25 +239,26 @@ class Rig(Part):
     def __getitem__(self, name: str) -> Value:
         """Return the SI value of a parameter by its bare or dotted name."""
         value: Any = self
-        for symbol in resolve(name, declared_names()).split("."):
+        for symbol in resolve_name(name, declared_names()).split("."):
             value = getattr(value, symbol)
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
         """Return value, unit, source and place of a parameter, as stated."""
-        return self._stated_entries()[resolve(name, declared_names())]
+        return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if these parameters are stated: a source that begins with `assumed:` states nothing."""
+        """Return True if all these parameters are stated for this machine, and none is assumed (source `assumed:`)."""
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
-        """Return the same rig with each value an assumption, for this reason."""
+        """Return the same rig with all values marked as assumed, for a reason that their sources state."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
         return rig.with_channel_map(self.channel_map)
 
     def _stated_entries(self) -> dict[str, ParameterEntry]:
+        """Return the entries of all parameters by dotted name; raise InputError for a rig made without sources."""
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
@@ -265,36 +273,37 @@ class Rig(Part):
         if not source.strip():
             raise InputError("source must not be blank")
         entries = self._stated_entries()
-        replaced: dict[str, str] = {}
+        names_by_parameter: dict[str, str] = {}  # as the caller wrote them
         for name, value in overrides.items():
-            full = resolve(name, declared_names())
-            if full in replaced:
-                raise InputError(f"{full} must be set once, got {replaced[full]} and {name}")
-            replaced[full] = name
-            entries[full] = ParameterEntry(*_as_given(full, value, source), source, source)
+            full_name = resolve_name(name, declared_names())
+            if full_name in names_by_parameter:
+                raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
+            names_by_parameter[full_name] = name
+            entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), source, source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
-        """Return the same machine with other piston areas [m^2]; volumes that move with the piston fit them.
+        """Return the same rig with other piston areas [m^2], and volumes that fit them.
 
-        The dead volume beside the stroke and the accumulator's gas are scaled with the larger area, an assumption.
+        The dead volume (not swept by the piston) and the accumulator's gas are scaled with the larger area, and marked
+        as assumed.
         """
-        entries, old = self._stated_entries(), self.cylinder
-        scale = max(A_A, A_B) / max(old.A_A, old.A_B)
-        fitted: dict[str, float] = {}
-        if old.volumes == "position":
-            dead = max(old.V - 0.5 * max(old.A_A, old.A_B) * old.L, 0.0)
-            fitted["cylinder.V"] = 0.5 * max(A_A, A_B) * old.L + scale * dead
-            fitted["cylinder.V_rod"] = max(0.5 * (A_A - A_B) * old.L, 0.0)
+        entries, cylinder = self._stated_entries(), self.cylinder
+        scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
+        scaled_values: dict[str, float] = {}
+        if cylinder.volumes == "position":
+            dead_volume = max(cylinder.V - 0.5 * max(cylinder.A_A, cylinder.A_B) * cylinder.L, 0.0)
+            scaled_values["cylinder.V"] = 0.5 * max(A_A, A_B) * cylinder.L + scale * dead_volume
+            scaled_values["cylinder.V_rod"] = max(0.5 * (A_A - A_B) * cylinder.L, 0.0)
         if self.makeup.check_valves != "absent":
-            gas = _GAS_OVER_ROD * abs(A_A - A_B) * old.L
-            fitted["makeup.V_gas"] = max(scale * self.makeup.V_gas, gas)
+            min_gas = GAS_OVER_ROD * abs(A_A - A_B) * cylinder.L
+            scaled_values["makeup.V_gas"] = max(scale * self.makeup.V_gas, min_gas)
         assumed = f"{ASSUMED} that of {self._name}, scaled with the area"
-        stated = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
-        for values, why in ((fitted, assumed), (stated, source)):
-            for full, value in values.items():
-                entries[full] = ParameterEntry(*_as_given(full, value, source), why, source)
+        stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
+        for values, value_source in ((scaled_values, assumed), (stated_values, source)):
+            for full_name, value in values.items():
+                entries[full_name] = ParameterEntry(*_parse_value(full_name, value, source), value_source, source)
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=source)
         return rig.with_channel_map(self.channel_map)
 
@@ -303,23 +312,23 @@ class Rig(Part):
         entries = self._stated_entries()
         return [
             ParameterRow(
-                name.rpartition(".")[2],
-                name,
-                str(field.title),
-                self[name],
-                unit_of(field),
-                entries[name].text(),
-                entries[name].source,
+                symbol=name.rpartition(".")[2],
+                name=name,
+                meaning=str(field.title),
+                value=self[name],
+                unit=unit_of(field),
+                given=entries[name].text(),
+                source=entries[name].source,
             )
-            for name, field in declared().items()
+            for name, field in declared_fields().items()
         ]
 
-    def present(self) -> dict[str, Value]:
-        """Return the values in SI by dotted name, without those of parameters absent from the model.
+    def present_values(self) -> dict[str, Value]:
+        """Return the SI values by dotted name, without parameters that are absent from the model.
 
-        Two rigs have the same ones where they are the same machine, whichever parameters Sealscope has learnt since.
+        They identify a machine in all versions: a parameter that a later version adds is absent from older rigs.
         """
-        return {name: self[name] for name, field in declared().items() if self[name] != absent_of(field)}
+        return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the rig to plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
@@ -342,39 +351,41 @@ class Rig(Part):
         head = tree.get("rig")
         name, title = (head.get("name", ""), head.get("title", "")) if isinstance(head, Mapping) else ("", "")
         parts = ((key, item) for key, item in tree.items() if key != "rig")
-        return cls.from_entries(flatten(parts, place), name=str(name), title=str(title), place=place)
+        return cls.from_entries(flatten_entries(parts, place), name=str(name), title=str(title), place=place)
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
-        """Build a rig from one entry for each declared parameter, by dotted name.
+        """Build a rig from the entries of its parameters, by dotted name.
 
-        One that is not stated has the value at which it is absent; `place` is named where it has none such.
+        A parameter without an entry has its `absent` value; raises InputError, which names `place`, if it has none.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
-        for full in entries:
-            if full not in declared():
-                raise InputError(f"{full} is not a parameter{closest(full, names)} ({entries[full].place})")
-        for full in names:
-            if full not in entries:
-                raise InputError(f"{full} is missing ({place})")
-        rig = _built(cls, "", entries, place)
+        for full_name in entries:
+            if full_name not in declared_fields():
+                raise InputError(
+                    f"{full_name} is not a parameter{suggestion(full_name, names)} ({entries[full_name].place})"
+                )
+        for full_name in names:
+            if full_name not in entries:
+                raise InputError(f"{full_name} is missing ({place})")
+        rig = _build_part(cls, "", entries, place)
         rig._name, rig._title = name, title
-        rig._entries = tuple((full, entries[full]) for full in names)
+        rig._entries = tuple((full_name, entries[full_name]) for full_name in names)
         return rig
 
 
 @cache
-def declared() -> dict[str, FieldInfo]:
-    """Return the declaration of each parameter by dotted name, in the order of declaration."""
-    return dict(leaves(Rig))
+def declared_fields() -> dict[str, FieldInfo]:
+    """Return pydantic's field of every parameter of a rig by dotted name, in the order of declaration."""
+    return dict(iter_fields(Rig))
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Make an entry for each parameter that need not be stated."""
+    """Make the entries of all parameters that need not be stated, with their `absent` values."""
     return {
-        full: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
-        for full, field in declared().items()
+        full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
+        for full_name, field in declared_fields().items()
         if (value := absent_of(field)) is not None
     }
 
@@ -382,45 +393,43 @@ def _absent_entries(place: str) -> dict[str, ParameterEntry]:
 @cache
 def declared_names() -> tuple[str, ...]:
     """List the dotted names of all parameters, in the order of declaration."""
-    return tuple(declared())
+    return tuple(declared_fields())
 
 
-def _built(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
-    """Build a part of parameters whose names begin with `path`; an error names the place of the wrong value."""
+def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
+    """Build the part whose parameters' names begin with `path`; an InputError names the place of the wrong value."""
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, Part):
-            values[symbol] = _built(kind, f"{path}{symbol}.", entries, place)
+            values[symbol] = _build_part(kind, f"{path}{symbol}.", entries, place)
         else:
             values[symbol] = _si_value(path + symbol, field, entries[path + symbol])
     try:
         return model(**values)
     except InputError as error:
         text = str(error)
-        culprit = path + text.split(maxsplit=1)[0]
-        where = place if isinstance(error, PartsDisagreeError) else entries[culprit].place
-        raise InputError(f"{_qualified(culprit, text) if path else text} ({where})") from None
+        wrong_parameter = path + text.split(maxsplit=1)[0]  # a message of `Part` begins with the symbol
+        wrong_place = place if isinstance(error, PartsDisagreeError) else entries[wrong_parameter].place
+        raise InputError(f"{_qualify_symbol(wrong_parameter, text) if path else text} ({wrong_place})") from None
 
 
-def _qualified(full: str, text: str) -> str:
-    """Replace the first word of `text` by its dotted name where it is not unique among parameters."""
-    symbol = full.rpartition(".")[2]
-    unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
-    return text if unique else full + text[len(symbol) :]
+def _qualify_symbol(full_name: str, text: str) -> str:
+    """Replace the symbol at the start of `text` by its dotted name `full_name`, if several parameters have it."""
+    symbol = full_name.rpartition(".")[2]
+    is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
+    return text if is_unique else full_name + text[len(symbol) :]
 
 
 @cache
-def _short_name(full: str) -> str:
-    return _qualified(full, full.rpartition(".")[2])
+def _short_name(full_name: str) -> str:
+    """Return the bare symbol of a dotted name if it is unique, else the dotted name."""
+    return _qualify_symbol(full_name, full_name.rpartition(".")[2])
 
 
-def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
-    """Convert one entry to its SI number or its choice.
-
-    Raises InputError for a blank source, a wrong type or a wrong unit.
-    """
-    short_name, place = _short_name(full), entry.place
+def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
+    """Convert an entry to its SI number or its choice; raise InputError for a wrong type or unit, or no source."""
+    short_name, place = _short_name(full_name), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
         raise InputError(f"{short_name} must have a source, got none ({place})")
     if allowed := choices_of(field):
@@ -436,42 +445,43 @@ def _si_value(full: str, field: FieldInfo, entry: ParameterEntry) -> Value:
         raise InputError(f"{short_name} must have a unit, such as {si_unit}, got none ({place})")
     try:
         number = to_si(float(entry.value), entry.unit, si_unit, name=short_name, place=place)
-    except OverflowError:
+    except OverflowError:  # an integer beyond the largest double
         number = math.inf
     if not math.isfinite(number):
         raise InputError(f"{short_name} must be finite, got {entry.value} ({place})")
     return int(number) if field.annotation is int and number.is_integer() else number
 
 
-def _as_given(full: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse value and unit of a caller's number (SI) or text (with its unit)."""
-    field = declared()[full]
+def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
+    """Return the value and unit of an override: a number in SI, or a text with its unit or of a choice."""
+    field = declared_fields()[full_name]
     if choices_of(field):
         return (value.strip() if isinstance(value, str) else value), ""
     si_unit = unit_of(field)
     if isinstance(value, str):
-        return parse_quantity(value, si_unit, name=_short_name(full), place=place), si_unit
+        return parse_quantity(value, si_unit, name=_short_name(full_name), place=place), si_unit
     return (value.item() if isinstance(value, np.generic) else value), si_unit
 
 
-def flatten(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
+def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name."""
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
-        full = prefix + key
-        if full in declared() or (isinstance(item, dict) and "value" in item):
-            entries[full] = _entry(full, item, place)
+        full_name = prefix + key
+        if full_name in declared_fields() or (isinstance(item, dict) and "value" in item):
+            entries[full_name] = _parse_entry(full_name, item, place)
         elif isinstance(item, dict):
-            entries |= flatten(item.items(), place, full + ".")
+            entries |= flatten_entries(item.items(), place, full_name + ".")
         else:
-            raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
+            raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
     return entries
 
 
-def _entry(full: str, item: Any, place: str) -> ParameterEntry:
-    if full not in declared():
-        raise InputError(f"{full} is not a parameter{closest(full, declared_names())} ({place})")
-    short_name = _short_name(full)
+def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
+    """Check the table of a parameter in a rig's file, and convert it; raise InputError for a wrong key or type."""
+    if full_name not in declared_fields():
+        raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
+    short_name = _short_name(full_name)
     if not isinstance(item, dict):
         raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
     if unknown := sorted(set(item) - {"value", "unit", "source"}):

@@ -1,4 +1,4 @@
-"""Parameters of a valve-controlled rig: the servo valve, and the supply at constant pressure that it throttles."""
+"""Parameters of a valve-controlled rig: the servo valve, and its supply at constant pressure."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ _OVERLAP = "overlap of the edge from {} (< 0: underlap)"
 
 
 def _overlap(edge: str) -> Any:
+    """Declare the overlap [m] of a metering edge, such as "P to A"."""
     return quantity(_OVERLAP.format(edge), "m", absent=0, ge=-0.1, le=0.1)
 
 
 class ServoValve(Part):
     """Servo valve with four edges between supply (P), return (T) and the chambers; `spool = "absent"`: none.
 
-    Its spool follows the command as a system of the second order with a limited speed. An edge's flow is that of an
-    orifice whose area grows evenly with the spool's way beyond its overlap.
+    The spool follows the command as a second-order system with a limited speed. The flow of an edge is that of an
+    orifice whose area grows linearly with the spool's travel beyond the overlap.
     """
 
     spool: Literal["absent", "present"] = choice("servo valve between supply and cylinder", absent="absent")
@@ -39,7 +40,8 @@ class ServoValve(Part):
     v_max: float = quantity("largest speed of the spool", "m/s", absent=0.1, gt=0, le=1e3)
 
     @model_validator(mode="after")
-    def _edges_open_within_the_stroke(self) -> Self:
+    def _check_overlaps(self) -> Self:
+        """Check that each edge opens or closes within the spool's stroke; raise ValueError otherwise."""
         for name in ("o_PA", "o_AT", "o_PB", "o_BT"):
             overlap = getattr(self, name)
             if not abs(overlap) < self.x_max:

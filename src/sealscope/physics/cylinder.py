@@ -13,10 +13,10 @@ from sealscope.units import P_ATM
 
 
 @law
-def volumes_at_middle(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes of both sides [m^3] at mid-stroke, chamber and hose.
+def mid_stroke_volumes(c: Any) -> tuple[float, float]:
+    """Compute the oil volumes [m^3] of chamber and hose on sides A and B, with the piston at mid-stroke.
 
-    `c`: a cylinder, or other numbers with its V, V_rod, V_hose_A and V_hose_B [m^3].
+    `c`: a cylinder, or any object with the numbers V, V_rod, V_hose_A and V_hose_B [m^3].
     """
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
@@ -25,9 +25,9 @@ def volumes_at_middle(c: Any) -> tuple[float, float]:
 def chamber_volumes(
     x: float, V_A: float, V_B: float, A_A: float, A_B: float, position_dependent: bool
 ) -> tuple[float, float]:
-    """Compute the oil volumes of both sides [m^3] at piston position x [m] from mid-stroke.
+    """Compute the oil volumes of sides A and B [m^3] at piston position x [m] from mid-stroke.
 
-    V_A and V_B at mid-stroke (Table 4.1: V each, and the hoses), or V_A + A_A x and V_B - A_B x.
+    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1).
     """
     if position_dependent:
         return V_A + A_A * x, V_B - A_B * x
@@ -36,39 +36,41 @@ def chamber_volumes(
 
 @contracted
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
-    """Compute dp/dt = K_oil/V (net inflow - volume growth) [Pa/s], eqs. (4.16)-(4.19).
+    """Compute the pressure rise dp/dt = K_oil/V Q [Pa/s] of an oil volume, eqs. (4.16)-(4.19).
 
-    `inflow` [m^3/s] is already net of both.
+    `inflow` Q [m^3/s]: flow in, less flow out, less growth of the volume.
     """
     return K_oil / volume * inflow
 
 
 @contracted
 def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) -> float:
-    """Compute the force [N] of the cap on the piston, against +x at x = +L/2 and against -x at x = -L/2.
+    """Compute the force [N] along +x of the end caps (at x = +-L/2) on the piston.
 
-    A stiff spring k_stop [N/m] with a damper d_stop [N s/m] that acts in contact only and never pulls.
+    A cap is a stiff spring k_stop [N/m] with a damper d_stop [N s/m]. It acts in contact only and never pulls.
     """
-    side = math.copysign(1.0, x)
+    cap_sign = math.copysign(1.0, x)
     depth = abs(x) - 0.5 * L
-    return select(depth > 0.0, -side * max(k_stop * depth + d_stop * (side * v), 0.0), 0.0)  # type: ignore[no-any-return]
+    force = max(k_stop * depth + d_stop * (cap_sign * v), 0.0)
+    return select(depth > 0.0, -cap_sign * force, 0.0)  # type: ignore[no-any-return]
 
 
 @contracted
 def load_force(x: float, F_l: float, k_load: float) -> float:
-    """Compute the force [N] of the load against +x, a weight and a spring about mid-stroke: F_l + k_load x."""
+    """Compute the load [N] against +x of a constant force and a spring about mid-stroke: F_l + k_load x."""
     return F_l + k_load * x
 
 
 @contracted
-def force_over(s: float, bends: np.ndarray) -> float:
-    """Compute the force [N] of a load over a position s [m] or a velocity [m/s], linear between bends.
+def piecewise_linear_force(s: float, breakpoints: np.ndarray) -> float:
+    """Compute a load [N] that is a piecewise linear function of a position s [m] or a velocity s [m/s].
 
-    a + b s + sum of c_k max(s - s_k, 0). `bends` (n, 2): (a, b), then (s_k, c_k), the change c_k of the slope at s_k.
+    F = a + b s + sum of c_k max(s - s_k, 0). `breakpoints` (n, 2): row 0 is (a, b), row k is (s_k, c_k), with the
+    change c_k of the slope at s_k.
     """
-    force = bends[0, 0] + bends[0, 1] * s
-    for k in range(1, bends.shape[0]):
-        force = force + bends[k, 1] * max(s - bends[k, 0], 0.0)
+    force = breakpoints[0, 0] + breakpoints[0, 1] * s
+    for k in range(1, breakpoints.shape[0]):
+        force = force + breakpoints[k, 1] * max(s - breakpoints[k, 0], 0.0)
     return force  # type: ignore[no-any-return]
 
 
@@ -76,21 +78,21 @@ def force_over(s: float, bends: np.ndarray) -> float:
 def piston_acceleration(
     p_A: float, p_B: float, friction: float, load: float, stop: float, A_A: float, A_B: float, M_eq: float
 ) -> float:
-    """Compute the acceleration a = (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq [m/s^2], eq. (4.15) with the caps."""
+    """Compute the piston's acceleration (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq [m/s^2], eq. (4.15) with caps."""
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
 
 
 @contracted
 def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
-    """Compute the force [N] against +x of an opposing cylinder, fed at p_opp [Pa] through an orifice: A_opp p.
+    """Compute the force A_opp p [N] against +x of an opposing cylinder that is fed at p_opp [Pa] through an orifice.
 
-    p = p_opp + v |v| (A_opp/C_opp)^2, the orifice's law solved for the pressure; it falls no lower than vacuum. The oil
-    of that cylinder is taken as stiff (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
+    p = p_opp + v |v| (A_opp/C_opp)^2 is the orifice's law solved for the pressure, no lower than vacuum. The oil of
+    that cylinder is taken as incompressible (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
     """
-    ratio = A_opp / C_opp
-    return A_opp * max(p_opp + v * abs(v) * ratio * ratio, -P_ATM)
+    drop_coefficient = A_opp / C_opp
+    return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)
 
 
 def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
-    """Compute the power [W] of the pressures on the piston: (p_A A_A - p_B A_B) v."""
+    """Compute the mechanical power [W] that the chamber pressures give the piston: (p_A A_A - p_B A_B) v."""
     return (p_A * A_A - p_B * A_B) * v

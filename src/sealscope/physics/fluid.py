@@ -1,4 +1,4 @@
-"""The oil: the air in it, and what its temperature changes."""
+"""Properties of the oil: bulk modulus and density with free air in it, and their change with temperature."""
 
 from __future__ import annotations
 
@@ -8,83 +8,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import contracted
-from sealscope.physics.lanes import anywhere, exponential
+from sealscope.physics.lanes import any_lane, exponential
 from sealscope.units import P_ATM
 
-#: 40 and 100 deg C [K], at which viscosities are stated.
+#: 40 and 100 deg C [K], at which data sheets state viscosities.
 _T_40, _T_100 = 313.15, 373.15
-#: Relative change of the bulk modulus of mineral oils with temperature, as a power of ten [1/K].
-_SOFTER = 0.0024
-#: Least absolute pressure [Pa] at which the law of the air is evaluated: a bubble has a volume.
-_LEAST = 100.0
+#: Decrease of log10(bulk modulus) of mineral oils per kelvin [1/K].
+_LOG_MODULUS_SLOPE = 0.0024
+#: Lowest absolute pressure [Pa] in the law of the air, whose volume would otherwise grow without bound.
+_MIN_ABSOLUTE_PRESSURE = 100.0
 
 
 @contracted
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
     """Compute the bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
-    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), r = air (p_atm/p_abs)^(1/n): volume of air over volume of oil, compressed
-    polytropically from its share `air` at atmospheric pressure; nothing dissolves. K_oil without air, exactly.
+    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the volume of air over volume of oil r (`air_volume_ratio`). No air
+    dissolves. Without air K is exactly K_oil.
 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
     """
-    if not anywhere(air > 0.0):
-        return K_oil + 0.0 * p
-    p_abs = max(p + P_ATM, _LEAST)
-    r = air_share(p, air, n_air)
+    if not any_lane(air > 0.0):
+        return K_oil + 0.0 * p  # lanes if p is lanes
+    p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
+    r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))
 
 
 @contracted
 def oil_density_ratio(dp: float, K_oil: float) -> float:
-    """Compute rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air and with a constant bulk modulus.
+    """Compute the density ratio rho(p + dp)/rho(p) = exp(dp/K_oil) of oil without air.
 
-    From K = rho dp/d rho (Merritt, Hydraulic Control Systems, 1967, the definition of the bulk modulus).
+    Source: Merritt, Hydraulic Control Systems, 1967, definition of the bulk modulus, K = rho dp/d rho, K constant.
     """
     return exponential(dp / K_oil)  # type: ignore[no-any-return]
 
 
 @contracted
-def air_share(p: float, air: float, n_air: float) -> float:
-    """Compute the volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n)."""
-    return air * math.pow(P_ATM / max(p + P_ATM, _LEAST), 1.0 / n_air)
+def air_volume_ratio(p: float, air: float, n_air: float) -> float:
+    """Compute the volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n).
+
+    `air`: that ratio at atmospheric pressure; `n_air`: polytropic exponent.
+    """
+    return air * math.pow(P_ATM / max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE), 1.0 / n_air)
 
 
 @contracted
 def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air: float) -> float:
-    """Return rho(p)/rho(p_0) of oil with free air, whose modulus is `effective_bulk_modulus`.
+    """Compute the density ratio rho(p)/rho(p_0) of oil with free air, whose modulus is `effective_bulk_modulus`.
 
-    ln of it is the integral of dp/K: ln((1 + r_0)/(1 + r)) of the air exactly, and that of dp/(K_oil (1 + r)) by
-    Simpson's rule, whose error is far below r dp/K_oil.
+    Its logarithm is the integral of dp/K. The part of the air is ln((1 + r_0)/(1 + r)), exactly; that of the liquid,
+    the integral of dp/(K_oil (1 + r)), is taken by Simpson's rule, with an error far below r dp/K_oil.
     """
-    r, r_0, r_m = air_share(p, air, n_air), air_share(p_0, air, n_air), air_share(0.5 * (p + p_0), air, n_air)
-    mean = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
-    return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean / K_oil)  # type: ignore[no-any-return]
+    r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
+    r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)
+    mean_liquid_fraction = (1.0 / (1.0 + r) + 4.0 / (1.0 + r_m) + 1.0 / (1.0 + r_0)) / 6.0
+    return (1.0 + r_0) / (1.0 + r) * exponential((p - p_0) * mean_liquid_fraction / K_oil)  # type: ignore[no-any-return]
 
 
 def kinematic_viscosity(T: NDArray[np.float64], nu_40: float, nu_100: float) -> NDArray[np.float64]:
-    """Compute the kinematic viscosity [m^2/s] of an oil at the temperatures T [K], from those at 40 and 100 deg C.
+    """Compute an oil's kinematic viscosity [m^2/s] at the temperatures T [K] from its values at 40 and 100 deg C.
 
-    log log(nu + 0.7) = A - B log T, nu in mm^2/s: Walther's law, ASTM D341 (above 2 mm^2/s).
+    Source: Walther's law, ASTM D341: log log(nu + 0.7) = A - B log T, nu in mm^2/s (for nu above 2 mm^2/s).
     """
     y_40, y_100 = (math.log(math.log(1e6 * nu + 0.7)) for nu in (nu_40, nu_100))
     B = (y_40 - y_100) / math.log(_T_100 / _T_40)
     return np.asarray(1e-6 * (np.exp(np.exp(y_40 - B * np.log(T / _T_40))) - 0.7))
 
 
-def thermal_density(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
-    """Compute the density at the temperatures T [K] over that at T_0 [K]: 1 - alpha (T - T_0).
+def thermal_density_ratio(T: NDArray[np.float64], T_0: float, alpha: float) -> NDArray[np.float64]:
+    """Compute the density ratio rho(T)/rho(T_0) = 1 - alpha (T - T_0) of an oil; T, T_0 [K], expansion alpha [1/K].
 
-    Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of petroleum fluids; `alpha` [1/K].
+    Source: Merritt, Hydraulic Control Systems, 1967, section 2.2, density of petroleum fluids.
     """
     return np.asarray(1.0 - alpha * (T - T_0))
 
 
-def thermal_stiffness(T: NDArray[np.float64], T_0: float) -> NDArray[np.float64]:
-    """Compute the bulk modulus at the temperatures T [K] over that at T_0 [K]: 10^(-0.0024 (T - T_0)), of mineral oils.
+def thermal_stiffness_ratio(T: NDArray[np.float64], T_0: float) -> NDArray[np.float64]:
+    """Compute the bulk modulus ratio K(T)/K(T_0) = 10^(-0.0024 (T - T_0)) of mineral oils; T, T_0 [K].
 
     Source: A. T. J. Hayward, How to estimate the bulk modulus of hydraulic fluids, Hydraulic Pneumatic Power 16 (1970)
     28-40: isentropic secant modulus.
     """
-    return np.asarray(10.0 ** (-_SOFTER * (T - T_0)))
+    return np.asarray(10.0 ** (-_LOG_MODULUS_SLOPE * (T - T_0)))

@@ -1,7 +1,7 @@
 """Friction of piston and rod: Coulomb, Stribeck and viscous, linear near standstill (eqs. 4.20-4.22).
 
-Other machines may have one of two other laws. In Karnopp's the piston sticks; in LuGre's the contact gives way before
-it slides.
+A rig may have one of two other laws instead: in Karnopp's the piston sticks at standstill; in LuGre's the contact is an
+elastic bristle that deflects before it slides.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from sealscope.physics.lanes import exponential, select
 
 
 @contracted
-def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, of_difference: bool) -> float:
+def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_difference: bool) -> float:
     """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
 
-    `of_difference` takes p_A - p_B, the literal reading.
+    `use_difference`: take p_A - p_B in place of the sum, as the equation is printed.
     """
-    return F_pr + F_cfr * ((p_A - p_B) if of_difference else (p_A + p_B))
+    return F_pr + F_cfr * ((p_A - p_B) if use_difference else (p_A + p_B))
 
 
 @contracted
-def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
-    """Compute the friction force [N] of steady sliding at `speed` >= 0 [m/s] without its viscous part, eq. (4.21).
+def stribeck_force(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
+    """Compute the Coulomb and Stribeck friction [N] of steady sliding at `speed` >= 0 [m/s], eq. (4.21).
 
-    F_C (1 + (K_brk - 1) exp(-C_c speed)): the breakaway force K_brk F_C at standstill, F_C at speed.
+    F_C (1 + (K_brk - 1) exp(-C_c speed)) falls from the breakaway force K_brk F_C at standstill to F_C. The viscous
+    part is not in it.
     """
     return F_C * (1.0 + (K_brk - 1.0) * exponential(-C_c * speed))  # type: ignore[no-any-return]
 
@@ -34,65 +35,64 @@ def stribeck_level(speed: float, F_C: float, K_brk: float, C_c: float) -> float:
 def karnopp_friction(
     v: float, applied: float, breakaway: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float
 ) -> float:
-    """Compute the friction force [N] of a piston that sticks where |v| < v_th, and slides by eq. (4.21) above.
+    """Compute Karnopp's friction force [N]: the piston sticks for |v| < v_th and slides by eq. (4.21) otherwise.
 
-    Stuck, it balances the `applied` force [N] up to the `breakaway` force [N]; `stuck_velocity` says how it moves.
+    While it sticks, friction balances the `applied` force [N] up to the `breakaway` force [N] (see `stuck_velocity`).
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
     """
     speed = abs(v)
-    sliding = math.copysign(stribeck_level(speed, F_C, K_brk, C_c), v) + F_v * v
+    sliding = math.copysign(stribeck_force(speed, F_C, K_brk, C_c), v) + F_v * v
     stuck = min(max(applied, -breakaway), breakaway)
     return select(speed < v_th, stuck, sliding)  # type: ignore[no-any-return]
 
 
 @contracted
 def stuck_velocity(v: float, v_th: float) -> float:
-    """Compute the velocity [m/s] at which a piston of Karnopp's law moves: none where |v| < v_th."""
+    """Compute the velocity [m/s] at which a piston with Karnopp's friction moves: 0 while it sticks, |v| < v_th."""
     return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]
 
 
 @contracted
-def bristle_rate(v: float, z: float, level: float, sigma_0: float) -> float:
-    """Compute dz/dt = v - sigma_0 |v|/g z [m/s] of the mean deflection z [m] of the contact, g = `level` > 0 [N].
+def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
+    """Compute the rate dz/dt = v - sigma_0 |v|/g z [m/s] of the bristles' mean deflection z [m] in LuGre's law.
 
-    At a steady v it settles at sigma_0 z = g sign(v), |z| never exceeds g/sigma_0 once below it.
+    `g` > 0 [N]: friction of steady sliding at v. At a steady v, z settles at g/sigma_0 sign(v), its largest magnitude.
 
     Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with friction,
     IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2), with g of eq. (4.21) in place of its Gaussian.
     """
-    return v - sigma_0 * abs(v) / level * z
+    return v - sigma_0 * abs(v) / g * z
 
 
 @contracted
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
-    """Compute the friction force [N] of a contact with deflection z [m], its rate dz [m/s] and velocity v [m/s].
+    """Compute LuGre's friction force [N] from the bristles' deflection z [m], its rate dz [m/s] and the velocity v.
 
-    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. The damping of the contact dies out as it slides, without which
-    the force could drive the motion.
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. The damping sigma_1 must vanish at speed: otherwise the force
+    could drive the motion.
 
     Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
     """
-    share = v / v_th
-    return sigma_0 * z + sigma_1 * exponential(-share * share) * dz + F_v * v  # type: ignore[no-any-return]
+    relative_v = v / v_th
+    return sigma_0 * z + sigma_1 * exponential(-relative_v * relative_v) * dz + F_v * v  # type: ignore[no-any-return]
 
 
 @contracted
 def stribeck_friction(
     v: float, F_C: float, K_brk: float, C_c: float, F_v: float, v_th: float, literal_bracket: bool
 ) -> float:
-    """Compute the friction force [N] against the velocity v [m/s], eqs. (4.21)-(4.22).
+    """Compute the thesis's friction force [N] at the velocity v [m/s], eqs. (4.21)-(4.22).
 
     |v| > v_th: F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v;
     |v| <= v_th: F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th, continuous at v_th.
-    `literal_bracket` reads the unbalanced bracket of eq. (4.22) the other way, F_C times the whole sum and |v| in the
-    exponential, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no pressure): F = v F_C [1 + (K_brk
-    - 1) exp(-C_c |v|) + F_v v_th] / v_th.
+    `literal_bracket`: close the unbalanced bracket of eq. (4.22) after F_v v_th instead, F = v F_C [1 + (K_brk - 1)
+    exp(-C_c |v|) + F_v v_th] / v_th. Then F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no pressure).
     """
     speed = abs(v)
     if literal_bracket:
         stribeck = 1.0 + (K_brk - 1.0) * exponential(-C_c * speed)
         slow = v * F_C * (stribeck + F_v * v_th) / v_th
         return select(speed > v_th, math.copysign(F_C * stribeck, v) + F_v * v, slow)  # type: ignore[no-any-return]
-    return stribeck_level(max(speed, v_th), F_C, K_brk, C_c) * min(max(v / v_th, -1.0), 1.0) + F_v * v
+    return stribeck_force(max(speed, v_th), F_C, K_brk, C_c) * min(max(v / v_th, -1.0), 1.0) + F_v * v

@@ -1,12 +1,11 @@
-"""Lanes: vectors of numbers that the laws take in place of one number.
+"""Lanes: a numba type for a short vector of numbers, which the laws take in place of one number.
 
-One source serves one run and eight on a processor's vector registers (sixteen in single precision). A law written
-without branches on its numbers (`select` instead of `if`) is compiled for plain floats, for `LANES` and for `SINGLES`
-alike; the type of an array says which of them `load` takes from it. Each operation on lanes is one
-instruction over a whole vector register where the processor has it (two or four where its registers are shorter), by
-construction and not by a compiler's guess. Products and sums of lanes may be contracted to fused multiply-adds, so a
-lane and a plain run agree to rounding, not to the bit. Lanes live inside compiled functions only: `load` and `store`
-move them from and to rows of arrays.
+One source serves a single run and eight runs on a processor's vector registers (sixteen in single precision). A law
+written without branches on its numbers (`select` instead of `if`) compiles for floats, for `LANES` and for `SINGLES`;
+the type of an array decides which of them `load` reads. Each operation on lanes is one LLVM vector instruction, so
+vectorisation does not depend on the compiler's heuristics. Products and sums may be contracted to fused multiply-adds:
+a lane and a single run agree to rounding, not to the bit. Lanes exist inside compiled functions only: `load` and
+`store` move them from and to rows of arrays.
 """
 
 from __future__ import annotations
@@ -23,15 +22,14 @@ from numba.extending import lower_builtin, lower_cast, models, register_model
 
 from sealscope.compiled import contracted
 
-#: Runs side by side: a register of 512 bits.
+#: Lanes of doubles and of single-precision numbers: a register of 512 bits.
 WIDTH = 8
-#: ... and runs side by side in single precision.
 SINGLE_WIDTH = 2 * WIDTH
-_FLAGS = ("contract",)
+_FLAGS = ("contract",)  # LLVM may fuse products and sums
 
 
 class Lanes(types.Type):  # type: ignore[misc]
-    """`width` numbers of a kind, float64 or float32."""
+    """The type of `width` numbers of the type `number`, float64 or float32."""
 
     def __init__(self, number: Any, width: int) -> None:
         self.number, self.width = number, width
@@ -45,7 +43,7 @@ class Lanes(types.Type):  # type: ignore[misc]
 
 
 class Mask(types.Type):  # type: ignore[misc]
-    """Truth values, one of each of the lanes."""
+    """The type of one truth value for each of the lanes."""
 
     def __init__(self, lanes: Lanes) -> None:
         self.lanes = lanes
@@ -56,15 +54,15 @@ LANES, SINGLES = Lanes(types.float64, WIDTH), Lanes(types.float32, SINGLE_WIDTH)
 _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
-def _vector(lanes: Lanes) -> Any:
-    """Return the vector type of LLVM's code."""
+def _vector_type(lanes: Lanes) -> Any:
+    """Return LLVM's vector type for lanes."""
     return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _vector(kind))
+        super().__init__(manager, kind, _vector_type(kind))
 
 
 @register_model(Mask)
@@ -73,95 +71,97 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.lanes.width))
 
 
-def _spread(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Build the instructions that put the same number into every lane."""
+def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
+    """Build the instructions that copy one number into every lane."""
     zero = ir.Constant(ir.IntType(32), 0)
-    first = builder.insert_element(ir.Constant(_vector(lanes), ir.Undefined), scalar, zero)
-    places = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
-    return builder.shuffle_vector(first, first, places)
+    first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
+    return builder.shuffle_vector(first_lane, first_lane, zeros)
 
 
-def _as_lanes(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> Any:
-    if isinstance(kind, Lanes):
+def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
+    """Build the instructions that convert a number to lanes; lanes are returned unchanged."""
+    if isinstance(value_type, Lanes):
         return value
-    return _spread(builder, context.cast(builder, value, kind, lanes.number), lanes)
+    return _broadcast(builder, context.cast(builder, value, value_type, lanes.number), lanes)
 
 
 @lower_cast(types.Number, Lanes)  # type: ignore[untyped-decorator]
-def _cast(context: Any, builder: Any, kind: Any, to: Any, value: Any) -> Any:
-    return _as_lanes(context, builder, value, kind, to)
+def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, value: Any) -> Any:
+    """Convert a number to lanes where numba needs one type for both, such as at the ends of two branches."""
+    return _convert_to_lanes(context, builder, value, value_type, lanes)
 
 
-def _lanes_of(kinds: tuple[Any, ...]) -> Lanes | None:
-    """Find the lanes among kinds, with plain numbers allowed between them; None for any other mixture."""
-    lanes = {kind for kind in kinds if isinstance(kind, Lanes)}
-    compatible = len(lanes) == 1 and all(isinstance(kind, Lanes | types.Number) for kind in kinds)
+def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
+    """Find the one type of lanes among argument types, all others being plain numbers; None for any other mixture."""
+    lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
+    compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
 
 
-def _define(function: Any, build: Any, *, asks: bool = False) -> None:
-    """Let `function` take lanes (and plain numbers beside them): `build(builder, *values)` makes the instructions.
+def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
+    """Overload `function` for lanes, alone or mixed with plain numbers, by the instructions `build(builder, *values)`.
 
-    It returns lanes, or truth values where it `asks`.
+    The result is lanes, or a mask of truth values if `is_test`.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            lanes = None if kws else _lanes_of(args)
-            return None if lanes is None else signature(_MASKS[lanes] if asks else lanes, *args)
+            """Return the signature for these argument types, or None if they are not lanes."""
+            lanes = None if kws else _common_lanes_type(args)
+            return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        lanes = _lanes_of(sig.args)
+        """Build the instructions of one call, with plain numbers converted to lanes."""
+        lanes = _common_lanes_type(sig.args)
         assert lanes is not None
-        return build(builder, *(_as_lanes(context, builder, v, k, lanes) for v, k in zip(args, sig.args, strict=True)))
+        pairs = zip(args, sig.args, strict=True)
+        return build(builder, *(_convert_to_lanes(context, builder, value, kind, lanes) for value, kind in pairs))
 
-    for kinds in ((Lanes,), (Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
-        lower_builtin(function, *kinds)(lower)
-
-
-def _arithmetic(name: str) -> Any:
-    return lambda builder, a, b: getattr(builder, name)(a, b, flags=_FLAGS)
+    for arg_types in ((Lanes,), (Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(function, *arg_types)(lower)
 
 
-def _quotient(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Divide lanes by one number: multiply by its reciprocal, found once where the number does not change."""
-    number = context.cast(builder, args[1], sig.args[1], types.float64)
+def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    """Divide lanes by one number: multiply by its reciprocal, which the compiler can move out of a loop."""
+    lanes, number_type = sig.args
+    number = context.cast(builder, args[1], number_type, types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
-    lanes = sig.args[0]
     reciprocal = context.cast(builder, reciprocal, types.float64, lanes.number)
-    return builder.fmul(args[0], _spread(builder, reciprocal, lanes), flags=_FLAGS)
+    return builder.fmul(args[0], _broadcast(builder, reciprocal, lanes), flags=_FLAGS)
 
 
 _ARITHMETIC = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
-_ORDER = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "=="}
+_COMPARISONS = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "=="}
 for _function, _name in _ARITHMETIC.items():
-    _define(_function, _arithmetic(_name))
-for _function, _sign in _ORDER.items():
-    _define(_function, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b), asks=True)
-lower_builtin(operator.truediv, Lanes, types.Number)(_quotient)
-_define(operator.neg, lambda builder, a: builder.fneg(a))
+    _define_on_lanes(_function, lambda builder, a, b, name=_name: getattr(builder, name)(a, b, flags=_FLAGS))
+for _function, _symbol in _COMPARISONS.items():
+    _define_on_lanes(_function, lambda builder, a, b, symbol=_symbol: builder.fcmp_ordered(symbol, a, b), is_test=True)
+lower_builtin(operator.truediv, Lanes, types.Number)(_lower_division_by_number)
+_define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
-def _called(name: str) -> Any:
-    """Build a call of an LLVM intrinsic over the lanes."""
+def _intrinsic_builder(name: str) -> Any:
+    """Return the function that builds the call of an LLVM intrinsic on lanes."""
 
     def build(builder: Any, *values: Any) -> Any:
+        """Build the call; the intrinsic's name has the type as its suffix, such as llvm.sqrt.v8f64."""
         vector = values[0].type
         bits = 64 if vector.element == ir.DoubleType() else 32
-        kind = ir.FunctionType(vector, [vector] * len(values))
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{vector.count}f{bits}")
+        function_type = ir.FunctionType(vector, [vector] * len(values))
+        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.v{vector.count}f{bits}")
         return builder.call(function, values)
 
     return build
 
 
-_define(math.sqrt, _called("sqrt"))
-_define(abs, _called("fabs"))
-_define(math.copysign, _called("copysign"))
-_define(math.pow, _called("pow"))  # lane by lane
-_define(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
-_define(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
+_define_on_lanes(math.sqrt, _intrinsic_builder("sqrt"))
+_define_on_lanes(abs, _intrinsic_builder("fabs"))
+_define_on_lanes(math.copysign, _intrinsic_builder("copysign"))
+_define_on_lanes(math.pow, _intrinsic_builder("pow"))  # lane by lane
+_define_on_lanes(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
+_define_on_lanes(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
 
 
 for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
@@ -169,26 +169,28 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     @infer_global(_function)
     class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
+            """Return the signature for two masks of the same lanes, else None."""
             compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
             return signature(args[0], *args) if compatible else None
 
     lower_builtin(_function, Mask, Mask)(lambda context, builder, sig, args, name=_name: getattr(builder, name)(*args))
 
 
-def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
-    """Give a plain function a compiled form as well.
+def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) -> None:
+    """Make a Python function callable in compiled code, by LLVM instructions that `build` writes.
 
-    `result(kinds)` is the kind of what it returns (None where it does not take these kinds), and
-    `build(context, builder, kinds, values)` makes the instructions.
+    `arity`: number of arguments; `infer_type(arg_types)` returns the type of the result, or None if the function does
+    not take arguments of these types; `build(context, builder, arg_types, values)` builds the instructions.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
+            """Return the signature for these argument types, or None if the function does not take them."""
             if len(args) != arity or kws:
                 return None
-            kind = result(args)
-            return None if kind is None else signature(kind, *args)
+            result_type = infer_type(args)
+            return None if result_type is None else signature(result_type, *args)
 
     lower_builtin(function, *[types.Any] * arity)(
         lambda context, builder, sig, args: build(context, builder, sig.args, args)
@@ -196,164 +198,175 @@ def lowered(function: Any, arity: int, result: Any, build: Any) -> None:
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` where the condition holds, `no` elsewhere; both are computed."""
+    """Choose `yes` if the condition is true, else `no`, lane by lane; both are computed."""
     return yes if condition else no
 
 
-def _kind_of_choice(kinds: Any) -> Any:
-    if isinstance(kinds[0], Mask):
-        return kinds[0].lanes
-    return next((kind for kind in kinds if isinstance(kind, Lanes)), types.float64)
+def _select_type(arg_types: Any) -> Any:
+    """Return the type of `select`'s result: the lanes of a mask or of either value, else a double."""
+    if isinstance(arg_types[0], Mask):
+        return arg_types[0].lanes
+    return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
 
 
-def _select(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    kind = _kind_of_choice(kinds)
-    if isinstance(kind, Lanes):
-        a, b = (_as_lanes(context, builder, v, k, kind) for v, k in zip(values[1:], kinds[1:], strict=True))
+def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the instructions of `select`: convert both values to one type, and choose by the condition."""
+    result_type = _select_type(arg_types)
+    pairs = zip(values[1:], arg_types[1:], strict=True)
+    if isinstance(result_type, Lanes):
+        yes, no = (_convert_to_lanes(context, builder, value, kind, result_type) for value, kind in pairs)
     else:
-        a, b = (context.cast(builder, v, k, types.float64) for v, k in zip(values[1:], kinds[1:], strict=True))
-    return builder.select(values[0], a, b)
+        yes, no = (context.cast(builder, value, kind, types.float64) for value, kind in pairs)
+    return builder.select(values[0], yes, no)
 
 
-lowered(select, 3, _kind_of_choice, _select)
+register_lowering(select, 3, _select_type, _lower_select)
 
 
-def anywhere(condition: Any) -> Any:
-    """Return True where a condition holds in any lane; a plain truth value is returned as it is."""
+def any_lane(condition: Any) -> Any:
+    """Return True if a condition is true in any lane; a plain truth value is returned unchanged."""
     return condition
 
 
-def _anywhere(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    if not isinstance(kinds[0], Mask):
+def _lower_any_lane(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the instructions of `any_lane`: a mask's bits, taken as one integer, are not all zero."""
+    if not isinstance(arg_types[0], Mask):
         return values[0]
-    bits = ir.IntType(kinds[0].lanes.width)
+    bits = ir.IntType(arg_types[0].lanes.width)
     return builder.icmp_unsigned("!=", builder.bitcast(values[0], bits), ir.Constant(bits, 0))
 
 
-lowered(anywhere, 1, lambda _: types.boolean, _anywhere)
+register_lowering(any_lane, 1, lambda _: types.boolean, _lower_any_lane)
 
 
-def _constant(kind: Any, value: float) -> Any:
-    if not isinstance(kind, Lanes):
+def _float_constant(value_type: Any, value: float) -> Any:
+    """Return LLVM's constant of a value, in every lane if `value_type` is lanes."""
+    if not isinstance(value_type, Lanes):
         return ir.Constant(ir.DoubleType(), value)
-    return ir.Constant(_vector(kind), [value] * kind.width)
+    return ir.Constant(_vector_type(value_type), [value] * value_type.width)
 
 
-def nearest_whole(x: Any) -> Any:
-    """Round x to the nearest whole number, |x| < 2^51 (2^22 in single precision)."""
-    return (x + _ROUND) - _ROUND
+def nearest_integer(x: Any) -> Any:
+    """Round x to the nearest whole number, for |x| < 2^51 (2^22 in single precision), as a float."""
+    return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 
-def _nearest_whole(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    large = _constant(kinds[0], _ROUND_SINGLE if kinds[0] == SINGLES else _ROUND)
+def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the instructions of `nearest_integer` with the rounding constant of the argument's precision."""
+    large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == SINGLES else _ROUNDING_DOUBLE)
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
 
-lowered(nearest_whole, 1, lambda kinds: kinds[0], _nearest_whole)
+register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0], _lower_nearest_integer)
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for whole n in -1022..1023, held within -126..127 in single precision, from the bits of n."""
+    """Compute 2^n for whole n in -1022..1023; single precision limits n to -126..127."""
     return math.ldexp(1.0, int(n))
 
 
-def _power_of_two(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    kind, n = kinds[0], values[0]
-    single = kind == SINGLES
-    bits = ir.IntType(32 if single else 64)
-    integers = ir.VectorType(bits, kind.width) if isinstance(kind, Lanes) else bits
-    places = 23 if single else 52
+def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the instructions of `power_of_two`: shift the biased exponent to its place above the mantissa."""
+    n_type, n = arg_types[0], values[0]
+    single = n_type == SINGLES
+    integer = ir.IntType(32 if single else 64)
+    integers = ir.VectorType(integer, n_type.width) if isinstance(n_type, Lanes) else integer
+    mantissa_bits = 23 if single else 52
     if single:
-        least, most = _constant(kind, -126.0), _constant(kind, 127.0)
-        n = builder.select(builder.fcmp_ordered("<", n, least), least, n)
-        n = builder.select(builder.fcmp_ordered(">", n, most), most, n)
-    # the last bits of 1.5 * 2^52 + k (2^23) are those of the whole number k: no conversion, of doubles one by one
-    large = _constant(kind, _ROUND_SINGLE + 127.0 if single else _ROUND + 1023.0)
-    biased = builder.bitcast(builder.fadd(n, large), integers)
-    shift = ir.Constant(integers, [places] * kind.width if isinstance(kind, Lanes) else places)
-    return builder.bitcast(builder.shl(biased, shift), n.type)
+        n_min, n_max = _float_constant(n_type, -126.0), _float_constant(n_type, 127.0)
+        n = builder.select(builder.fcmp_ordered("<", n, n_min), n_min, n)
+        n = builder.select(builder.fcmp_ordered(">", n, n_max), n_max, n)
+    # the last bits of 1.5 * 2^52 + k (2^23) are the integer k: faster than converting each lane to an integer
+    rounding = _float_constant(n_type, _ROUNDING_SINGLE + 127.0 if single else _ROUNDING_DOUBLE + 1023.0)
+    exponent = builder.bitcast(builder.fadd(n, rounding), integers)
+    shift = ir.Constant(integers, [mantissa_bits] * n_type.width if isinstance(n_type, Lanes) else mantissa_bits)
+    return builder.bitcast(builder.shl(exponent, shift), n.type)
 
 
-lowered(power_of_two, 1, lambda kinds: kinds[0], _power_of_two)
+register_lowering(power_of_two, 1, lambda arg_types: arg_types[0], _lower_power_of_two)
 
-_LOADED = {types.float64: LANES, types.float32: SINGLES}
-
-
-def _is_block(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.dtype in _LOADED and array.layout == "C"
+_LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
-def _place(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    """Find the address of the lanes of a row."""
-    data = context.make_array(kinds[0])(context, builder, values[0]).data
-    row = context.cast(builder, values[1], kinds[1], types.intp)
-    lanes = _LOADED[kinds[0].dtype]
-    place = builder.mul(row, ir.Constant(row.type, lanes.width))
-    return builder.bitcast(cgutils.gep_inbounds(builder, data, place), _vector(lanes).as_pointer())
+def _is_array_of_lanes(array: Any) -> bool:
+    """Test whether the rows of an array of this type can be loaded as lanes."""
+    return isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
+
+
+def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the address of the lanes in a row of an array."""
+    data = context.make_array(arg_types[0])(context, builder, values[0]).data
+    row = context.cast(builder, values[1], arg_types[1], types.intp)
+    lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
+    first_element = builder.mul(row, ir.Constant(row.type, lanes.width))
+    return builder.bitcast(cgutils.gep_inbounds(builder, data, first_element), _vector_type(lanes).as_pointer())
 
 
 def load(array: Any, row: int) -> Any:
-    """Load the lanes of row `row` of a C-ordered array, rows counted through all leading axes.
+    """Load row `row` of a C-ordered array as lanes; rows are counted through all leading axes.
 
-    It is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision.
+    The array's shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision.
     """
 
 
-def _load(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    return builder.load(_place(context, builder, kinds, values), align=kinds[0].dtype.bitwidth // 8)
+def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
-def _loaded(kinds: Any) -> Any:
-    return _LOADED[kinds[0].dtype] if _is_block(kinds[0]) and isinstance(kinds[1], types.Integer) else None
+def _loaded_type(arg_types: Any) -> Any:
+    """Return the type of lanes that `load` reads from an array, or None if the arguments are not array and row."""
+    is_loadable = _is_array_of_lanes(arg_types[0]) and isinstance(arg_types[1], types.Integer)
+    return _LANES_OF_DTYPE[arg_types[0].dtype] if is_loadable else None
 
 
-lowered(load, 2, _loaded, _load)
+register_lowering(load, 2, _loaded_type, _lower_load)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes into row `row` of an array as `load` reads it."""
+    """Write lanes into row `row` of an array, as `load` reads them."""
 
 
-def _store(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    builder.store(values[2], _place(context, builder, kinds, values), align=kinds[0].dtype.bitwidth // 8)
+def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
     return context.get_dummy_value()
 
 
-def _stored(kinds: Any) -> Any:
-    return types.none if _loaded(kinds) == kinds[2] else None
+def _stored_type(arg_types: Any) -> Any:
+    """Return the type of `store`'s result, which is none, or None if the array does not contain such lanes."""
+    return types.none if _loaded_type(arg_types) == arg_types[2] else None
 
 
-lowered(store, 3, _stored, _store)
+register_lowering(store, 3, _stored_type, _lower_store)
 
 
-def spread(value: Any) -> Any:
-    """Put the same number into every lane of doubles."""
+def broadcast(value: Any) -> Any:
+    """Copy one number into every lane of doubles."""
 
 
-def _spread_out(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    return _as_lanes(context, builder, values[0], kinds[0], LANES)
+def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 
-lowered(spread, 1, lambda _: LANES, _spread_out)
+register_lowering(broadcast, 1, lambda _: LANES, _lower_broadcast)
 
 
 _LOG2_E = 1.4426950408889634
-_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
-# 1.5 * 2^52 and 1.5 * 2^23: adding it rounds to a whole number
-_ROUND, _ROUND_SINGLE = 6755399441055744.0, 12582912.0
+_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10  # their sum is ln 2 to more than double precision
+# 1.5 * 2^52 and 1.5 * 2^23: adding one of them leaves no bits behind the point, and so rounds to a whole number
+_ROUNDING_DOUBLE, _ROUNDING_SINGLE = 6755399441055744.0, 12582912.0
 
 
 @contracted
 def exponential(x: Any) -> Any:
-    """Compute exp(x) for x in -708..709 (held at these ends): 2^n times a polynomial in r = x - n ln 2.
+    """Compute exp(x), x limited to -708..709, as 2^n times a polynomial in r = x - n ln 2.
 
-    Within 1e-14 of exp(x), relatively; compiled from this source for a number and for lanes. In single precision it is
-    within 2e-6 for x in -60..60, and beyond -87..88 held at a power of two.
-    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction in two parts of ln 2);
-    Taylor's polynomial, whose rest for |r| <= ln 2/2 is below 7e-15.
+    The relative error is below 1e-14, the same for a number and for lanes. In single precision it is below 2e-6 for x
+    in -60..60; beyond -87..88 the result stays at a power of two.
+    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two parts);
+    Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
     """
     x = min(max(x, -708.0), 709.0)
-    n = nearest_whole(x * _LOG2_E)
+    n = nearest_integer(x * _LOG2_E)
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     s = r * r
     q = s * s

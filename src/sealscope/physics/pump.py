@@ -16,26 +16,26 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
-    """Compute the flow [m^3/s] that the pump delivers into port 1.
+    """Compute the pump's flow into port 1, Q_1 = q_b omega/(2 pi) - G_pump (p_1 - p_2) [m^3/s], eq. (4.1).
 
-    Q_1 = q_b omega / (2 pi) - G_pump (p_1 - p_2), eq. (4.1) with internal leakage.
-
-    `omega` [rad/s], `dp` = p_1 - p_2 [Pa], `q_b` displacement [m^3/rev], `G_pump` [m^3/(s Pa)] (zero in the thesis).
+    `omega` [rad/s], `dp` = p_1 - p_2 [Pa], displacement `q_b` [m^3/rev]; internal leakage `G_pump` [m^3/(s Pa)] is 0 in
+    the thesis.
     """
     return q_b / (2.0 * math.pi) * omega - G_pump * dp
 
 
 @contracted
 def pump_torque(dp: float, q_b: float) -> float:
-    """Compute the torque [N m] of the pressures on the shaft: q_b (p_1 - p_2) / (2 pi), eqs. (4.5)-(4.6)."""
+    """Compute the torque q_b (p_1 - p_2)/(2 pi) [N m] of the port pressures on the shaft, eqs. (4.5)-(4.6)."""
     return q_b / (2.0 * math.pi) * dp
 
 
 @law
 def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
-    """Compute c_slip [m^3/(s Pa^0.5)] of the turbulent slip and k_h [N m s^2] of the hydrodynamic torque.
+    """Compute the coefficients (c_slip, k_h) of the pump's turbulent slip and of its hydrodynamic torque.
 
-    c_slip = C_st D^(2/3) sqrt(2/rho), k_h = C_h rho D^(5/3)/2, `rho` density [kg/m^3] (Schlosser 1961).
+    c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)], k_h = C_h rho D^(5/3)/2 [N m s^2], density `rho` [kg/m^3]
+    (Schlosser 1961).
     """
     D = q_b / (2.0 * math.pi)
     return C_st * D ** (2.0 / 3.0) * math.sqrt(2.0 / rho), 0.5 * C_h * rho * D ** (5.0 / 3.0)
@@ -43,7 +43,7 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 
 @contracted
 def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
-    """Compute the slip flow [m^3/s] through the pump's gaps, an orifice's law: C_st D^(2/3) sqrt(2 |dp|/rho)."""
+    """Compute the turbulent slip [m^3/s] through the pump's gaps under `dp` [Pa]: an orifice law (Schlosser 1961)."""
     return orifice_flow(dp, c_slip, dp_0)
 
 
@@ -51,13 +51,13 @@ def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
     """Compute the friction torque [N m] of motor and pump, without viscous drag.
 
-    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction and one by pressure, made smooth
-    below `omega_f` [rad/s] (sat: held within +-1), and the hydrodynamic torque.
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction, friction due to pressure, and the
+    hydrodynamic torque. sat limits to +-1, so that T is continuous at standstill.
     """
-    turning = min(max(omega / omega_f, -1.0), 1.0)
-    return turning * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)
+    smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
+    return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)
 
 
 def hydraulic_power(Q_1: Any, dp: Any) -> Any:
-    """Compute the power [W] that the pump gives the oil: Q_1 (p_1 - p_2)."""
+    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump gives the oil."""
     return Q_1 * dp

@@ -1,4 +1,4 @@
-"""Orifices: the turbulent restrictor, regularised once, and the one-way throttle made of two of them."""
+"""Orifices and filters: the turbulent restrictor, made smooth at zero flow, one-way throttles, clogging filters."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import math
 from typing import Any
 
 from sealscope.compiled import contracted, law
-from sealscope.physics.lanes import anywhere, select
+from sealscope.physics.lanes import any_lane, select
 
 
 @law
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
-    """Compute the flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice (factor of eqs. 4.9-4.12)."""
+    """Compute the flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice, as in eqs. (4.9)-(4.12)."""
     return C_d * area * math.sqrt(2.0 / rho)
 
 
-def behind_shut_off(c: float, c_line: float, opening: Any) -> Any:
-    """Compute the flow coefficient [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
+def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
+    """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
 
-    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, solved for C: the valve opens the share `opening` in 0..1 of its line,
-    whose whole area has the coefficient `c_line`. Fully open it leaves `c`, shut 0.
+    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2: the valve opens the fraction `opening` of its line's area, whose
+    coefficient is `c_line`. Fully open C = c, shut C = 0.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
@@ -27,106 +27,104 @@ def behind_shut_off(c: float, c_line: float, opening: Any) -> Any:
     return c * c_line * opening * (c_line * c_line * square + c * c * (1.0 - square)) ** -0.5
 
 
-_in_series = law(behind_shut_off)
+_series_coefficient = law(series_coefficient)
 
 
 @law
-def behind_valve(c: float, c_line: float, opening: float) -> float:
-    """Compute `behind_shut_off` in compiled code; a valve that is fully open leaves `c` to the last bit."""
-    return c if opening >= 1.0 else _in_series(c, c_line, opening)
+def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
+    """Compute `series_coefficient` in compiled code; exactly `c` for a fully open valve."""
+    return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
 
 @contracted
 def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     """Compute the flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
-    Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. 4.9-4.12 with the square root made smooth: Q -> c sign(dp) sqrt|dp| for
-    |dp| >> dp_0, and laminar, Q = c dp / sqrt(dp_0), for |dp| << dp_0, where the slope of the bare square root would
-    be infinite.
+    Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. (4.9)-(4.12) made smooth at dp = 0, where the square root's slope is
+    infinite: turbulent, c sign(dp) sqrt|dp|, for |dp| >> dp_0, and laminar, c dp / sqrt(dp_0), for |dp| << dp_0.
     """
     return c * dp / math.sqrt(math.sqrt(dp * dp + dp_0 * dp_0))
 
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose the coefficient of a one-way throttle by the direction of the pressure difference."""
+    """Choose the flow coefficient of a one-way throttle by the sign of its pressure difference `dp`."""
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
 @contracted
-def _implicit_share(b: float, a: float) -> float:
-    """Solve w r(w) + a w = b for the share w, b >= 0, a >= 0, where r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1.
+def _solve_scaled_flow(b: float, a: float) -> float:
+    """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) of an orifice; a >= 0, b >= 0.
 
-    w = Q/(c sqrt(dp_0)) is the flow through an orifice and w r its pressure difference over dp_0 (`orifice_flow` solved
-    for the difference). The left side grows and is convex, so the root is unique; Halley's method finds it, in one turn
-    where the volumes are stiff (a >> 1: r hardly matters), and ends where its rest is below 1e-12 of w.
+    w r(w), r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1, is the pressure difference over dp_0 (the inverse of
+    `orifice_flow`). The left side rises and is convex, so the root is unique. Halley's method finds it to 1e-12 of w,
+    in one iteration if a >> 1, where r hardly matters.
     """
     w = b / (a + 1.0)
-    w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))
+    w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # r(w) approximated for small and large w
     for _ in range(50):
         square = w * w
         r = math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0)))
         r_2 = r * r
         r_4 = r_2 * r_2
-        over = w * (r + a) - b
+        residual = w * (r + a) - b
         d = 1.0 + r_4
-        slope = 2.0 * r * r_4 + a * d  # of the left side, times d
-        bend = w * (r * r_2 * r_4) * (10.0 + 2.0 * r_4)  # its second derivative, times d^3
-        step = 2.0 * over * d * d * slope / (2.0 * d * slope * slope - over * bend)
+        slope = 2.0 * r * r_4 + a * d  # first derivative of the left side, times d
+        curvature = w * (r * r_2 * r_4) * (10.0 + 2.0 * r_4)  # its second derivative, times d^3
+        step = 2.0 * residual * d * d * slope / (2.0 * d * slope * slope - residual * curvature)
         w = w - step
-        if not anywhere(abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r)):
+        if not any_lane(abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r)):
             break
     return w  # type: ignore[no-any-return]
 
 
 @contracted
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Compute the flow Q [m^3/s] of a one-way throttle between two volumes in an implicit stage.
+    """Compute the flow Q [m^3/s] of a one-way throttle in an implicit stage, from d + g Q(d) = total.
 
-    d + g Q(d) = total, g >= 0 [Pa s/m^3].
-
-    This scalar equation is all that an implicit stage has to solve for one line volume against one chamber; the root
-    is unique and has the sign of `total`.
+    d [Pa] is the throttle's pressure difference at the stage's end, `total` [Pa] that without the flow, and g Q
+    (`g` >= 0 [Pa s/m^3]) what the flow takes off it. The root is unique and has the sign of `total`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
-    root = math.sqrt(dp_0)
-    w = _implicit_share(abs(total) / dp_0, g * c / root)
-    return math.copysign(c * root * w, total)
+    sqrt_dp_0 = math.sqrt(dp_0)
+    w = _solve_scaled_flow(abs(total) / dp_0, g * c / sqrt_dp_0)
+    return math.copysign(c * sqrt_dp_0 * w, total)
 
 
 @contracted
-def clogged_resistance(R: float, passed: float, k: float, n: float) -> float:
-    """Compute the resistance [Pa s/m^3] of a filter after `passed` [m^3] of oil; `R` when new.
+def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
+    """Compute the resistance [Pa s/m^3] of a filter that has passed the oil volume `V` [m^3]; `R` when new.
 
-    dR/dV = k R_new (R/R_new)^n, the blocking laws of filtration for a steady share of dirt:
-    R = R_new (1 + (1 - n) k V)^(1/(1 - n)). That is 1 + k V for a cake (n = 0), exp(k V) for intermediate (1),
-    (1 - k V/2)^-2 for standard (1.5) and 1/(1 - k V) for complete blocking (2). Of n > 1 the base is kept above 1e-3,
-    where hardly anything would pass any more.
+    The blocking laws of filtration at a constant dirt concentration, dR/dV = k R_new (R/R_new)^n, give
+    R = R_new (1 + (1 - n) k V)^(1/(1 - n)): the factor is 1 + k V for a cake (n = 0), exp(k V) for intermediate (1),
+    (1 - k V/2)^-2 for standard (1.5) and 1/(1 - k V) for complete blocking (2). The base is limited to 1e-3, below
+    which a filter with n > 1 would pass almost nothing.
 
     Source: J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187.
     """
     e = 1.0 - n
-    e = select(abs(e) < 1e-6, 1e-6, e)
-    return R * math.pow(max(1.0 + e * k * passed, 1e-3), 1.0 / e)
+    e = select(abs(e) < 1e-6, 1e-6, e)  # the limit n = 1
+    return R * math.pow(max(1.0 + e * k * V, 1e-3), 1.0 / e)
 
 
 @contracted
 def filtered_flow(
     total: float, g: float, R: float, p_bypass: float, G_bypass: float, c_forward: float, c_reverse: float, dp_0: float
 ) -> float:
-    """Compute the flow [m^3/s] of a throttle in series with a filter and its bypass valve.
+    """Compute the flow Q [m^3/s] of a throttle in series with a filter and its bypass valve in an implicit stage.
 
-    d + g Q(d) + dp_f(Q) = total, with the filter's dp_f = R Q, and where that is above `p_bypass` [Pa] what the valve
-    leaves: Q = dp_f/R + G_bypass (dp_f - p_bypass). Both are straight lines, so each is `implicit_orifice_flow`.
+    d + g Q(d) + dp_f(Q) = total. The filter's drop dp_f is R Q while the valve is shut, and follows from
+    Q = dp_f/R + G_bypass (dp_f - p_bypass) above `p_bypass` [Pa]. Each case is linear in Q, so that
+    `implicit_orifice_flow` solves it.
     """
-    through = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
-    share = 1.0 / (1.0 + G_bypass * R)
-    rest = total - math.copysign(G_bypass * R * p_bypass * share, total)
-    bypassed = implicit_orifice_flow(rest, g + R * share, c_forward, c_reverse, dp_0)
-    return select(R * abs(through) > p_bypass, bypassed, through)  # type: ignore[no-any-return]
+    filter_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
+    filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
+    open_total = total - math.copysign(G_bypass * R * p_bypass * filter_fraction, total)
+    open_flow = implicit_orifice_flow(open_total, g + R * filter_fraction, c_forward, c_reverse, dp_0)
+    return select(R * abs(filter_flow) > p_bypass, open_flow, filter_flow)  # type: ignore[no-any-return]
 
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute the flow [m^3/s], without its sign, through the filter itself and not its bypass."""
+    """Compute the magnitude [m^3/s] of the flow through a filter itself, out of Q through filter and bypass valve."""
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

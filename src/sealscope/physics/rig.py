@@ -1,13 +1,13 @@
-"""Where the laws meet: the right-hand side of the whole rig, eqs. (4.1)-(4.22).
+"""The right-hand side dy/dt of the whole rig from its laws, eqs. (4.1)-(4.22).
 
 State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
 angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
-the make-up has fed, deflection z [m] of the bristles of LuGre's friction, position x_s [m] and speed v_s [m/s] of a
-servo valve's spool, or in their places the oil [m^3] that passed the filters where these clog. Without throttles the
-pump is connected to the chambers directly: there are no line volumes, p_1 = p_A and p_2 = p_B. With a servo valve the
-pump turns at a constant speed between the return (p_2) and the supply (p_1), and the valve's edges connect both with
-the chambers. With throttles the stiffness of the equations is in their two flows alone (microseconds, against
-milliseconds for all else), so the right-hand side comes in two parts: everything but the throttles, and the throttles.
+the make-up has delivered, deflection z [m] of LuGre's bristles, position x_s [m] and speed v_s [m/s] of a servo valve's
+spool, or in place of these the oil [m^3] that has passed clogging filters. Without throttles there are no line volumes:
+the pump is connected to the chambers, p_1 = p_A and p_2 = p_B. With a servo valve the pump runs at a constant speed
+from the return (p_2) to the supply (p_1), and the valve's edges connect both to the chambers. With throttles, only
+their two flows are stiff (microseconds, against milliseconds for the rest), so the right-hand side is in two parts:
+`rates_without_throttles` and `throttle_rates`. `p` is always the rig's numbers, `RigNumbers`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
-from sealscope.parameters.fields import leaves, unit_of
+from sealscope.parameters.fields import iter_fields, unit_of
 from sealscope.physics import cylinder, external, friction, motor, pump, restrictors, valve
 from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
 from sealscope.physics.lanes import select
@@ -50,42 +50,40 @@ from sealscope.physics.state import (
 from sealscope.physics.state import OUTPUTS as OUTPUTS  # noqa: PLC0414
 from sealscope.units import P_ATM
 
-#: Parameters that the laws take within other numbers alone (`DERIVED`).
-_WITHIN = (
+#: Parameters that the laws take only through derived numbers (`DERIVED`).
+_DERIVED_ONLY = (
     *("line.C_d", "line.d_line", "line.closed_A", "line.closed_B", "line.open_A", "line.open_B", "fluid.rho"),
     *("cylinder.V_rod", "cylinder.V_hose_A", "cylinder.V_hose_B", "pump.C_st", "pump.C_h"),
 )
-#: Parameters that are informative, and those of what only changes within a run.
-_NOT_TAKEN = {
-    *("pump.omega_max", "line.G_circ", "fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha"),
-}
-#: Dotted name of each parameter that the laws take, by its symbol, as the models declare them.
+#: Parameters that the laws do not take: informative ones, and those of changes within a run.
+_NOT_TAKEN = {*("pump.omega_max", "line.G_circ", "fluid.T_oil", "fluid.nu_40", "fluid.nu_100", "fluid.alpha")}
+#: Dotted names of the parameters that the laws take, by symbol, in the order of declaration.
 PARAMETERS = {
     name.rpartition(".")[2]: name
-    for name, field in leaves(Rig)
-    if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN | {*_WITHIN}
+    for name, field in iter_fields(Rig)
+    if unit_of(field) and not name.startswith(("sensors.", "daq.")) and name not in _NOT_TAKEN | {*_DERIVED_ONLY}
 }
-#: ... and of those that the laws' numbers follow from.
-VALUES = {**PARAMETERS, **{name.rpartition(".")[2]: name for name in _WITHIN}}
-#: Choices that the laws take as truth values, each with the parameter and the value that stand for True; `made_up` is
-#: True with check valves of either kind.
+#: Those, and the parameters from which numbers are derived.
+VALUES = {**PARAMETERS, **{name.rpartition(".")[2]: name for name in _DERIVED_ONLY}}
+#: Choices that the laws take as truth values, each with the parameter and its value that means True. A further one,
+#: `made_up`, is True with check valves of either kind.
 _CHOICES = {
     "position_dependent": ("cylinder.volumes", "position"),
     "coulomb_of_difference": ("friction.coulomb_pressure", "difference"),
     "literal_bracket": ("friction.bracket", "literal"),
 }
-#: Numbers that follow from parameters: coefficients of throttle A (from the pump to the cylinder, back) and B, with
-#: their shut-off valves, volumes of both sides at mid-stroke, coefficients of the pump's losses (`derived_numbers`).
+#: Derived numbers: flow coefficients of throttles A and B towards the cylinder and back, with their shut-off valves;
+#: volumes of both sides at mid-stroke; coefficients of the pump's losses (`derived_numbers`).
 DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
-#: Laws that some rigs do without: tuples, empty where the law is not in force, so that the compiler leaves it out.
-#: Throttles in the lines; air in the oil; oil that leaves or enters; a balance of mass; friction that sticks, that has
-#: bristles, that differs between the directions; check valves with pilots, relief valves, an accumulator that exchanges
-#: little heat; a damper; a load of a run beside the rig's own, over time, or with the two tables of `force_over` in
-#: place of (True,) over position and velocity too; a servo valve between a supply and the cylinder; filters in the
-#: lines; losses of motor and pump beyond the linear ones; an opposing cylinder; oil
-#: that boils; filters that clog, filters with a bypass.
+#: Laws that some rigs do without. Each is a tuple, empty if the law is not in force: numba specialises on its length,
+#: so that the law is not compiled in. Throttles in the lines; air in the oil; rod seals or make-up; balance of mass in
+#: place of volume; Karnopp's friction; LuGre's; friction that differs between the directions; pilot-operated check
+#: valves; relief valves; an accumulator that is not isothermal; a damper; a load in addition to the rig's own, (True,)
+#: over time, or its two tables (`piecewise_linear_force`) over position and velocity; a servo valve and its supply;
+#: filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder; boiling oil; filters
+#: that clog; filters with a bypass.
 LAWS = (
     *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
@@ -113,20 +111,20 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 
 @law
-def coefficients_of_throttles(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
+def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
     """Compute the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "Closed" is a share of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out": free
-    flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
-    (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series with them (`behind_valve`).
+    "Closed" is a fraction of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out":
+    free flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
+    (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series (`series_coefficient`).
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
     throttled_B = free * (1.0 - v.closed_B) ** exponent
-    A_in = restrictors.behind_valve(free, free, v.open_A)
-    A_out = restrictors.behind_valve(throttled_A, free, v.open_A)
-    B_free = restrictors.behind_valve(free, free, v.open_B)
-    B_throttled = restrictors.behind_valve(throttled_B, free, v.open_B)
+    A_in = restrictors.compiled_series_coefficient(free, free, v.open_A)
+    A_out = restrictors.compiled_series_coefficient(throttled_A, free, v.open_A)
+    B_free = restrictors.compiled_series_coefficient(free, free, v.open_B)
+    B_throttled = restrictors.compiled_series_coefficient(throttled_B, free, v.open_B)
     if literal:
         return A_in, A_out, B_throttled, B_free
     return A_in, A_out, B_free, B_throttled
@@ -134,31 +132,31 @@ def coefficients_of_throttles(v: RigValues, exponent: float, literal: bool) -> t
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Compute the numbers of `DERIVED`; `exponent`, `literal`: see `coefficients_of_throttles`."""
-    c_A_in, c_A_out, c_B_in, c_B_out = coefficients_of_throttles(v, exponent, literal)
-    V_A, V_B = cylinder.volumes_at_middle(v)
+    """Compute the derived numbers `DERIVED`; `exponent`, `literal`: see `throttle_flow_coefficients`."""
+    c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
+    V_A, V_B = cylinder.mid_stroke_volumes(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
     return c_A_in, c_A_out, c_B_in, c_B_out, V_A, V_B, c_slip, k_h
 
 
-def values_of(rig: Rig) -> RigValues:
-    """Collect the parameters of a rig that its numbers are made of."""
+def parameter_values(rig: Rig) -> RigValues:
+    """Collect the values of a rig's parameters from which its numbers are computed."""
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return `exponent` and `literal` of `coefficients_of_throttles` for a rig."""
+    """Return the arguments `exponent` and `literal` of `throttle_flow_coefficients` for a rig."""
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Compute the coefficients of the rig's throttles (`coefficients_of_throttles`)."""
-    return coefficients_of_throttles(values_of(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
+    """Compute the coefficients of the rig's throttles (`throttle_flow_coefficients`)."""
+    return throttle_flow_coefficients(parameter_values(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Collect the rig's parameters as the compiled laws take them."""
-    values = values_of(rig)
+    """Build the numbers of a rig as the compiled laws take them."""
+    values = parameter_values(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"
     laws = {
@@ -174,7 +172,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
         "polytropic": choices["made_up"] and rig.makeup.n_gas != 1.0,
         "damped": rig.cylinder.d_load > 0,
         "pushed": False,
-        "valved": rig.valve.spool == "present",
+        "valved": rig.circuit.valve_controlled,
         "filtered": rig.line.R_A > 0 or rig.line.R_B > 0,
         "lossy": rig.motor.T_f > 0 or rig.pump.C_st > 0 or rig.pump.C_f > 0 or rig.pump.C_h > 0,
         "opposed": rig.cylinder.A_opp > 0,
@@ -191,33 +189,33 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 
 @cache
-def _record(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the type of the record of `packed`, by the lengths of the laws."""
+def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
+    """Build the type of the record of `pack_numbers`; `lengths`: those of the tuples of `LAWS`."""
     truths = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
     return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
 
 
-def packed(p: RigNumbers) -> Any:
-    """Pack the numbers into a record, whose one address compiled functions hand on: they compile faster.
+def pack_numbers(p: RigNumbers) -> Any:
+    """Pack the numbers into a record: compiled functions pass its address instead of 100 values, and compile faster.
 
-    The tables of a load have no place in it: numbers with them are returned as they are.
+    Numbers with the tables of a load, which do not fit into a record, are returned unchanged.
     """
     lengths = tuple(len(getattr(p, name)) for name in LAWS)
     if len(p.pushed) > 1:
         return p
-    return np.array([tuple(p)], _record(lengths)).view(np.recarray)[0]
+    return np.array([tuple(p)], _record_type(lengths)).view(np.recarray)[0]
 
 
 @contracted
-def within_limits(y: State, p: RigNumbers) -> State:
-    """Limit the drive's current in the state after a step.
+def limit_state(y: State, p: RigNumbers) -> State:
+    """Limit current and spool in the state after a step, and set the states that the rig does without.
 
-    Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's, and the spool stays within its
-    stroke. What no law of the rig moves is 0, so that the compiler leaves it out.
+    Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's pressure. States that no law of the
+    rig changes are set to 0, so that the compiler removes them.
     """
-    fed = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
-    z = y[BRISTLE] if len(p.bristled) > 0 else 0.0
+    V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
+    bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
     current = min(max(y[CURRENT], -p.i_max), p.i_max)
     p_1, p_2 = (y[P_1], y[P_2]) if len(p.throttled) > 0 else (y[P_A], y[P_B])
     x_s, v_s = 0.0, 0.0
@@ -226,15 +224,15 @@ def within_limits(y: State, p: RigNumbers) -> State:
         x_s, v_s = valve.spool_within_stroke(y[SPOOL], y[SPOOL_SPEED], p.x_max, p.v_max)
     if len(p.clogging) > 0:
         x_s, v_s = y[PASSED_A], y[PASSED_B]
-    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, fed, z, x_s, v_s
+    return y[0], current, y[2], y[3], y[4], y[5], y[6], y[7], p_1, p_2, V_up, bristle, x_s, v_s
 
 
 @contracted
 def vapour_floor(q: float, p: RigNumbers) -> float:
-    """Compute the pressure [Pa] of a volume of state q [Pa]: no lower than the vapour pressure `p_vap` [Pa absolute].
+    """Compute the pressure [Pa] of a volume whose pressure state is q [Pa]: q, but at least the vapour pressure.
 
-    Below it the oil boils: a cavity opens, and q goes on by the oil's own bulk modulus, so that rho(q) V is the mass
-    that is there and V (1 - rho(q)/rho(p_vap)) the cavity. Nothing of the balances of oil changes.
+    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q then continues by the oil's bulk modulus:
+    rho(q) V is the mass of oil in the volume V, and V (1 - rho(q)/rho(p_vap)) the cavity, so that mass balances hold.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -251,7 +249,7 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the commanded less actual motor speed [rad/s]; the pump of a servo valve's supply has one speed."""
+    """Compute the motor's set speed, by the command u [V] or the supply's constant one, minus its speed [rad/s]."""
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -259,7 +257,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Compute the pressure difference [Pa] between the ports of the pump."""
+    """Compute the pump's pressure difference [Pa], port 1 less port 2."""
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) > 0 or len(p.valved) > 0:
         return p_1 - p_2
@@ -268,30 +266,30 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction [N] on the piston by the rig's law, and the rate [m/s] of its bristles' deflection.
+    """Compute the friction [N] on the piston by the rig's law, and the rate [m/s] of LuGre's bristles, else 0.
 
-    `applied` [N]: all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
+    `applied` [N]: sum of all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
         vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), p.F_pr, p.F_cfr, p.coulomb_of_difference
     )
-    F_v, breakaway = p.F_v, p.K_brk * F_C
+    F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # a zero of v's type: a number or lanes
     if len(p.one_sided) > 0:
         breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
         side = select(v < 0.0, p.backward, 1.0)
         F_C, F_v = side * F_C, side * F_v
     if len(p.sticking) > 0:
-        return friction.karnopp_friction(v, applied, breakaway, F_C, p.K_brk, p.C_c, F_v, p.v_th), 0.0 * v
+        return friction.karnopp_friction(v, applied, breakaway, F_C, p.K_brk, p.C_c, F_v, p.v_th), no_rate
     if len(p.bristled) > 0:
-        dz = friction.bristle_rate(v, y[BRISTLE], friction.stribeck_level(abs(v), F_C, p.K_brk, p.C_c), p.sigma_0)
+        dz = friction.bristle_rate(v, y[BRISTLE], friction.stribeck_force(abs(v), F_C, p.K_brk, p.C_c), p.sigma_0)
         return friction.lugre_friction(v, y[BRISTLE], dz, p.sigma_0, p.sigma_1, F_v, p.v_th), dz
-    return friction.stribeck_friction(v, F_C, p.K_brk, p.C_c, F_v, p.v_th, p.literal_bracket), 0.0 * v
+    return friction.stribeck_friction(v, F_C, p.K_brk, p.C_c, F_v, p.v_th, p.literal_bracket), no_rate
 
 
 @contracted
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the resistances [Pa s/m^3] of the filters in line A and B, as the oil that passed has clogged them."""
+    """Compute the resistances [Pa s/m^3] of the filters in lines A and B, clogged by the oil that has passed."""
     if len(p.clogging) == 0:
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
@@ -302,9 +300,9 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 def implicit_flows(
     total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
 ) -> tuple[float, float]:
-    """Compute the flows Q_A, Q_B [m^3/s] of throttles and filters: d + g Q(d) = total in each line.
+    """Compute the flows Q_A, Q_B [m^3/s] of throttles and filters in an implicit stage, d + g Q(d) = total each.
 
-    The filter is in series with its throttle, p_1 - p_A = d + R Q, and so adds to g.
+    A filter in series with its throttle, p_1 - p_A = d + R Q, adds R to g.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -319,24 +317,21 @@ def implicit_flows(
 
 
 @contracted
-def passing_filters(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the oil [m^3/s] that passes the filters of line A and B, in either direction, beside their bypasses."""
+def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
+    """Compute the magnitudes [m^3/s] of the flows through the filters of lines A and B, without their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
     if len(p.bypassed) == 0:
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
-    return (
-        restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass),
-        restrictors.flow_through_filter(Q_B, R_B, p.p_bypass, p.G_bypass),
-    )
+    filter_flow_A = restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass)
+    return filter_flow_A, restrictors.flow_through_filter(Q_B, R_B, p.p_bypass, p.G_bypass)
 
 
 @contracted
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the throttles' flows Q_A and Q_B [m^3/s].
+    """Compute the throttles' flows [m^3/s]: Q_A from line 1 to chamber A, Q_B from chamber B to line 2.
 
-    Q_A runs from line 1 into chamber A, eqs. (4.9)-(4.10), and Q_B from chamber B into line 2, eqs. (4.11)-(4.12). A
-    filter in series takes R Q of the pressure difference (Darcy's law).
+    Eqs. (4.9)-(4.12). The pressure drop of a filter in series is R Q (Darcy's law).
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
@@ -348,7 +343,7 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of both sides, hoses and chambers, at piston position x [m]."""
+    """Compute the oil volumes [m^3] of chamber and hose on sides A and B at piston position x [m]."""
     return cylinder.chamber_volumes(x, p.V_A, p.V_B, p.A_A, p.A_B, p.position_dependent)
 
 
@@ -361,24 +356,25 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 
 @contracted
-def density_ratio(pressure: float, other: float, p: RigNumbers) -> float:
-    """Compute the density of the oil at `pressure` over that at the `other` pressure [Pa]."""
+def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
+    """Compute the oil's density ratio rho(pressure)/rho(reference), both pressures [Pa]."""
     if len(p.aerated) == 0:
-        return oil_density_ratio(pressure - other, p.K_oil)
-    p_a, p_b = vapour_floor(pressure, p), vapour_floor(other, p)
+        return oil_density_ratio(pressure - reference, p.K_oil)
+    p_a, p_b = vapour_floor(pressure, p), vapour_floor(reference, p)
     ratio = mixture_density_ratio(p_a, p_b, p.K_oil, p.air, p.n_air)
     if len(p.boiling) == 0:
         return ratio
-    softest = effective_bulk_modulus(p.p_vap - P_ATM, p.K_oil, p.air, p.n_air)
-    return ratio * oil_density_ratio((pressure - p_a) - (other - p_b), softest)
+    boiling_modulus = effective_bulk_modulus(p.p_vap - P_ATM, p.K_oil, p.air, p.n_air)
+    # below the vapour pressure the pressure states continue by that modulus (`vapour_floor`)
+    return ratio * oil_density_ratio((pressure - p_a) - (reference - p_b), boiling_modulus)
 
 
 @contracted
-def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the volume flows [m^3/s] at either end of a flow, each at its own pressure (`source`, `sink` [Pa]).
+def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
+    """Compute the volume flows [m^3/s] out of the source and into the sink, at their pressures `source`, `sink` [Pa].
 
-    `Q` > 0 leaves the first, and is counted at the pressure it comes from: mass is conserved, rho_in Q_in = rho_out
-    Q_out. Where the rig balances volumes, both are Q.
+    `Q` [m^3/s] is the flow at the pressure it comes from (the sink's for Q < 0); at the other end it is that of the
+    same mass, rho_in Q_in = rho_out Q_out. If the rig balances volumes, both flows are Q.
     """
     if len(p.conserving) == 0:
         return Q, Q
@@ -389,10 +385,10 @@ def volumes_exchanged(Q: float, source: float, sink: float, p: RigNumbers) -> tu
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """Compute the throttles' part of the rates of p_A, p_B, p_1, p_2 [Pa/s], eqs. (4.16)-(4.19)."""
+    """Compute the part of dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] due to the throttles, eqs. (4.16)-(4.19)."""
     V_A, V_B = volumes_at(y[POSITION], p)
-    from_1, to_A = volumes_exchanged(Q_A, y[P_1], y[P_A], p)
-    from_B, to_2 = volumes_exchanged(Q_B, y[P_B], y[P_2], p)
+    from_1, to_A = flows_at_both_ends(Q_A, y[P_1], y[P_A], p)
+    from_B, to_2 = flows_at_both_ends(Q_B, y[P_B], y[P_2], p)
     return (
         cylinder.pressure_rate(to_A, V_A, bulk_modulus(y[P_A], p)),  # eq. (4.18)
         cylinder.pressure_rate(-from_B, V_B, bulk_modulus(y[P_B], p)),  # eq. (4.19)
@@ -404,53 +400,55 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 @contracted
 def supply_pressure(y: State, p: RigNumbers) -> float:
     """Compute the pressure [Pa] of the make-up's accumulator."""
-    if len(p.polytropic) > 0:
+    if len(p.polytropic) > 0:  # empty unless the gas is polytropic, so that the law is chosen at compile time
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the flows [m^3/s] from the accumulator into side 1 (A) and side 2 (B), through check and relief valves.
+    """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), by check and relief valves.
 
-    At the pump's ports, or at the chambers without lines. The pilot of a side's check valve is the other side.
+    The sides are the pump's ports, or the chambers in a rig without lines. Each check valve is piloted by the other
+    side.
     """
     supply = supply_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) == 0:
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
-        up_1 = external.pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
-        up_2 = external.pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        makeup_1 = external.pilot_valve_flow(supply - p_1, p_2 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
+        makeup_2 = external.pilot_valve_flow(supply - p_2, p_1 - supply, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
         G_check = p.G_check if p.made_up else 0.0 * p.G_check
-        up_1 = external.check_valve_flow(supply - p_1, p.p_crack, G_check)
-        up_2 = external.check_valve_flow(supply - p_2, p.p_crack, G_check)
+        makeup_1 = external.check_valve_flow(supply - p_1, p.p_crack, G_check)
+        makeup_2 = external.check_valve_flow(supply - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
-        up_1 = up_1 - external.check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
-        up_2 = up_2 - external.check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
-    return up_1, up_2
+        makeup_1 = makeup_1 - external.check_valve_flow(p_1 - supply, p.p_relief, p.G_relief)
+        makeup_2 = makeup_2 - external.check_valve_flow(p_2 - supply, p.p_relief, p.G_relief)
+    return makeup_1, makeup_2
 
 
 @contracted
-def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the part of the rates that the rod seals and the make-up add.
+def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
+    """Compute the part of the pressure rates due to external leakage and make-up, and the make-up's flow.
 
-    Rates of p_A, p_B, p_1, p_2 [Pa/s], and of the oil fed [m^3/s], counted at the accumulator's pressure.
+    Rates of p_A, p_B, p_1, p_2 [Pa/s]; flow out of the accumulator [m^3/s] at its pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
-    up_1, up_2 = make_up_flows(y, p)
+    makeup_1, makeup_2 = make_up_flows(y, p)
     out_A, out_B = external.external_leakage(y[P_A], p.G_ext_A), external.external_leakage(y[P_B], p.G_ext_B)
     supply = supply_pressure(y, p)
-    given_1, up_1 = volumes_exchanged(up_1, supply, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
-    given_2, up_2 = volumes_exchanged(up_2, supply, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
-    fed = given_1 + given_2
+    drawn_1, makeup_1 = flows_at_both_ends(makeup_1, supply, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
+    drawn_2, makeup_2 = flows_at_both_ends(makeup_2, supply, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
+    fed = drawn_1 + drawn_2
     if len(p.throttled) > 0:
-        rate_1 = cylinder.pressure_rate(up_1, p.V_1, bulk_modulus(y[P_1], p))
-        rate_2 = cylinder.pressure_rate(up_2, p.V_2, bulk_modulus(y[P_2], p))
+        rate_1 = cylinder.pressure_rate(makeup_1, p.V_1, bulk_modulus(y[P_1], p))
+        rate_2 = cylinder.pressure_rate(makeup_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
-    rate_1, rate_2 = cylinder.pressure_rate(up_1 - out_A, V_A, K_A), cylinder.pressure_rate(up_2 - out_B, V_B, K_B)
+    rate_1 = cylinder.pressure_rate(makeup_1 - out_A, V_A, K_A)
+    rate_2 = cylinder.pressure_rate(makeup_2 - out_B, V_B, K_B)
     if len(p.valved) > 0:  # a supply's line has no rod seal
         return (rate_1, rate_2, 0.0 * rate_1, 0.0 * rate_2), fed
     return (rate_1, rate_2, rate_1, rate_2), fed
@@ -458,7 +456,7 @@ def outer_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 @contracted
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
-    """Compute the flows [m^3/s] of a servo valve's edges: P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
+    """Compute a servo valve's flows [m^3/s] from P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
     return (
@@ -471,54 +469,54 @@ def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
 
 @contracted
 def supply_compliance(p_1: float, p: RigNumbers) -> float:
-    """Compute the oil [m^3/Pa] that supply line and accumulator take in as p_1 [Pa] rises.
+    """Compute the compliance [m^3/Pa] of the supply line with its accumulator at p_1 [Pa].
 
-    (V_1 + V_oil)/K + V_gas/(n p_abs), V_oil = V_acc - V_gas the oil in the accumulator.
+    (V_1 + V_oil)/K + V_gas/(n p_abs), with the oil V_oil = V_acc - V_gas in the accumulator.
     """
     V_gas = external.gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
-    of_oil = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
-    return of_oil + external.accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)  # type: ignore[no-any-return]
+    oil_compliance = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
+    return oil_compliance + external.accumulator_compliance(p_1, p.p_pre, V_gas, p.n_acc)  # type: ignore[no-any-return]
 
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Compute the part of a servo valve and its supply in the rates of p_A, p_B, p_1, p_2 [Pa/s].
+    """Compute the part of the rates of p_A, p_B, p_1, p_2 [Pa/s] due to a servo valve and its supply.
 
-    `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure stays.
+    `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure is constant.
     """
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)
-    given_A, to_A = volumes_exchanged(Q_PA, p_P, p_A, p)
-    given_B, to_B = volumes_exchanged(Q_PB, p_P, p_B, p)
-    from_A, _ = volumes_exchanged(Q_AT, p_A, p_T, p)
-    from_B, _ = volumes_exchanged(Q_BT, p_B, p_T, p)
-    _, fed = volumes_exchanged(Q_1, p_T, p_P, p)
+    drawn_A, to_A = flows_at_both_ends(Q_PA, p_P, p_A, p)
+    drawn_B, to_B = flows_at_both_ends(Q_PB, p_P, p_B, p)
+    from_A, _ = flows_at_both_ends(Q_AT, p_A, p_T, p)
+    from_B, _ = flows_at_both_ends(Q_BT, p_B, p_T, p)
+    _, fed = flows_at_both_ends(Q_1, p_T, p_P, p)
     relief = external.check_valve_flow(pump_difference(y, p), p.p_set, p.G_set)
     return (
         cylinder.pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
         cylinder.pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
-        (fed - relief - given_A - given_B) / supply_compliance(p_P, p),
+        (fed - relief - drawn_A - drawn_B) / supply_compliance(p_P, p),
         0.0 * p_T,
     )
 
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute dy/dt without the throttles' flows; `u` [V] command, `G`, `C` leakage coefficients, `F` [N] load."""
+    """Compute dy/dt without the throttles' flows; command `u` [V], leakage coefficients `G`, `C`, load `F` [N]."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)
     dp_pump = pump_difference(y, p)
     error = speed_error(y, u, p)  # eq. (4.2) as a state
     voltage = motor.controller_voltage(error, y[INTEGRAL], p.k_p, p.K_i, p.V_max)
-    current = motor.winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
+    d_i = motor.winding_current_rate(voltage, y[CURRENT], y[OMEGA], p.R_c, p.L_c, p.C_e, p.i_max)
     torque = pump.pump_torque(dp_pump, p.q_b)
     Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
         torque = torque + pump.friction_torque(y[OMEGA], dp_pump, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
         Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
-    spin = motor.shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
+    d_omega = motor.shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
     stop = cylinder.hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
     load = cylinder.load_force(x, p.F_l, p.k_load)
     if len(p.damped) > 0:
@@ -528,46 +526,47 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     if len(p.pushed) > 0:
         load = load + F
     if len(p.pushed) > 1:
-        load = load + cylinder.force_over(x, p.pushed[0]) + cylinder.force_over(v, p.pushed[1])
+        load = load + cylinder.piecewise_linear_force(x, p.pushed[0]) + cylinder.piecewise_linear_force(v, p.pushed[1])
     F_f, dz = friction_force(y, p_A * p.A_A - p_B * p.A_B - load + stop, p)
-    push = cylinder.piston_acceleration(p_A, p_B, F_f, load, stop, p.A_A, p.A_B, p.M_eq)
+    acceleration = cylinder.piston_acceleration(p_A, p_B, F_f, load, stop, p.A_A, p.A_B, p.M_eq)
     Q_L = piston_leakage(p_A - p_B, G, C, p.dp_0)
     V_A, V_B = volumes_at(x, p)
     K_A, K_B = bulk_modulus(p_A, p), bulk_modulus(p_B, p)
-    from_A, to_B = volumes_exchanged(Q_L, y[P_A], y[P_B], p)
+    from_A, to_B = flows_at_both_ends(Q_L, y[P_A], y[P_B], p)
     if len(p.throttled) > 0:
-        from_2, to_1 = volumes_exchanged(Q_1, y[P_2], y[P_1], p)
+        from_2, to_1 = flows_at_both_ends(Q_1, y[P_2], y[P_1], p)
         rate_A = cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
         rate_B = cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
         rate_1 = cylinder.pressure_rate(to_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(-from_2, p.V_2, bulk_modulus(y[P_2], p))
     elif len(p.valved) > 0:
-        by_valve = valve_rates(y, Q_1, p)
-        rate_A = by_valve[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
-        rate_B = by_valve[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
-        rate_1, rate_2 = by_valve[2], by_valve[3]
+        valve_part = valve_rates(y, Q_1, p)
+        rate_A = valve_part[0] + cylinder.pressure_rate(-p.A_A * v - from_A, V_A, K_A)
+        rate_B = valve_part[1] + cylinder.pressure_rate(p.A_B * v + to_B, V_B, K_B)
+        rate_1, rate_2 = valve_part[2], valve_part[3]
     else:
-        from_2, to_1 = volumes_exchanged(Q_1, y[P_B], y[P_A], p)
+        from_2, to_1 = flows_at_both_ends(Q_1, y[P_B], y[P_A], p)
         rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
         rate_B = cylinder.pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
-    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v
+    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number or lanes
     if len(p.open_circuit) > 0:
-        outer, fed = outer_rates(y, p)
-        rate_A, rate_B = rate_A + outer[0], rate_B + outer[1]
-        rate_1, rate_2 = rate_1 + outer[2], rate_2 + outer[3]
+        external_part, fed = external_pressure_rates(y, p)
+        rate_A, rate_B = rate_A + external_part[0], rate_B + external_part[1]
+        rate_1, rate_2 = rate_1 + external_part[2], rate_2 + external_part[3]
     if len(p.valved) > 0:
         d_x_s = valve.spool_speed(y[SPOOL_SPEED], p.v_max)
         x_d = valve.spool_target(u, p.u_N, p.x_max)
         d_v_s = valve.spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
     if len(p.clogging) > 0:
-        d_x_s, d_v_s = passing_filters(y, p)
-    return error, current, spin, y[OMEGA], v, push, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s  # eq. (4.13)
+        d_x_s, d_v_s = filter_flows(y, p)
+    # in the order of `STATES`; dx/dt = v is eq. (4.13)
+    return error, d_i, d_omega, y[OMEGA], v, acceleration, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s
 
 
 @contracted
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute dy/dt of the whole rig."""
+    """Compute dy/dt of the whole rig; arguments as in `rates_without_throttles`."""
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:
         Q_A, Q_B = throttle_flows(y, p)
@@ -577,7 +576,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Write the states and the derived quantities of `OUTPUTS` into `row`."""
+    """Compute the outputs (`OUTPUTS`) of a state into `row`; arguments as in `rates_without_throttles`."""
     for m in range(len(y)):
         row[m] = y[m]
     row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)
@@ -590,6 +589,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
         Q_A, Q_B = Q_PA - Q_AT, Q_BT - Q_PB
+    # the outputs after the states: Q_1, Q_A, Q_B, q_leak, V, q_ext, q_up
     row[n] = Q_1
     row[n + 1] = Q_A
     row[n + 2] = Q_B
@@ -598,5 +598,5 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     row[n + 5] = row[n + 6] = 0.0
     if len(p.open_circuit) > 0:
         row[n + 5] = external.external_leakage(y[P_A], p.G_ext_A) + external.external_leakage(y[P_B], p.G_ext_B)
-        up_1, up_2 = make_up_flows(y, p)
-        row[n + 6] = up_1 + up_2
+        makeup_1, makeup_2 = make_up_flows(y, p)
+        row[n + 6] = makeup_1 + makeup_2

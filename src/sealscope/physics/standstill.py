@@ -1,4 +1,4 @@
-"""The state at standstill: pressures that carry the load, and a motor that holds them."""
+"""The state at standstill: pressures that carry the load, and a motor current that holds the pump against them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: What `stand_still` returns where there is no standstill.
-BELOW_VACUUM, NOT_HELD = 2, 3
+#: Codes of `stand_still` if there is no standstill: a pressure is below vacuum, or the drive cannot hold the load.
+BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 
 @law
-def carried_at_standstill(x: float, p: RigNumbers) -> float:
-    """Compute the force [N] against +x on the pressures at standstill at x [m]: the rig's load less a stop's."""
+def standstill_force(x: float, p: RigNumbers) -> float:
+    """Compute the force [N] against +x that the pressures carry at standstill at x [m]: load less end stop."""
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
@@ -33,9 +33,8 @@ def carried_at_standstill(x: float, p: RigNumbers) -> float:
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
 
-    With a make-up the lower of both is at the accumulator's charge pressure. Without one the circuit holds as much oil
-    as at the charge pressure throughout: the mean of both, weighted by the volumes of the sides (chamber, hose, and the
-    line where there is one), stays.
+    With a make-up the lower one is the charge pressure. Without one the circuit contains as much oil as with the charge
+    pressure throughout: the mean of both pressures, weighted by the volumes of the sides, is the charge pressure.
     """
     if p.made_up:
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
@@ -44,17 +43,17 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     V_A, V_B = p.V_A, p.V_B
     if len(p.throttled) > 0:
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
-    lack = force - p.p_charge * (p.A_A - p.A_B)  # of force, at the charge pressure
-    pressed_out = lack / (p.A_A / V_A + p.A_B / V_B)
-    return p.p_charge + pressed_out / V_A, p.p_charge - pressed_out / V_B
+    missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N], not carried by the charge pressure
+    displaced_oil = missing_force / (p.A_A / V_A + p.A_B / V_B)
+    return p.p_charge + displaced_oil / V_A, p.p_charge - displaced_oil / V_B
 
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Put a pump-controlled rig at standstill at x [m] under `force` [N] against +x, into a state `y` of zeros.
+    """Write the standstill of a pump-controlled rig at x [m] under `force` [N] against +x into a state `y` of zeros.
 
-    The motor holds the pump against the pressures: i = T_load/C_m, eq. (4.5), with the speed controller's integral at
-    R_c i/K_i, which gives that current, eq. (4.3). Returns 0, or `BELOW_VACUUM` or `NOT_HELD` (by the drive).
+    The motor holds the pump with the current i = T_load/C_m, eq. (4.5), which the speed controller's integral R_c i/K_i
+    gives, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`, `BEYOND_DRIVE`.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -64,57 +63,55 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     y[INTEGRAL] = p.R_c * y[CURRENT] / p.K_i if p.K_i > 0.0 else 0.0
     if not min(p_A, p_B) >= -P_ATM:
         return BELOW_VACUUM
-    return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else NOT_HELD
+    return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else BEYOND_DRIVE
 
 
 @law
 def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
     """Compute p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
 
-    p_A + p_B = p_1 + p_2: as much is lost at the supply's edges as at those to the return (Merritt, Hydraulic Control
-    Systems, 1967, section 5.2). An overlapped valve may trap any mean; this one is taken.
+    p_A + p_B = p_1 + p_2: edges to supply and return have equal drops (Merritt, Hydraulic Control Systems, 1967,
+    section 5.2). An overlapped valve may trap another mean pressure; this one is assumed.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
     return p_A, p_1 + p_2 - p_A
 
 
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
-    """Return p_1, p_A, p_B [Pa] at which pump, relief valve and a servo valve at null let the supply's pressure stay.
+    """Compute p_1, p_A, p_B [Pa] at which the supply's pressure is constant, with a servo valve at null.
 
-    By bisection: dp_1/dt falls as p_1 rises. `force` [N] against +x, `x` [m] of the piston.
+    By bisection of dp_1/dt, which falls as p_1 rises. `force` [N] against +x; `x` [m]: position of the piston.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
     high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # the relief valve alone takes more
     p_A, p_B = low, low
-    for _ in range(200):
+    for _ in range(200):  # halvings, beyond the resolution of doubles
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
-        over = middle - p.p_return
-        Q_1 = pump_flow(p.omega_P, over, p.q_b, p.G_pump) - turbulent_slip(over, p.c_slip, p.dp_0)
+        dp = middle - p.p_return
+        Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - turbulent_slip(dp, p.c_slip, p.dp_0)
         rises = valve_rates(state_of(y), Q_1, p)[2] > 0.0
         low, high = (middle, high) if rises else (low, middle)
     return low, p_A, p_B
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """Compute the state (14,) at standstill with the piston at x_0 [m] from mid-stroke, under `push` [N] and its load.
+    """Compute the state (14,) at standstill with the piston at x_0 [m] from mid-stroke, under its load and `push` [N].
 
-    The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`). A
-    machine that leaks creeps from there. Without a load and with equal areas all pressures are at the charge pressure
-    and all else is zero.
+    The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`).
+    Without load and with equal areas all pressures are the charge pressure and all else is 0. With a servo valve at
+    null the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
+    underlap, creeps from there.
 
-    Behind a servo valve at null the motor turns at the supply's speed, whose pressure stays (`supply_at_standstill`).
-    An underlapped valve lets a loaded piston creep from there.
-
-    Raises InputError where the pressures are below vacuum or beyond the supply's, or the drive cannot hold them.
+    Raises InputError if a pressure is below vacuum or above the supply's, or if the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
-    force = carried_at_standstill(x_0, p) + push
-    if rig.valve.spool == "present":
-        return _at_valve(rig, y, x_0, force, p)
+    force = standstill_force(x_0, p) + push
+    if rig.circuit.valve_controlled:
+        return _fill_standstill_state(rig, y, x_0, force, p)
     failure = stand_still(y, x_0, force, p)
     if failure == BELOW_VACUUM:
         raise InputError(
@@ -122,17 +119,17 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
             f"Pa and p_B = {y[P_B]:.4g} Pa; raise fluid.p_charge, or let a make-up hold the low side "
             "(makeup.check_valves)"
         )
-    if failure == NOT_HELD:
-        most = min(p.i_max, p.V_max / p.R_c)
+    if failure == BEYOND_DRIVE:
+        max_current = min(p.i_max, p.V_max / p.R_c)
         raise InputError(
             f"the drive must hold the load of {force:.4g} N at standstill, which takes {abs(y[CURRENT]):.4g} A, got at "
-            f"most {most:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
+            f"most {max_current:.4g} A (motor.i_max, motor.V_max); take a smaller load or pump"
         )
     return y
 
 
-def _at_valve(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Complete the state `y` at standstill at x [m] behind a servo valve, under `force` [N] against +x."""
+def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
+    """Fill the zero state `y` with the equilibrium at x [m] behind a servo valve, under `force` [N] against +x."""
     m = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:

@@ -1,4 +1,4 @@
-"""The state of the rig: its order, its names, and the tuple of numbers (or of lanes) that the laws take."""
+"""The state of the rig: names and order of its numbers, and the tuple of floats (or lanes) that the laws take."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP
     len(STATES)
 )
 
-#: A rig with lines has no servo valve: there the spool's places hold the oil [m^3] that passed the filters of A and B.
+#: In a rig with lines, which has no servo valve, the spool's places are the oil [m^3] that passed the filters A and B.
 PASSED_A, PASSED_B = SPOOL, SPOOL_SPEED
 
-#: What a run reports at each output instant: the states and the quantities that follow from them.
+#: Outputs of a run at each output instant: the states and the quantities that follow from them.
 OUTPUTS = (*STATES, "Q_1", "Q_A", "Q_B", "q_leak", "V", "q_ext", "q_up")
 
-#: A state or its rate as the laws take it, in the order of `STATES`; p_A, p_B, p_1, p_2 or their rates.
+#: A state or its rate of change in the order of `STATES`; and p_A, p_B, p_1, p_2 or their rates of change.
 State = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float, float]
 Pressures = tuple[float, float, float, float]
 
 
 @contracted
 def state_of(y: np.ndarray) -> State:
-    """Unpack the state (14,) into the tuple of numbers that the laws take."""
+    """Convert a state (14,) to the tuple of numbers that the laws take."""
     return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13]
 
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute y + h dy."""
+    """Compute the state y + h dy."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -51,6 +51,6 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Add h s to the pressures of a state."""
+    """Compute the state y with h s added to p_A, p_B, p_1, p_2; `s`: their rates [Pa/s]."""
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

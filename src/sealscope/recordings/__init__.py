@@ -1,4 +1,4 @@
-"""Recording, its files, and what is wrong with the data."""
+"""The Recording, its files, and findings on the quality of its data."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Load what is heavy when it is first used."""
+    """Import a module with heavy dependencies when its name is first used."""
     from importlib import import_module
 
     if name in _HOMES:

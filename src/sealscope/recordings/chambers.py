@@ -8,10 +8,10 @@ CHAMBERS = ("p_A", "p_B")
 #: The pump's ports and the chambers, in the order of the instruments.
 PRESSURES = ("p_1", "p_2", *CHAMBERS)
 
-#: Units in which pressures are shown.
-SHOWN_UNITS = ("bar", "MPa", "kPa", "psi")
+#: Units in which pressures are displayed.
+DISPLAY_UNITS = ("bar", "MPa", "kPa", "psi")
 
 
 def chambers_of(recording: Container[str]) -> tuple[str, ...]:
-    """Return the names of the chamber pressures that a recording has."""
+    """List the chamber pressures that a recording has."""
     return tuple(name for name in CHAMBERS if name in recording)

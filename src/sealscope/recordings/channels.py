@@ -27,9 +27,9 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
         "T_oil": "K",
     }
 )
-#: What tells the flow to the cylinder, best first: the pump's angle, its speed, a flow meter, the command.
+#: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meter, command.
 FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
-#: Channels that change over minutes: that such a channel is constant, or missing in most rows, is no defect.
+#: Channels that change over minutes: constant or mostly missing values are no defect there.
 SLOW = frozenset({"T_oil"})
 #: What each channel, and the time, measures.
 LONG_NAMES: Mapping[str, str] = MappingProxyType(
@@ -49,13 +49,13 @@ LONG_NAMES: Mapping[str, str] = MappingProxyType(
         "T_oil": "oil temperature",
     }
 )
-#: Unit of a mapped channel that came without one: raw counts of a converter.
+#: Unit of a channel whose column states none: raw counts of a converter.
 COUNTS = "count"
 
-#: Beginning of the line of a history that names the columns of a file that are no channels.
+#: Beginning of the history line that lists the unused columns of a file.
 UNUSED = "columns not used"
 
 
 def flow_source(channels: Container[str]) -> str | None:
-    """Return the channel that tells the flow to the cylinder, None where none does."""
+    """Choose the best available channel for the flow to the cylinder; None if there is none."""
     return next((name for name in FLOW_SOURCES if name in channels), None)

@@ -1,76 +1,91 @@
-"""The cycle of a duty: how long until the command, or the pressure difference, repeats."""
+"""The cycle of a duty: the period after which the command, or the pressure difference, repeats."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
-from sealscope.recordings.motion import moves
-from sealscope.recordings.recording import Recording, remembered
-from sealscope.storage.toml_file import priors_of
+from sealscope.recordings.motion import is_moving
+from sealscope.recordings.priors import RECORDINGS
+from sealscope.recordings.recording import Recording, compute_once
 
-_CYCLE = priors_of("sealscope.recordings")["cycle"]
+_CYCLE = RECORDINGS.cycle
+#: Fewest repetitions of a cycle, its shortest period [s], and fewest samples from which it is estimated.
+_MIN_REPETITIONS, _MIN_PERIOD, _MIN_SAMPLES = 5, 0.2, 32
+#: Peaks of the autocorrelation this much below the highest are as high, to within noise.
+_EQUAL_PEAKS = 0.05
 
 
 def find_cycle(recording: Recording) -> float | None:
-    """Return the length of the duty's cycle [s], from the command or else from the pressures; None without a cycle.
+    """Find the period of the duty [s] from the command, or else from the pressures; None if nothing repeats.
 
-    Computed once for a recording and what `Recording.only` makes of it. The command is used where it moves, else the
-    pressure difference, else the only chamber pressure.
+    The command is used if it moves, else the pressure difference, else the only chamber pressure. The result is
+    computed once for a recording and its `Recording.only` views.
     """
-    names = ("u",) if "u" in recording and moves(recording["u"]) else chambers_of(recording)
+    names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
-    def cycle(recording: Recording) -> float | None:
-        signals = [recording[name] for name in names]
-        return cycle_of(signals[0] - signals[1] if len(signals) == 2 else signals[0], recording.rate)
+    def compute(recording: Recording) -> float | None:
+        """Estimate the period of the duty's signal."""
+        return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
 
-    return remembered(recording, "cycle", cycle, names) if names else None
+    return compute_once(recording, "cycle", compute, names) if names else None
 
 
-def cycle_of(signal: Array, rate: float) -> float | None:
-    """Return the period [s] of a signal (n,) sampled at `rate` [Hz]; None when nothing repeats.
+def duty_signal(channels: Sequence[Array]) -> Array:
+    """Return the signal (n,) in which a duty repeats: the only channel, or the difference of both."""
+    return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
-    The first maximum of the autocorrelation after its first zero, at least 0.6 high, between 0.2 s and 20 s and
-    repeated five times or more; refined by a parabola.
+
+def estimate_period(signal: Array, rate: float) -> float | None:
+    """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
+
+    It is the lag of the first high maximum of the autocorrelation after its first zero crossing, refined by a parabola:
+    at least 0.6 high, between 0.2 s and 20 s, and a fifth of the signal at most.
     """
-    stride = max(1, int(rate / _CYCLE["rate"]))
+    stride = max(1, int(rate / _CYCLE.rate))
     n = signal.size // stride
-    if n < 32:
+    if n < _MIN_SAMPLES:
         return None
-    slow = signal[: n * stride].reshape(-1, stride).mean(axis=1)
-    slow = slow - slow.mean()
-    if not np.any(slow):
+    resampled = signal[: n * stride].reshape(-1, stride).mean(axis=1)
+    resampled = resampled - resampled.mean()
+    if not np.any(resampled):
         return None
-    spectrum = np.abs(np.fft.rfft(slow, 2 * n)) ** 2
-    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)
+    spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2
+    correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # each lag has another number of products
     correlation = correlation / correlation[0]
-    longest = min(n // 5, int(_CYCLE["longest"] * rate / stride))
-    below = np.flatnonzero(correlation[:longest] < 0)
-    if below.size == 0:
+    max_lag = min(n // _MIN_REPETITIONS, int(_CYCLE.longest * rate / stride))
+    negative = np.flatnonzero(correlation[:max_lag] < 0)
+    if negative.size == 0:
         return None
-    first = int(below[0])
-    inner = correlation[first + 1 : longest - 1]
-    peaks = np.flatnonzero((inner >= correlation[first : longest - 2]) & (inner > correlation[first + 2 : longest]))
-    peaks = peaks[inner[peaks] >= _CYCLE["correlation"]]
+    first = int(negative[0])  # peaks are searched for after the first negative value
+    later = correlation[first + 1 : max_lag - 1]
+    peaks = np.flatnonzero((later >= correlation[first : max_lag - 2]) & (later > correlation[first + 2 : max_lag]))
+    peaks = peaks[later[peaks] >= _CYCLE.correlation]
     if peaks.size == 0:
         return None
-    best = peaks[inner[peaks] >= inner[peaks].max() - 0.05][0]
-    k = int(first + 1 + best)
-    a, b, c = correlation[k - 1 : k + 2]
-    lag = (k + 0.5 * (a - c) / (a - 2 * b + c)) * stride / rate
-    return float(lag) if lag >= 0.2 else None
+    # the first of the nearly highest peaks: later ones are at multiples of the period
+    first_high = peaks[later[peaks] >= later[peaks].max() - _EQUAL_PEAKS][0]
+    k = int(first + 1 + first_high)
+    before, peak, after = correlation[k - 1 : k + 2]  # the vertex of the parabola through them
+    lag = (k + 0.5 * (before - after) / (before - 2 * peak + after)) * stride / rate
+    return float(lag) if lag >= _MIN_PERIOD else None
 
 
-def fundamental(signal: Array, t: Array, cycle: float) -> float:
-    """Return the fundamental frequency [Hz] of a signal (n,) at even instants `t` (n,) [s]: the slope of its phase.
+def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
+    """Estimate the fundamental frequency [Hz] of a signal (n,) at even times `t` (n,) [s] from the slope of its phase.
 
-    `cycle` [s]: about how long its cycle is (`cycle_of`), of which there must be two or more.
+    `period`: approximate period [s] (`estimate_period`); the signal has two periods or more.
     """
-    size = max(1, round(cycle / (t[1] - t[0])))
-    count = t.size // size
-    turned = (signal - signal.mean()) * np.exp(-2j * np.pi * t / cycle)
-    phasors = turned[: count * size].reshape(count, size).mean(axis=1)
+    n_period = max(1, round(period / (t[1] - t[0])))
+    n_periods = t.size // n_period
+    demodulated = (signal - signal.mean()) * np.exp(-2j * np.pi * t / period)
+    # one phasor a period: its phase drifts with the difference from 1 / period
+    phasors = demodulated[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1)
     phase = np.unwrap(np.angle(phasors))
-    slope = np.polyfit(t[: count * size].reshape(count, size).mean(axis=1), phase, 1, w=np.abs(phasors))[0]
-    return 1.0 / cycle + float(slope) / (2.0 * np.pi)
+    slope = np.polyfit(
+        t[: n_periods * n_period].reshape(n_periods, n_period).mean(axis=1), phase, 1, w=np.abs(phasors)
+    )[0]
+    return 1.0 / period + float(slope) / (2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""Reading and writing recordings: a file to read has the format of its content, a file to write that of its suffix."""
+"""Read and write recordings: the content decides the format of a file to read, the suffix that of a file to write."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ from typing import Any
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.apart import file_apart
-from sealscope.recordings.archives import is_workbook, unpacked
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, Wanted
+from sealscope.recordings.formats.columns import ChannelMap, Request
 from sealscope.recordings.formats.matlab import is_matlab_4
+from sealscope.recordings.formats.structured.archives import is_workbook, unpack
 from sealscope.recordings.formats.structured.json_log import is_json
 from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
-from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
-from sealscope.recordings.recording import Recording, recording_of
+from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
+from sealscope.recordings.recording import Recording, make_recording
+from sealscope.recordings.subprocesses import run_on_file
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.opening import open_regular, whole
-from sealscope.storage.unpacking import most_unpacked
+from sealscope.storage.opening import open_regular, raising_unreadable
+from sealscope.storage.unpacking import max_unpacked_size
 
-#: `formats.toml`: the formats that are read, and what is known by its first bytes or its suffix and not read.
+#: `formats.toml`: formats that are read, and formats that are recognised by first bytes or suffix but not read.
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
 _BEGINS = {kind: re.compile(entry["begins"].encode()) for kind, entry in _FORMATS.items() if "begins" in entry}
 _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
-#: Suffix -> format of any file, and of a file to write.
+#: Suffix -> format, of all files and of files to write.
 _SUFFIXES = {suffix: kind for kind, entry in _FORMATS.items() for suffix in entry["suffixes"]}
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
-#: Formats that are read in the program itself; the others' libraries end it, or fill its memory, on some files.
-_TEXTS = ("text", "lvm")
-#: Longest time that such a file may take [s], and what is added for its size [bytes/s]; most memory [bytes], and so
-#: many times its size.
-_LONGEST, _SLOWEST, _SLOWEST_SHEETS = 10.0, 20e6, 5e5
-_MEMORY, _MEMORY_SHARE = 2**31, 64
-#: Archives within archives that are unpacked.
-_DEEPEST_ARCHIVE = 3
+#: Formats read in this process; damaged files of the others can crash their libraries or fill the memory.
+_SAFE_FORMATS = ("text", "lvm")
+#: Limits for a file of these: time _BASE_TIME [s] + size / _MIN_SPEED [bytes/s], memory _BASE_MEMORY [bytes] +
+#: _MEMORY_RATIO * size.
+_BASE_TIME, _MIN_SPEED, _MIN_SPEED_SHEETS = 10.0, 20e6, 5e5
+_BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
+#: Deepest nesting of archives that is unpacked.
+_MAX_NESTING = 3
 
 
-def _format_of(path: Path) -> str:
-    """Return the format of a file, or kind of archive, by its content; raise UnreadableFile where none is read."""
+def _detect_format(path: Path) -> str:
+    """Detect the format of a file, or its kind of archive, from its content; raise UnreadableFile if it is not read."""
     try:
         with open_regular(path, "a recording") as file:
             head = file.read(SNIFF)
@@ -62,37 +62,33 @@ def _format_of(path: Path) -> str:
         raise UnreadableFile(f"a recording must be readable, got: {reason} ({path})") from error
     if archive := next((kind for kind, begins in _ARCHIVES.items() if begins.match(head)), None):
         return "spreadsheet" if archive == "zip" and is_workbook(path) else archive
-    if known := next((kind for kind, begins in _BEGINS.items() if begins.match(head)), None):
-        return known
-    if any(_BEGINS["netcdf"].match(head, offset) for offset in (512, 1024, 2048, 4096)):  # after a block of the user's
+    if format_name := next((kind for kind, begins in _BEGINS.items() if begins.match(head)), None):
+        return format_name
+    if any(_BEGINS["netcdf"].match(head, offset) for offset in (512, 1024, 2048, 4096)):  # after a user block of HDF5
         return "netcdf"
     foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
     if foreign is None and is_matlab_4(head):
         return "matlab"
-    if foreign is None and encoding_of(head) is None:
+    if foreign is None and detect_encoding(head) is None:
         foreign = _PROPRIETARY.get(path.suffix.lower())
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
     return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
 
 
-def _member(kind: str, verb: str) -> Callable[..., Any]:
-    """Return ``read_KIND`` or ``write_KIND`` of the format's module; its library is loaded now."""
+def _format_function(kind: str, verb: str) -> Callable[..., Any]:
+    """Return the function ``read_KIND`` or ``write_KIND`` of a format; this imports its library."""
     module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind]['module']}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
-def _read_here(file: Path, kind: str, request: Wanted) -> RecordingFields:
-    return _member(kind, "read")(file, request)  # type: ignore[no-any-return]
+def _read_by_format(file: Path, kind: str, request: Request) -> RecordingFields:
+    """Read a file by the reader of its format."""
+    return _format_function(kind, "read")(file, request)  # type: ignore[no-any-return]
 
 
 @checked_call
-def read(
-    path: str | os.PathLike[str],
-    *,
-    map: ChannelMap | None = None,
-    rate: float | None = None,
-) -> Recording:
+def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: float | None = None) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
     Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm, JSON (lines,
@@ -107,9 +103,8 @@ def read(
         Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``, or number,
         as in ``{"p_A": "#2"}``, or a constant plus columns times factors and the unit, as in
         ``{"p_A": "ch2*0.0625-0.625 bar"}``. A unit at the end of the column's name is read, as in ``p_bottom_bar``; a
-        column without any is raw counts. ``"auto"``: what the columns' names and units
-        tell, in several languages; the history says what was taken. ``{"*": "auto", ...}``: so for the channels that
-        the mapping does not name.
+        column without one is raw counts. ``"auto"`` chooses by the columns' names and units, in several languages;
+        the history lists the choice. ``{"*": "auto", ...}`` does so for the channels that the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
 
@@ -139,29 +134,25 @@ def read(
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    request = Wanted(map or {}, rate, file.name)
-    with _inner(file) as (inner, kind):
-        return _read(inner, kind, request)
+    request = Request(map or {}, rate, file.name)
+    with _unpacked_file(file) as (inner, kind):
+        return _read_unpacked(inner, kind, request)
 
 
 @checked_call
 def read_parts(
-    path: str | os.PathLike[str],
-    every: float,
-    *,
-    map: ChannelMap | None = None,
-    rate: float | None = None,
+    path: str | os.PathLike[str], every: float, *, map: ChannelMap | None = None, rate: float | None = None
 ) -> Iterator[Recording]:
     r"""Read a long recording part by part.
 
-    A text log is read in bounded memory, whatever its size; other formats are read whole and cut.
+    A text log of any size is read in bounded memory; other formats are read as a whole and then cut.
 
     Parameters
     ----------
     path : str or path
         The file, as for `read`.
     every : float
-        Length of a part [s], by the sampling rate of the file's beginning; the last may be shorter. Gaps do not count.
+        Length of a part [s] at the sampling rate of the file's beginning; gaps do not count. The last may be shorter.
     map : mapping of str to str or "auto", optional
         As for `read`.
     rate : float, optional
@@ -170,7 +161,7 @@ def read_parts(
     Yields
     ------
     Recording
-        The next part. Its start is its own where the file has stamps; other times go on from part to part.
+        The next part. If the file has time stamps it has its own start; other times continue from part to part.
 
     Raises
     ------
@@ -189,38 +180,39 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    request = Wanted(map or {}, rate, file.name)
+    request = Request(map or {}, rate, file.name)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
-    return _parts(file, every, request)
+    return _iter_parts(file, every, request)
 
 
-def _parts(file: Path, every: float, request: Wanted) -> Iterator[Recording]:
-    with _inner(file) as (inner, kind):
+def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recording]:
+    """Yield the parts of `read_parts`; formats other than text are read as a whole and cut."""
+    with _unpacked_file(file) as (inner, kind):
         if kind != "text":
-            whole_file = _read(inner, kind, request)
-            size = max(1, round(every * whole_file.rate))
-            for first in range(0, len(whole_file), size):
-                yield whole_file.samples(slice(first, first + size))
+            recording = _read_unpacked(inner, kind, request)
+            n_samples = max(1, round(every * recording.rate))
+            for first in range(0, len(recording), n_samples):
+                yield recording.samples(slice(first, first + n_samples))
             return
-        with whole("a text file", inner):
+        with raising_unreadable("a text file", inner):
             for fields in read_text_parts(inner, request, every):
-                yield recording_of(fields)
+                yield make_recording(fields)
 
 
 @contextmanager
-def _inner(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file, or what is packed in it, and its format; what is wrong with either is an UnreadableFile."""
+def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the file, or the file packed in it, and its format; errors in a packed file name the archive, too."""
     with ExitStack() as folders:
-        inner, kind = file, _format_of(file)
-        most = most_unpacked(file) if kind in _ARCHIVES else 0
+        inner, kind = file, _detect_format(file)
+        max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0
         try:
-            for _ in range(_DEEPEST_ARCHIVE):  # a .tar.gz is an archive in an archive
+            for _ in range(_MAX_NESTING):  # a .tar.gz is an archive in an archive
                 if kind in _ARCHIVES:
-                    inner = folders.enter_context(unpacked(inner, kind, most))
-                    kind = _format_of(inner)
+                    inner = folders.enter_context(unpack(inner, kind, max_bytes))
+                    kind = _detect_format(inner)
             if kind in _ARCHIVES:
-                raise UnreadableFile(f"at most {_DEEPEST_ARCHIVE} archives may lie in each other, got more ({inner})")
+                raise UnreadableFile(f"at most {_MAX_NESTING} archives may lie in each other, got more ({inner})")
             yield inner, kind
         except UnreadableFile as error:
             if inner == file:
@@ -228,28 +220,27 @@ def _inner(file: Path) -> Iterator[tuple[Path, str]]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read(file: Path, kind: str, request: Wanted) -> Recording:
-    """Read a file that is no archive: by a process of its own where the format is none of text."""
-    with whole(f"{_FORMATS[kind]['words']} file", file):
-        if kind in _TEXTS:
-            fields = _read_here(file, kind, request)
+def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
+    """Read a file that is no archive, in a subprocess unless its format is text."""
+    with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
+        if kind in _SAFE_FORMATS:
+            fields = _read_by_format(file, kind, request)
         else:
             size = file.stat().st_size
-            limit = _LONGEST + size / (_SLOWEST_SHEETS if kind in ("spreadsheet", "json") else _SLOWEST)
-            memory = _MEMORY + _MEMORY_SHARE * size
-            fields = file_apart(_read_here, file, kind, request, limit=limit, memory=memory, disk=most_unpacked(file))
+            limit = _BASE_TIME + size / (_MIN_SPEED_SHEETS if kind in ("spreadsheet", "json") else _MIN_SPEED)
+            memory = _BASE_MEMORY + _MEMORY_RATIO * size
+            fields = run_on_file(
+                _read_by_format, file, kind, request, limit=limit, memory=memory, disk=max_unpacked_size(file)
+            )
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
-        return recording_of(fields)
+        return make_recording(fields)
 
 
-def check_target(path: str | os.PathLike[str]) -> str:
-    """Return the format of a file to write by its suffix; raise InputError for another."""
-    file = Path(path)
-    kind = SUFFIXES.get(file.suffix.lower())
-    if kind is None:
+def check_target(file: Path) -> None:
+    """Raise InputError unless the suffix of a file to write is that of a format."""
+    if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
-    return kind
 
 
 @checked_call
@@ -261,14 +252,14 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     recording : Recording
         At least one sample of one channel, in SI units or raw counts.
     path : str or path
-        The file to write, whole or not at all. Its suffix tells the format: .nc .nc4 .h5 .hdf5 .csv .tsv .txt .parquet
+        The file to write, atomically. Its suffix gives the format: .nc .nc4 .h5 .hdf5 .csv .tsv .txt .parquet
         .pq.
 
     Raises
     ------
     InputError
-        If the suffix is another, the folder does not exist or cannot be written, or the recording could not be read
-        back as it is.
+        If the suffix is unknown, the folder does not exist or cannot be written, or the recording would not read back
+        unchanged.
     MissingExtra
         If the format is Parquet and pyarrow is not installed.
 
@@ -280,7 +271,8 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     [300000.0, 310000.0]
     """
     file = Path(path)
-    kind = check_target(file)
+    check_target(file)
+    kind = SUFFIXES[file.suffix.lower()]
     if len(recording) == 0 or not recording.channels:
         raise InputError("a recording to write must hold at least one sample of one channel")
     for name, unit in recording.units.items():
@@ -291,4 +283,4 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     delimiter = {"delimiter": "," if file.suffix.lower() == ".csv" else "\t"} if kind == "text" else {}
     values, units, description = recording.series()
     with atomic_write(file) as temporary:
-        _member(kind, "write")(temporary, values, units, description, **delimiter)
+        _format_function(kind, "write")(temporary, values, units, description, **delimiter)

@@ -1,4 +1,4 @@
-"""pandas data frames and xarray data sets, with the names, units and description that the files have."""
+"""Convert to and from pandas data frames and xarray data sets, with the names and attributes of the files."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import LONG_NAMES, Array
-from sealscope.recordings.formats.columns import Wanted
+from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import entries, stated_rate
-from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.netcdf import attributes
-from sealscope.recordings.formats.table import FORMAT_VERSION, RecordingFields, Series, parse_description, table_of
+from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.libraries import import_library
+from sealscope.recordings.formats.netcdf import make_attributes
+from sealscope.recordings.formats.table import FORMAT_VERSION, RecordingFields, Series, build_fields, parse_description
 
 if TYPE_CHECKING:
     import pandas
@@ -26,18 +26,18 @@ if TYPE_CHECKING:
 def to_pandas(
     values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> pandas.DataFrame:
-    """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`; the description is in its `attrs`."""
-    pandas = library("pandas", "a data frame", "pandas")
+    """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`; its `attrs` hold the description."""
+    pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
     frame = pandas.DataFrame(columns, index=pandas.Index(values["t"].copy(), name="t [s]"))
-    kept = {key: description[key] for key in ("rate", "provenance", "history")}
-    frame.attrs = {"units": {f"{name} [{unit}]": unit for name, unit in units.items()}, **kept}
+    metadata = {key: description[key] for key in ("rate", "provenance", "history")}
+    frame.attrs = {"units": {f"{name} [{unit}]": unit for name, unit in units.items()}, **metadata}
     return frame  # type: ignore[no-any-return]
 
 
-def read_pandas(frame: pandas.DataFrame, request: Wanted) -> RecordingFields:
-    """Read the wanted columns of a data frame; an index other than row numbers is a column, too."""
-    pandas = library("pandas", "a data frame", "pandas")
+def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
+    """Read the requested columns of a data frame; a named or non-integer index is a column, too."""
+    pandas = import_library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
     columns = [(str(name), frame.iloc[:, i]) for i, name in enumerate(frame.columns)]
@@ -51,36 +51,39 @@ def read_pandas(frame: pandas.DataFrame, request: Wanted) -> RecordingFields:
         unit = units.get(name, column.attrs.get("units"))
         elapsed = "s" if pandas.api.types.is_timedelta64_dtype(column.dtype) else None
         label = Label.parse(name, unit if isinstance(unit, str) else elapsed)
-        series.append(Series("", label, len(frame), partial(_values, pandas.api.types, column, name)))
+        series.append(Series("", label, len(frame), partial(_convert_column, pandas.api.types, column, name)))
     try:
         description = parse_description({"format": FORMAT_VERSION, **frame.attrs})
-    except InputError:  # it is not of our making
+    except InputError:  # not written by `to_pandas`
         description = None
-    remarks = entries((name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float))
-    return table_of(series, request, "pandas", remarks, stated_rate(remarks), description=description)
+    remarks = collect_remarks(
+        (name, value) for name, value in frame.attrs.items() if isinstance(value, str | int | float)
+    )
+    return build_fields(series, request, "pandas", remarks, stated_rate(remarks), description=description)
 
 
-def _values(types: Any, series: Any, name: str) -> NDArray[Any]:
-    if types.is_datetime64_any_dtype(series.dtype):
+def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
+    """Convert a column to datetime64, timedelta64, doubles or texts; raise InputError for other types."""
+    if dtypes.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
         return np.asarray(series.to_numpy().astype("datetime64[ns]"))
-    if types.is_timedelta64_dtype(series.dtype):
+    if dtypes.is_timedelta64_dtype(series.dtype):
         return np.asarray(series.to_numpy())
-    if types.is_numeric_dtype(series.dtype) and not types.is_complex_dtype(series.dtype):
+    if dtypes.is_numeric_dtype(series.dtype) and not dtypes.is_complex_dtype(series.dtype):
         return np.asarray(series.to_numpy(dtype=np.float64, na_value=np.nan))
-    if types.is_string_dtype(series.dtype) or types.is_object_dtype(series.dtype):
+    if dtypes.is_string_dtype(series.dtype) or dtypes.is_object_dtype(series.dtype):
         cells = ["" if missing else str(cell) for cell, missing in zip(series, series.isna(), strict=True)]
         return np.array(cells, dtype=object)
     raise InputError(f"{name} must hold numbers, got the type {series.dtype}")
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set over the coordinate `t`, with `units` and `long_name` of each variable as the NetCDF files."""
-    xarray = library("xarray", "a data set", "xarray")
+    """Make a data set over the coordinate `t`; its variables have `units` and `long_name` as in the NetCDF files."""
+    xarray = import_library("xarray", "a data set", "xarray")
     variables = {
         name: ("t", series.copy(), {"units": units[name], "long_name": LONG_NAMES.get(name, name)})
         for name, series in values.items()
     }
     time = {"t": variables.pop("t")}
-    return xarray.Dataset(variables, coords=time, attrs=attributes(description))
+    return xarray.Dataset(variables, coords=time, attrs=make_attributes(description))

@@ -1,4 +1,4 @@
-"""When recordings were made, and those of one run, as loggers cut them into files, joined in that order."""
+"""Start times of recordings, and joining the files into which a logger cut one run."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
-from sealscope.recordings.formats.timebase import seconds_of
+from sealscope.recordings.formats.timebase import parse_epoch
 from sealscope.recordings.recording import Recording
 
-#: Files of the same start [s] have a clock that goes on from file to file.
+#: Starts that differ by less [s] are equal: the times then continue from file to file.
 _SAME_START = 1e-6
 _YEAR_FIRST = re.compile(
     r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
     r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"
 )
-#: Twelve hours, which loggers write with the month first.
+#: Stamps on a 12-hour clock, which loggers write with the month first.
 _TWELVE_HOURS = re.compile(
     r"(?<!\d)(?P<month>\d{1,2})[-_.](?P<day>\d{1,2})[-_.](?P<year>(?:19|20)\d\d)[-_ .]"
     r"(?P<hour>\d{1,2})[-_.:](?P<minute>[0-5]\d)[-_.:](?P<second>[0-5]\d)[-_ ]?(?P<half>[AP])M",
@@ -30,20 +30,20 @@ _TWELVE_HOURS = re.compile(
 
 
 def start_seconds(recording: Recording, file: str = "") -> float | None:
-    """Return when the recording's first sample was taken [s since 1970], None where it is not known.
+    """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    By its provenance, else by the name of its file; of one with a date and no time of day: the beginning of the day.
+    Taken from the provenance, else from the file's name; a date without a time of day stands for midnight.
     """
-    start = seconds_of(str(recording.provenance.get("start", "")))
+    start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
-        start = _stamp_in_name(str(recording.provenance.get("file") or file))
+        start = _parse_file_name(str(recording.provenance.get("file") or file))
     return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Return when the first sample of a file's recording was taken [s since 1970], by the one clock of all commands.
+    """Return the time of the first sample of a file's recording [s since 1970], for all commands by the same rule.
 
-    By the time in the file, else in its name, else that of its last change, when the last sample was taken.
+    Taken from the file, else from its name, else from its modification time, taken as the time of the last sample.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -52,7 +52,8 @@ def file_seconds(recording: Recording, path: Path) -> float:
     return path.stat().st_mtime - (float(times[-1] - times[0]) if times.size else 0.0)
 
 
-def _stamp_in_name(name: str) -> float | None:
+def _parse_file_name(name: str) -> float | None:
+    """Parse the date and time in a file's name [s since 1970]; None if there is none."""
     match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None
@@ -60,36 +61,50 @@ def _stamp_in_name(name: str) -> float | None:
     hour = int(fields["hour"] or 0)
     if fields.get("half"):
         hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
-    return seconds_of(
+    return parse_epoch(
         f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
         f"T{hour:02d}:{fields['minute'] or '00'}:{fields['second'] or '00'}"
     )
 
 
-def _start(recording: Recording) -> float | None:
-    """Return the moment t = 0 in seconds of some clock of the day; None where it is not known."""
+def _time_zero(recording: Recording) -> float | None:
+    """Return the time of t = 0 [s] on the clock of the provenance; None if it is not known."""
     epoch = recording.provenance.get("start_epoch_s")
-    return seconds_of(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
+    return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
+
+
+def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> None:
+    """Check that recordings have samples and the same channels, units and rate; raise InputError otherwise."""
+    first = recordings[0]
+    for name, recording in zip(names, recordings, strict=True):
+        if len(recording) == 0:
+            raise InputError(f"a recording to join must have samples, got none ({name})")
+        if dict(recording.units) != dict(first.units):
+            both = f"{', '.join(first.units)} and {', '.join(recording.units)}"
+            raise InputError(f"recordings to join must have the same channels and units, got {both} ({name})")
+        if recording.rate != first.rate:
+            both = f"{first.rate:g} and {recording.rate:g} Hz"
+            raise InputError(f"recordings to join must have the same rate, got {both} ({name})")
 
 
 @checked_call
 def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None) -> Recording:
-    """Join recordings of one run to one.
+    """Join recordings of one run to a single recording.
 
-    The clocks must fit: each recording begins after the one before has ended, by the moments of their files or, where
-    none is known, by times that go on. What was not recorded in between stays a gap of the time, which `inspect` names.
+    Each recording must begin after the previous one has ended, according to the start times of the files or, if these
+    are not known, to times that continue. Time that was not recorded in between stays a gap, which `inspect` reports.
 
     Parameters
     ----------
     recordings : sequence of Recording
         Two or more, in any order, with the same channels, units and sampling rate.
     names : sequence of str, optional
-        What messages and the history call them; by default the files of their provenance.
+        Names for messages and the history; by default the files of their provenance.
 
     Returns
     -------
     Recording
-        Its time begins with that of the first; its provenance is that of the first, with the names of all files.
+        Time and provenance are those of the first, with the names of all files.
 
     Raises
     ------
@@ -107,32 +122,23 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     """
     if len(recordings) < 2:
         raise InputError(f"recordings to join must be two or more, got {len(recordings)}")
-    first = recordings[0]
     names = names or [
         str(recording.provenance.get("file", f"recording {k}")) for k, recording in enumerate(recordings, 1)
     ]
-    for name, other in zip(names, recordings, strict=True):
-        if len(other) == 0:
-            raise InputError(f"a recording to join must have samples, got none ({name})")
-        if dict(other.units) != dict(first.units):
-            both = f"{', '.join(first.units)} and {', '.join(other.units)}"
-            raise InputError(f"recordings to join must have the same channels and units, got {both} ({name})")
-        if other.rate != first.rate:
-            both = f"{first.rate:g} and {other.rate:g} Hz"
-            raise InputError(f"recordings to join must have the same rate, got {both} ({name})")
-    starts = [_start(recording) for recording in recordings]
-    known = [start for start in starts if start is not None]
-    dated = len(known) == len(starts) and max(known) - min(known) > _SAME_START
-    offsets = [start - min(known) for start in known] if dated else [0.0] * len(recordings)
+    _check_compatible(recordings, names)
+    starts = [_time_zero(recording) for recording in recordings]
+    known_starts = [start for start in starts if start is not None]
+    is_dated = len(known_starts) == len(starts) and max(known_starts) - min(known_starts) > _SAME_START
+    offsets = [start - min(known_starts) for start in known_starts] if is_dated else [0.0] * len(recordings)
     times = [recording.t + offset for recording, offset in zip(recordings, offsets, strict=True)]
     order = sorted(range(len(recordings)), key=lambda number: float(np.nanmin(times[number])))
-    for before, after in pairwise(order):
-        begin, end = float(np.nanmin(times[after])), float(np.nanmax(times[before]))
+    for earlier, later in pairwise(order):
+        begin, end = float(np.nanmin(times[later])), float(np.nanmax(times[earlier]))
         if begin <= end:
-            clocks = "the moments of the files" if dated else "their times, as no moment of the files is known"
+            clocks = "the moments of the files" if is_dated else "their times, as no moment of the files is known"
             raise InputError(
                 f"the clocks of recordings to join must go on from file to file, got {end:g} s at the end of "
-                f"{names[before]} and {begin:g} s at the beginning of {names[after]}, by {clocks}"
+                f"{names[earlier]} and {begin:g} s at the beginning of {names[later]}, by {clocks}"
             )
     parts = [recordings[number] for number in order]
     files = [names[number] for number in order]

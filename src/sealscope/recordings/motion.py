@@ -1,7 +1,7 @@
-"""Whether a reading moves: constant channels, held values and changes that are mere rounding.
+"""Tests whether a reading moves: constant channels, held values, and changes that are only rounding.
 
-The noise of a transducer never stops. A value that stays the same to the last digit for longer than the noise allows
-is a rail, a held value or a dead channel.
+The noise of a transducer never stops. A value that stays identical for longer than the noise allows is a rail, a held
+value or a dead channel.
 """
 
 from __future__ import annotations
@@ -14,117 +14,128 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import priors_of
 
-#: A change of at most this share of a reading's largest value is rounding of the arithmetic: the reading does not move.
+#: Changes up to this fraction of a reading's largest value are rounding errors: the reading does not move.
 ROUNDING = 1e-9
-_HOLD = priors_of("sealscope.recordings")["hold"]
-_SHORTEST_STUCK = 5
-_NEIGHBOURHOOD = 100
-_STUCK_CHANCE = 1e-6
-_LEVELS = 2**15
+_HOLD = RECORDINGS.hold
+#: Shortest run of equal values that can be stuck [samples], samples compared with on either side, and the expected
+#: number of such runs in a channel below which one is stuck.
+_MIN_STUCK, _NEIGHBOURHOOD, _MAX_EXPECTED = 5, 100, 1e-6
+#: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
+_MIN_JUMP = 3.5
+#: Most samples from which the quantisation step is estimated.
+_QUANTUM_SAMPLES = 2**15
 
 
-def constant(values: Array) -> bool:
-    """Test whether all samples (n,) have one value; NaN equals nothing."""
+def is_constant(values: Array) -> bool:
+    """Test whether all samples (n,) are equal; a NaN equals nothing."""
     return bool(np.ptp(values) == 0)
 
 
-def moves(values: Array) -> bool:
-    """Test whether a reading (n,) has no missing sample and at least two values."""
-    return values.size > 1 and bool(np.isfinite(values).all()) and not constant(values)
+def is_moving(values: Array) -> bool:
+    """Test whether a reading (n,) has no missing sample and at least two different values."""
+    return values.size > 1 and bool(np.isfinite(values).all()) and not is_constant(values)
 
 
 class Holds(NamedTuple):
-    """Which samples of a pressure are held, and from which sample on its end leaves that open."""
+    """The held samples of a pressure.
+
+    `flags` (n,): True for held samples; `pending`: index of the first sample that may yet become held.
+    """
 
     flags: NDArray[np.bool_]
-    open: int
+    pending: int
 
 
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
-    """Find the samples (n,) of a pressure that stay the same to the last digit for longer than its noise allows.
+    """Find the samples (n,) of a pressure that stay identical for longer than its noise allows.
 
-    That is longer than 1.5 s, and 64 samples; the first of them is a reading. `before`: value that was held up to the
-    first sample, NaN for none.
+    A run is a hold if it is longer than 1.5 s and 64 samples; its first sample is a reading and not flagged, unless it
+    continues a hold of the value `before` (NaN: none) that lasts up to the first sample. A short last run is pending.
     """
-    longest = max(round(_HOLD["seconds"] * rate), _HOLD["samples"])
-    ends = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
-    lengths = np.diff(ends)
-    held = lengths > longest
-    goes_on = bool(len(values)) and bool(values[0] == before)
-    held[0] |= goes_on
-    flags = np.repeat(held, lengths)
-    flags[ends[:-1][held][goes_on:]] = False
-    return Holds(flags, len(values) if held[-1] else min(int(ends[-2]) + 1, len(values)))
+    max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
+    edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
+    lengths = np.diff(edges)
+    is_hold = lengths > max_length
+    continues = bool(len(values)) and bool(values[0] == before)
+    is_hold[0] |= continues
+    flags = np.repeat(is_hold, lengths)
+    first_samples = edges[:-1][is_hold]
+    flags[first_samples[1:] if continues else first_samples] = False
+    return Holds(flags, len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values)))
 
 
-def does_not_move(recording: Recording) -> str | None:
-    """Describe a chamber pressure that stays constant in a recording without missing samples, and when; None for none.
+def describe_hold(recording: Recording) -> str | None:
+    """Describe a chamber pressure that stops moving in a recording without missing samples; None if there is none.
 
-    A pressure is constant where it is held (`find_holds`), or where it is a straight line to within `ROUNDING`
-    throughout. A recording too short to tell and a constant channel, which `inspect` reports, give None.
+    A pressure does not move while it is held (`find_holds`), or if it is a straight line to within `ROUNDING`.
+    Recordings too short to tell and constant channels, which `inspect` reports, are not described.
     """
     for name in chambers_of(recording):
         values = recording[name]
-        if len(values) <= _HOLD["samples"] or constant(values):
+        if len(values) <= _HOLD.samples or is_constant(values):
             continue
-        if len(holds := runs_of(find_holds(values, recording.rate).flags)):
-            first, length = holds[np.argmax(holds[:, 1])]
+        if len(holds := find_runs(find_holds(values, recording.rate).flags)):
+            first, length = holds[np.argmax(holds[:, 1])]  # the longest
             start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))
             return f"{name} does not move from {start:.4g} s to {stop:.4g} s"
         if np.abs(np.diff(values, 2)).max() <= ROUNDING * np.abs(values).max():
-            return f"{name} does not move but along a straight line"
+            return f"{name} does not move but along a straight line, as if its samples were interpolated"
     return None
 
 
-def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the first index and the length (k, 2) of each run of True."""
+def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Find the runs of True in `flags` (n,): first index and length of each (k, 2)."""
     edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))
     return np.column_stack([edges[::2], edges[1::2] - edges[::2]])
 
 
-def spacing(levels: Array) -> float:
-    """Return the finest step between the sorted values that a channel takes; rounding of a conversion is no step."""
-    steps = np.diff(levels)
-    steps = steps[steps > ROUNDING * (levels[-1] - levels[0])]
+def smallest_step(values: Array) -> float:
+    """Return the smallest difference of neighbours in sorted values that exceeds rounding; 0 if there is none."""
+    steps = np.diff(values)
+    steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0
 
 
-def quantum(values: Array) -> float:
-    """Estimate the finest step of a channel (n,) from at most `_LEVELS` of its samples."""
-    return spacing(np.unique(values[:: max(1, values.size // _LEVELS)]))
+def estimate_quantum(values: Array) -> float:
+    """Estimate the quantisation step of a channel (n,) from at most `_QUANTUM_SAMPLES` of its samples."""
+    return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
-def stuck(values: Array) -> NDArray[np.intp]:
-    """Return first index and length (k, 2) of the runs of equal values that the signal around them makes incredible.
+def find_stuck(values: Array) -> NDArray[np.intp]:
+    """Find runs of equal values too long for the signal around them: first index and length of each (k, 2).
 
-    With p the share of unchanged samples in the 100 samples on either side (the larger of both), a run of length m has
-    the chance p^(m-1) to begin at a given sample; it is stuck where fewer than 1e-6 such runs are expected in the whole
-    channel, and where the value jumps by more than three quantisation steps when it begins or ends: a slow quantised
+    With p the fraction of unchanged samples in the 100 samples on either side (the larger of both), a run of length m
+    has the chance p^(m-1) to begin at a given sample. It is stuck if fewer than 1e-6 such runs are expected in the
+    channel, and if the value jumps by more than three quantisation steps at its beginning or end: a slow quantised
     signal at a turning point does not move either, but leaves in single steps.
     """
-    nothing = np.empty((0, 2), dtype=np.intp)
+    no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
-        return nothing
-    same = np.diff(values) == 0
-    runs = runs_of(same)
-    runs = runs[runs[:, 1] >= _SHORTEST_STUCK - 1]
+        return no_runs
+    is_same = np.diff(values) == 0
+    runs = find_runs(is_same)  # one shorter than the runs of equal values
+    runs = runs[runs[:, 1] >= _MIN_STUCK - 1]
     first, last = runs[:, 0], runs.sum(axis=1)  # the samples first..last are equal
+    # runs near an end of the recording have too few neighbours
     inner = (first >= _NEIGHBOURHOOD // 5) & (last < values.size - 1 - _NEIGHBOURHOOD // 5)
     runs, first, last = runs[inner], first[inner], last[inner]
     if not runs.size:
-        return nothing
-    fine = spacing(np.unique(values))
-    unchanged = np.r_[0, np.cumsum(same)]
+        return no_runs
+    quantum = smallest_step(np.unique(values))
+    n_unchanged = np.r_[0, np.cumsum(is_same)]
 
-    def share(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        begin, end = np.maximum(begin, 0), np.minimum(end, same.size)
-        return np.asarray((unchanged[end] - unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
+    def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
+        """Compute the fraction of unchanged samples from `begin` to `end` (k,), one of each kind added."""
+        begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
+        return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 
-    likely = np.maximum(share(first - _NEIGHBOURHOOD, first), share(last, last + _NEIGHBOURHOOD))
-    expected = np.log(values.size) + (runs[:, 1]) * np.log(likely)
+    p_unchanged = np.maximum(
+        unchanged_fraction(first - _NEIGHBOURHOOD, first), unchanged_fraction(last, last + _NEIGHBOURHOOD)
+    )
+    log_expected = np.log(values.size) + runs[:, 1] * np.log(p_unchanged)
     jump = np.maximum(np.abs(values[first] - values[first - 1]), np.abs(values[last + 1] - values[last]))
-    chosen = (expected < np.log(_STUCK_CHANCE)) & (jump > 3.5 * fine)
-    return np.column_stack([first[chosen], runs[chosen, 1] + 1])
+    is_stuck = (log_expected < np.log(_MAX_EXPECTED)) & (jump > _MIN_JUMP * quantum)
+    return np.column_stack([first[is_stuck], runs[is_stuck, 1] + 1])

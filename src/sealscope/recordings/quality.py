@@ -1,13 +1,13 @@
-"""The quality of a recording: what is wrong with it is found and named, never repaired.
+"""The quality of a recording: defects are found and named, never repaired.
 
-Each test of a channel's values lets quantised, slow and constant signals pass.
+Quantised and slow signals pass each test of a channel's values.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -15,34 +15,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
+from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import COUNTS, SLOW, Array
-from sealscope.recordings.formats.columns import counted
-from sealscope.recordings.motion import constant, runs_of, spacing, stuck
+from sealscope.recordings.motion import find_runs, find_stuck, is_constant, smallest_step
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import priors_of
-from sealscope.units import from_si
 
 Severity = Literal["note", "warning", "fatal"]
 
-#: Samples that the level 4 detail of db8 looks at together: (16 - 1)(2^4 - 1) + 1.
+#: Fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1.
 SHORTEST = 226
-#: An interval over this many sampling steps is a gap, one under the inverse share of a step is crowded.
-_GAP = 1.5
-_CROWDED = 0.5
-_FEWEST_AT_RAIL = 5
-_LONG_RUN = 20
-_PRIORS = priors_of("sealscope.recordings")
-_CLOCK, _HUM, _CREEP = (_PRIORS[table] for table in ("clock", "hum", "creep"))
-_POSSIBLE = _PRIORS["possible"]
+#: Intervals between these numbers of sampling steps are regular; a longer one is a gap.
+_MIN_STEP, _MAX_STEP = 0.5, 1.5
+#: Parts of a recording whose mean pressures must creep by like steps, to within these factors of the median step.
+_CREEP_PARTS, _MIN_CREEP, _MAX_CREEP = 8, 0.5, 2.0
+#: Fewest samples at the value of a rail, and the run length [samples] from which a single step away from it suffices.
+_MIN_AT_RAIL, _LONG_RUN = 5, 20
+#: Smallest jump to or from a rail [quantisation steps], and that of a long run; how many times as many samples a rail
+#: has as any of the values next to it.
+_MIN_JUMP, _MIN_LONG_JUMP, _MIN_CROWD = 3.5, 1.5, 5
+#: Shortest channel that is searched for hum [s], so that a line is narrow.
+_MIN_HUM_TIME = 1.5
+_CLOCK, _HUM, _CREEP, _SENSOR_LIMITS = RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.possible
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong with a recording.
+    """One defect of a recording.
 
-    `code` names it; `severity` is ``fatal`` (the recording cannot be analysed as it is), ``warning`` (the time or the
-    channel needs a look before a verdict is believed) or ``note``; `channel` is None for the time; `count`: samples or
-    intervals concerned; `first_t`: where first [s]; `text`: a sentence.
+    `code` names it; `severity` is ``fatal`` (the recording cannot be analysed as it is), ``warning`` (check the time or
+    the channel before relying on a verdict) or ``note``; `channel` is None for the time; `count`: samples or intervals
+    concerned; `first_t`: time of the first [s]; `text`: a sentence.
     """
 
     code: str
@@ -55,7 +58,7 @@ class Finding:
 
 @checked_call
 def inspect(recording: Recording) -> tuple[Finding, ...]:
-    """Find what is wrong with the time base and the channels of a recording.
+    """Find the defects of a recording's time base and channels.
 
     Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
     ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
@@ -69,7 +72,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     Returns
     -------
     tuple of Finding
-        Those on the time first, then those on each channel; empty where nothing is wrong.
+        Findings on the time first, then on each channel; empty if there is no defect.
 
     Raises
     ------
@@ -95,180 +98,219 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def _moment(recording: Recording, index: int) -> float | None:
+def _sample_time(recording: Recording, index: int) -> float | None:
+    """Return the time of a sample [s]; None if it has none."""
     t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
+    """Find missing, reversed and repeated times, gaps, irregular intervals, a wrong rate and too few samples."""
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, where: NDArray[Any], text: str, severity: Severity = "warning") -> None:
+        """Add a finding on the intervals or samples `where`, unless there are none."""
         if where.size:
-            findings.append(Finding(code, severity, None, where.size, _moment(recording, int(where[0])), text))
+            findings.append(Finding(code, severity, None, where.size, _sample_time(recording, int(where[0])), text))
 
-    unknown, known = np.flatnonzero(~np.isfinite(t)), np.flatnonzero(np.isfinite(t))
-    steps = np.diff(t[known])
-    back, same, forward = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0), steps[steps > 0]
-    add("missing_time", unknown, f"{counted(unknown.size, 'sample')} without a time")
-    worst = float(-steps[back].min(initial=0.0))
-    add("reversed_time", known[back + 1], f"time goes back {_times(back.size)}, by up to {worst:g} s")
-    add("duplicated_time", known[same + 1], f"{counted(same.size, 'time stamp')} equal to the one before")
-    if forward.size:
-        typical = float(np.median(forward))
-        if abs(typical / step - 1.0) > _CLOCK["rate"] and not (same.size and typical < 2.5 * step):
-            text = f"time stamps tell {1.0 / typical:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
-            add("rate_mismatch", known[:1], text, "fatal")
-            step = typical
-        gaps = np.flatnonzero(steps > _GAP * step)
-        lost = np.round(steps[gaps] / step - 1.0).sum()
-        samples = counted(int(lost), "sample") if lost < 1e15 else f"{lost:.3g} samples"
+    timed, untimed = np.flatnonzero(np.isfinite(t)), np.flatnonzero(~np.isfinite(t))
+    steps = np.diff(t[timed])
+    reversed_steps, equal_steps = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0)
+    positive_steps = steps[steps > 0]
+    add("missing_time", untimed, f"{format_count(untimed.size, 'sample')} without a time")
+    longest = float(-steps[reversed_steps].min(initial=0.0))
+    text = f"time goes back {_format_repetitions(reversed_steps.size)}, by up to {longest:g} s"
+    add("reversed_time", timed[reversed_steps + 1], text)
+    add(
+        "duplicated_time",
+        timed[equal_steps + 1],
+        f"{format_count(equal_steps.size, 'time stamp')} equal to the one before",
+    )
+    if positive_steps.size:
+        median_step = float(np.median(positive_steps))
+        is_coarse = equal_steps.size and median_step < 2.5 * step  # stamps repeat, and then step by two samples
+        if abs(median_step / step - 1.0) > _CLOCK.rate and not is_coarse:
+            text = f"time stamps tell {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
+            add("rate_mismatch", timed[:1], text, "fatal")
+            step = median_step
+        gaps = np.flatnonzero(steps > _MAX_STEP * step)
+        n_lost = np.round(steps[gaps] / step - 1.0).sum()
+        samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
         longest = float(steps[gaps].max(initial=0.0))
-        add("gap", known[gaps], f"{counted(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
-        usual = forward[forward <= _GAP * step] / step
-        scatter = float(usual.std()) if usual.size else 0.0
-        if scatter > _CLOCK["scatter"]:
-            odd = np.flatnonzero(
-                (steps > 0) & (steps <= _GAP * step) & (np.abs(steps / step - 1.0) > _CLOCK["scatter"])
+        add("gap", timed[gaps], f"{format_count(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
+        regular_steps = positive_steps[positive_steps <= _MAX_STEP * step] / step
+        scatter = float(regular_steps.std()) if regular_steps.size else 0.0
+        if scatter > _CLOCK.scatter:
+            irregular = np.flatnonzero(
+                (steps > 0) & (steps <= _MAX_STEP * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
             )
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
-            add("irregular_sampling", known[odd], text)
+            add("irregular_sampling", timed[irregular], text)
     if len(recording) < SHORTEST:
-        text = f"{counted(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
+        text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
     return findings
 
 
-def _times(count: int) -> str:
+def _format_repetitions(count: int) -> str:
+    """Format a number of times: `once`, `2 times`."""
     return "once" if count == 1 else f"{count} times"
 
 
 def _creep_findings(recording: Recording) -> list[Finding]:
-    """Return the finding on chambers whose mean pressure creeps evenly all the while, as no sealed circuit's does."""
+    """Find a steady drift of the chambers' mean pressure through the whole recording, which no sealed circuit has."""
     duration = len(recording) / recording.rate
-    if duration < _CREEP["seconds"] or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
+    if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
         return []
     mean = 0.5 * (recording["p_A"] + recording["p_B"])
-    levels = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in np.array_split(mean, 8)])
-    steps = np.diff(levels)
-    rate = float(np.median(steps)) * 8.0 / duration
-    even = np.all((steps / np.median(steps) > 0.5) & (steps / np.median(steps) < 2.0))
-    if not (even and abs(rate) >= _CREEP["rate"]):
+    parts = np.array_split(mean, _CREEP_PARTS)
+    means = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
+    steps = np.diff(means)
+    creep_rate = float(np.median(steps)) * _CREEP_PARTS / duration
+    is_even = np.all((steps / np.median(steps) > _MIN_CREEP) & (steps / np.median(steps) < _MAX_CREEP))
+    if not (is_even and abs(creep_rate) >= _CREEP.rate):
         return []
     text = (
-        f"p_A, p_B: their mean creeps evenly by {rate / 1e3:+.2g} kPa/s: oil is fed or lost, or a simulator balanced "
-        "volumes in place of mass"
+        f"p_A, p_B: their mean creeps evenly by {creep_rate / 1e3:+.2g} kPa/s: oil is fed or lost, or a "
+        "simulator balanced volumes in place of mass"
     )
-    return [Finding("creeping_pressures", "note", None, len(recording), _moment(recording, 0), text)]
+    return [Finding("creeping_pressures", "note", None, len(recording), _sample_time(recording, 0), text)]
+
+
+@dataclass
+class _ChannelReport:
+    """The findings on one channel of a recording."""
+
+    recording: Recording
+    name: str
+    findings: list[Finding] = field(default_factory=list)
+
+    def add(self, code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
+        """Add a finding on `count` samples, the first at index `first`."""
+        first_t = _sample_time(self.recording, first)
+        self.findings.append(Finding(code, severity, self.name, count, first_t, f"{self.name}: {text}"))
+
+    def format_value(self, value: float, digits: int = 6, *, is_span: bool = False) -> str:
+        """Format a value, or a difference of values, in the unit of the log."""
+        return self.recording.format_value(self.name, value, digits, is_span=is_span)
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
-    findings, rate, unit = list[Finding](), recording.rate, recording.units[name]
-    pressure, steady = name.startswith("p_"), name in ("u", "q_leak", "q_comp")
-
-    def add(code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
-        findings.append(Finding(code, severity, name, count, _moment(recording, first), f"{name}: {text}"))
-
-    def in_log(value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        shown = recording.unit_in_log(name) or unit
-        if shown != unit:
-            value = from_si(value, shown, unit) - (from_si(0.0, shown, unit) if is_span else 0.0)
-        return f"{value:.{digits}g} {shown}"
-
-    if pressure and unit == COUNTS:
+    """Find the defects of a channel's values (n,)."""
+    report, unit = _ChannelReport(recording, name), recording.units[name]
+    is_pressure, may_rest = name.startswith("p_"), name in ("u", "q_leak", "q_comp")
+    if is_pressure and unit == COUNTS:
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
-        add("raw_counts", values.size, 0, text, "note")
-    absent = np.isnan(values)
-    if absent.any():
-        runs = runs_of(absent)
-        samples, first = int(np.count_nonzero(absent)), int(runs[0, 0])
-        every = _every(np.flatnonzero(~absent))
-        if every:
-            text = f"has a value on every {_ordinal(every)} row only ({rate / every:g} Hz among {rate:g} Hz)"
-            add("mixed_rate", samples, first, text)
-        elif samples == values.size:
-            add("missing", samples, 0, "has no values at all")
-        else:
-            missed = f"{counted(samples, 'sample')} missing in {counted(len(runs), 'stretch')}"
-            add("missing", samples, first, f"{missed}, the longest {runs[:, 1].max() / rate:g} s")
-    extreme = np.flatnonzero(np.isinf(values))
-    if extreme.size:
-        add("infinite", extreme.size, int(extreme[0]), f"{counted(extreme.size, 'infinite sample')}")
-    impossible = flag_impossible(values, unit)
-    wild = np.flatnonzero(impossible)
-    if wild.size:
-        text = f"{counted(wild.size, 'sample')} beyond what any sensor reads, first {in_log(values[wild[0]])}"
-        add("impossible", wild.size, int(wild[0]), text)
-    present = np.flatnonzero(np.isfinite(values) & ~impossible)
-    kept = values[present]
-    if kept.size < 2:
-        return findings
-    if constant(kept):
+        report.add("raw_counts", values.size, 0, text, "note")
+    _report_missing(report, values)
+    infinite = np.flatnonzero(np.isinf(values))
+    if infinite.size:
+        report.add("infinite", infinite.size, int(infinite[0]), f"{format_count(infinite.size, 'infinite sample')}")
+    is_impossible = flag_impossible(values, unit)
+    impossible = np.flatnonzero(is_impossible)
+    if impossible.size:
+        first = report.format_value(values[impossible[0]])
+        text = f"{format_count(impossible.size, 'sample')} beyond what any sensor reads, first {first}"
+        report.add("impossible", impossible.size, int(impossible[0]), text)
+    present = np.flatnonzero(np.isfinite(values) & ~is_impossible)
+    readings = values[present]
+    if readings.size < 2:
+        return report.findings
+    if is_constant(readings):
         # a command may be constant, and a flow meter on a closed bypass reads one value; a pressure never does
-        text = f"is constant at {in_log(kept[0])}"
-        add("constant", kept.size, int(present[0]), text, "note" if steady else "warning")
-        return findings
-    held = stuck(kept)
-    for rail in clipped(kept, held, low=pressure) if pressure or name == "q_leak" else ():
-        text = f"{counted(rail.samples, 'sample')} at the {rail.side} end, {in_log(rail.value)}: clipped"
-        add("clipped", rail.samples, int(present[rail.first]), text)
-    if pressure:  # at an end of its values it is clipped
-        held = held[(kept[held[:, 0]] > kept.min()) & (kept[held[:, 0]] < kept.max())]
-    if held.size and not steady:
-        first, length = (int(v) for v in held[0])
-        text = f"does not move {_times(len(held))} while it should, first for {length / rate:g} s"
-        add("stuck", int(held[:, 1].sum()), int(present[first]), text)
-    for frequency, amplitude, share in hum(kept, rate) if kept.size > 0.9 * values.size else ():
-        text = f"mains hum of {frequency:g} Hz, amplitude {in_log(amplitude, 3, is_span=True)}"
-        text += f", {100 * share:.2g} % of the power over 20 Hz"
-        text += ": is the sensor connected?" if share > _HUM["alone"] else ""
-        add("mains_hum", kept.size, int(present[0]), text, "warning" if share > _HUM["loud"] else "note")
-    return findings
+        text = f"is constant at {report.format_value(readings[0])}"
+        report.add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
+        return report.findings
+    stuck = find_stuck(readings)
+    for rail in find_rails(readings, stuck, low_end=is_pressure) if is_pressure or name == "q_leak" else ():
+        n_clipped = format_count(rail.samples, "sample")
+        text = f"{n_clipped} at the {rail.side} end, {report.format_value(rail.value)}: clipped"
+        report.add("clipped", rail.samples, int(present[rail.first]), text)
+    if is_pressure:  # runs at an end of its values are reported as clipped
+        stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
+    if stuck.size and not may_rest:
+        start, length = (int(v) for v in stuck[0])
+        times = _format_repetitions(len(stuck))
+        text = f"does not move {times} while it should, first for {length / recording.rate:g} s"
+        report.add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
+    # the spectrum of a channel with many missing samples would be wrong
+    for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
+        text = f"mains hum of {line.frequency:g} Hz, amplitude {report.format_value(line.amplitude, 3, is_span=True)}"
+        text += f", {100 * line.power_fraction:.2g} % of the power over 20 Hz"
+        text += ": is the sensor connected?" if line.power_fraction > _HUM.alone else ""
+        severity: Severity = "warning" if line.power_fraction > _HUM.loud else "note"
+        report.add("mains_hum", readings.size, int(present[0]), text, severity)
+    return report.findings
+
+
+def _report_missing(report: _ChannelReport, values: Array) -> None:
+    """Report samples (n,) without a value, or that only every k-th row has one."""
+    is_missing, rate = np.isnan(values), report.recording.rate
+    if not is_missing.any():
+        return
+    runs = find_runs(is_missing)
+    n_missing, first = int(np.count_nonzero(is_missing)), int(runs[0, 0])
+    period = _row_period(np.flatnonzero(~is_missing))
+    if period:
+        text = f"has a value on every {_format_ordinal(period)} row only ({rate / period:g} Hz among {rate:g} Hz)"
+        report.add("mixed_rate", n_missing, first, text)
+    elif n_missing == values.size:
+        report.add("missing", n_missing, 0, "has no values at all")
+    else:
+        text = f"{format_count(n_missing, 'sample')} missing in {format_count(len(runs), 'stretch')}"
+        report.add("missing", n_missing, first, f"{text}, the longest {runs[:, 1].max() / rate:g} s")
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the samples (n,), in an SI unit, of a size that no sensor reads; missing and infinite ones are not."""
-    largest: float = _POSSIBLE.get(unit, _POSSIBLE["any"])
-    return np.asarray(np.isfinite(values) & (np.abs(values) > largest))
+    """Flag the finite samples (n,), in an SI unit, whose magnitude exceeds the range of any sensor."""
+    limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
+    return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
 
 
-def _every(present: NDArray[np.intp]) -> int:
-    """Return k where only each k-th row has a value, as of a slower channel among others; else 0."""
+def _row_period(present: NDArray[np.intp]) -> int:
+    """Return k >= 2 if only every k-th row has a value, as for a slower channel, else 0; `present`: row indices."""
     steps = np.diff(present)
-    usual = int(np.median(steps)) if present.size >= 3 else 0
-    return usual if usual >= 2 and np.mean(steps == usual) > 0.95 else 0
+    period = int(np.median(steps)) if present.size >= 3 else 0
+    is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
+    return period if is_regular else 0
 
 
-def _ordinal(number: int) -> str:
+def _format_ordinal(number: int) -> str:
+    """Format an ordinal number: `1st`, `12th`."""
     ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{ending}"
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
-    """Return the maximal stretches, as slices, sampled uniformly with the named channels finite.
+    """Find the maximal stretches, as slices, that are sampled evenly and have finite values.
 
-    `channels`: by default all but those that change slowly. Each interval of a stretch lies between half and one and a
-    half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
+    `channels`: names to consider, by default all but those that change slowly. Each interval of a stretch is between
+    half and one and a half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
-    count = len(recording)
-    whole = np.isfinite(recording.t)
-    for name in (name for name in recording.channels if name not in SLOW) if channels is None else channels:
-        whole = whole & np.isfinite(recording[name])
-    joined = whole[1:] & whole[:-1] & _even_steps(recording)
-    starts = np.flatnonzero(whole & np.r_[True, ~joined][:count])
-    stops = np.flatnonzero(whole & np.r_[~joined, True][-count:]) + 1 if count else starts
+    n = len(recording)
+    is_complete = np.isfinite(recording.t)
+    names = [name for name in recording.channels if name not in SLOW] if channels is None else channels
+    for name in names:
+        is_complete = is_complete & np.isfinite(recording[name])
+    continues = is_complete[1:] & is_complete[:-1] & _flag_even_steps(recording)
+    # [:n] and [-n:] make the flags of no samples empty
+    starts = np.flatnonzero(is_complete & np.r_[True, ~continues][:n])
+    stops = np.flatnonzero(is_complete & np.r_[~continues, True][-n:]) + 1 if n else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
-def _even_steps(recording: Recording) -> NDArray[np.bool_]:
-    """Flag the intervals (n - 1,) between half and one and a half steps of the recording's rate."""
+def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
+    """Flag the intervals (n - 1,) between samples that last 0.5 to 1.5 steps of the recording's rate."""
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate
-    return np.asarray((steps > _CROWDED) & (steps < _GAP))
+    return np.asarray((steps > _MIN_STEP) & (steps < _MAX_STEP))
 
 
 class Rail(NamedTuple):
-    """Samples at one end of a clipped channel: `low` or `high` side, the value there, how many, where first."""
+    """Samples at one end of a clipped channel.
+
+    `side`: `low` or `high`; `value` at that end; `samples`: how many have it; `first`: index of the first.
+    """
 
     side: str
     value: float
@@ -276,94 +318,106 @@ class Rail(NamedTuple):
     first: int
 
 
-def mostly_clipped(values: Array) -> bool:
-    """Test whether more than half of the finite values (n,) are cut off, as in a chamber that empties into the tank."""
+def is_mostly_clipped(values: Array) -> bool:
+    """Test whether more than half of the finite values (n,) are clipped, as in a chamber that drains to the tank."""
     finite = values[np.isfinite(values)]
-    return sum(rail.samples for rail in clipped(finite)) > len(finite) / 2
+    return sum(rail.samples for rail in find_rails(finite)) > len(finite) / 2
 
 
-def clipped(values: Array, held: NDArray[np.intp] | None = None, low: bool = True) -> list[Rail]:
-    """Find the ends at which finite values (n,) are cut off; the low one only where `low`.
+def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
+    """Find the ends at which finite values (n,) are clipped; the low end only if `low_end`.
 
-    A cut-off piles up at its value what lay beyond: far more samples than any of the five levels next to it, in runs
-    that the signal enters or leaves by more than three quantisation steps (one, for a long run). The crest of a slow
-    quantised signal also holds many samples, but its neighbours hold nearly as many and it is entered step by step; a
-    channel that stays at two levels, such as a square wave, has as many samples at the other. A run among `held`, as
-    `stuck` gives them, at an end of the values is a cut-off too.
+    A clipped end has far more samples than any of the five nearest values, in runs that the signal enters or leaves by
+    more than three quantisation steps (one, for a long run). The crest of a slow quantised signal also has many
+    samples, but its neighbours have nearly as many and it is entered step by step; a square wave has as many samples at
+    its other level. An end is also clipped if a run of `stuck` (as `find_stuck` returns them) lies there.
     """
     if not values.size:
         return []
-    starts, ends = np.empty(0) if held is None else values[held[:, 0]], (values.min(), values.max())
+    stuck_values = np.empty(0) if stuck is None else values[stuck[:, 0]]
+    ends = values.min(), values.max()
     at_ends = max(np.count_nonzero(values == end) for end in ends)
-    if at_ends < _FEWEST_AT_RAIL and not np.isin(starts, ends).any():
+    if at_ends < _MIN_AT_RAIL and not np.isin(stuck_values, ends).any():
         return []
-    levels, counts = np.unique(values, return_counts=True)
-    if levels.size < 3:
+    distinct, counts = np.unique(values, return_counts=True)
+    if distinct.size < 3:
         return []
-    fine = spacing(levels)
+    quantum = smallest_step(distinct)
     rails = []
-    for side, top, neighbours in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
-        if side == "low" and not low:
+    for side, index, nearest in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
+        if side == "low" and not low_end:
             continue
-        runs = runs_of(values == levels[top])
-        first, length = runs[np.argmax(runs[:, 1])]
+        runs = find_runs(values == distinct[index])
+        first, length = runs[np.argmax(runs[:, 1])]  # the longest
         before, after = values[max(first - 1, 0)], values[min(first + length, values.size - 1)]
-        drop = max(abs(before - levels[top]), abs(after - levels[top]))
-        piled = counts[top] >= _FEWEST_AT_RAIL and counts[top] > 5 * counts[neighbours].max()
-        entered = length >= 3 and drop > (1.5 if length >= _LONG_RUN else 3.5) * fine
-        if (piled and entered) or (starts == levels[top]).any():
-            rails.append(Rail(side, float(levels[top]), int(counts[top]), int(runs[0, 0])))
+        jump = max(abs(before - distinct[index]), abs(after - distinct[index]))
+        is_crowded = counts[index] >= _MIN_AT_RAIL and counts[index] > _MIN_CROWD * counts[nearest].max()
+        is_entered_by_jump = length >= 3 and jump > (_MIN_LONG_JUMP if length >= _LONG_RUN else _MIN_JUMP) * quantum
+        if (is_crowded and is_entered_by_jump) or (stuck_values == distinct[index]).any():
+            rails.append(Rail(side, float(distinct[index]), int(counts[index]), int(runs[0, 0])))
     return rails
 
 
 def fast_length(count: int) -> int:
-    """Return the least length from `count` on without a prime factor beyond 5, of which a transform is fast.
+    """Return the smallest n >= `count` with no prime factor above 5, a length for which an FFT is fast.
 
-    As `scipy.fft.next_fast_len(count, real=True)`, without the modules that scipy.fft loads.
+    The same as `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
     """
-    powers = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
-    return min((power << max(0, (-(-count // power) - 1).bit_length()) for power in powers), default=count)
+    odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
+    # times the smallest power of two >= count / factor
+    return min((factor << max(0, (-(-count // factor) - 1).bit_length()) for factor in odd_factors), default=count)
 
 
-def hum(values: Array, rate: float) -> list[tuple[float, float, float]]:
-    """Return (frequency [Hz], amplitude, share of the power over 20 Hz) of the lines of the mains, 50 or 60 Hz.
+class HumLine(NamedTuple):
+    """A spectral line of the mains: frequency [Hz], amplitude, and its fraction of the power over 20 Hz."""
 
-    They stand clear of the spectrum within 5 Hz.
+    frequency: float
+    amplitude: float
+    power_fraction: float
 
-    Hann-windowed periodogram of the values less their straight line; the amplitude of a line is 2 |X| / sum(w). Clear
-    means 10 times the median and 4 times the largest of what lies beside it. Nothing is looked for in under 1.5 s.
+
+def find_hum(values: Array, rate: float) -> list[HumLine]:
+    """Find spectral lines of the mains, 50 or 60 Hz, in values (n,) sampled at `rate` [Hz].
+
+    A line must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz around it, in the
+    Hann-windowed periodogram of the detrended values; its amplitude is 2 |X| / sum(w). Less than 1.5 s is not analysed.
     """
-    count = values.size
-    if count / rate < 1.5:
+    n = values.size
+    if n / rate < _MIN_HUM_TIME:
         return []
-    x = np.arange(count) - (count - 1) / 2
-    centred = values - values.mean()
-    centred -= x * ((x @ centred) / (x @ x))
-    if not centred.any():
+    x = np.arange(n) - (n - 1) / 2
+    detrended = values - values.mean()
+    detrended -= x * ((x @ detrended) / (x @ x))
+    if not detrended.any():
         return []
-    window = _hann(count)
-    size = fast_length(count)
-    centred *= window
-    spectrum = np.fft.rfft(centred, size)
-    squares = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
-    step = rate / size
-    # amplitude^2/2 summed over bins counts each line's power 1.5 size/count times, as wide as Hann's window makes it
-    power = float(squares[math.ceil(_HUM["from"] / step - 1e-9) :].sum()) / 2 / (1.5 * size / count)
+    window = _hann(n)
+    n_fft = fast_length(n)
+    detrended *= window
+    spectrum = np.fft.rfft(detrended, n_fft)
+    squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
+    bin_width = rate / n_fft
+    # a Hann window spreads a line over bins: the sum of amplitude^2 / 2 counts its power 1.5 n_fft / n times
+    power = float(squared_amplitudes[math.ceil(_HUM.lowest / bin_width - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)
     lines = []
     for mains in (50.0, 60.0):
-        if mains + _HUM["around"] >= rate / 2:
+        if mains + _HUM.around >= rate / 2:
             continue
-        bins = np.arange(int((mains - _HUM["around"]) / step), int((mains + _HUM["around"]) / step) + 2)
-        off, amplitudes = np.abs(bins * step - mains), np.sqrt(squares[bins])
-        near = off <= max(0.1, 0.5 * rate / count)
-        surroundings = (off > max(0.5, 2.5 * rate / count)) & (off <= _HUM["around"])
-        peak, rest = float(amplitudes[near].max(initial=0.0)), amplitudes[surroundings]
-        if rest.size >= 10 and peak > _HUM["over_rest"] * rest.max() and peak > _HUM["over_median"] * np.median(rest):
-            lines.append((mains, peak, min(1.0, peak**2 / 2 / power)))
+        bins = np.arange(int((mains - _HUM.around) / bin_width), int((mains + _HUM.around) / bin_width) + 2)
+        distance, amplitudes = np.abs(bins * bin_width - mains), np.sqrt(squared_amplitudes[bins])
+        # the main lobe of the window ends 2 rate / n from a line; a mains frequency varies by 0.1 Hz
+        is_line = distance <= max(0.1, 0.5 * rate / n)
+        is_background = (distance > max(0.5, 2.5 * rate / n)) & (distance <= _HUM.around)
+        peak, background = float(amplitudes[is_line].max(initial=0.0)), amplitudes[is_background]
+        if (
+            background.size >= 10
+            and peak > _HUM.over_rest * background.max()
+            and peak > _HUM.over_median * np.median(background)
+        ):
+            lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / power)))
     return lines
 
 
 @lru_cache(2)
 def _hann(count: int) -> Array:
-    """Return Hann's window (count,), the same for all channels of a recording."""
+    """Return a Hann window (count,), cached because all channels of a recording share it."""
     return np.hanning(count)

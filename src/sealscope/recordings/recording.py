@@ -1,7 +1,7 @@
-"""The Recording: labelled time series with units, a rate and a history; the one meeting point of the whole project.
+"""The Recording: labelled time series with units, a rate and a history, on which the whole project is built.
 
-A Recording is what a rig's data logger would have written. Where it came from (a simulator, a file, a stream) is in
-its provenance and nowhere else; the truth of a simulation is never part of it.
+A Recording is what a rig's data logger would have written. Only its provenance states where it comes from (a
+simulator, a file, a stream); the truth of a simulation is never part of it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
-from sealscope.recordings.chambers import SHOWN_UNITS
+from sealscope.paragraphs import format_count
+from sealscope.recordings.chambers import DISPLAY_UNITS
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
-from sealscope.recordings.formats.columns import ChannelMap, Wanted, counted
-from sealscope.storage.opening import whole
+from sealscope.recordings.formats.columns import ChannelMap, Request
+from sealscope.recordings.formats.headings.preamble import clean_remarks
+from sealscope.storage.opening import raising_unreadable
 from sealscope.units import from_si
 
 if TYPE_CHECKING:
@@ -30,15 +32,15 @@ if TYPE_CHECKING:
 
     from sealscope.recordings.formats.table import RecordingFields
 
-__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "recording_of", "remembered"]
+__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "compute_once", "make_recording"]
 
 _T = TypeVar("_T")
-#: Unit of a channel -> the one in which it is drawn where its log has none.
-_SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
+#: Unit of a channel -> unit in which it is drawn if its log states none.
+_PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
-def _frozen(values: Any) -> Array:
-    """Return the values as read-only doubles, without a copy if they are a read-only array of doubles and no view."""
+def _freeze(values: Any) -> Array:
+    """Convert values to read-only doubles; a read-only array of doubles that is no view is not copied."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -47,8 +49,8 @@ def _frozen(values: Any) -> Array:
 
 
 @dataclass
-class _Result:
-    """A result that is computed once, whichever thread is first."""
+class _CachedResult:
+    """A result that the first thread computes and others wait for."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -59,8 +61,8 @@ class _Result:
 class Recording:
     """Channels sampled on one time base.
 
-    A recording does not change: arrays are copied and read-only, and what cuts or selects returns a new recording.
-    ``recording["p_A"]`` is a channel, ``"p_A" in recording`` asks for it, ``len(recording)`` is the number of samples.
+    A recording is immutable: arrays are copied and read-only, and methods that cut or select return a new recording.
+    ``recording["p_A"]`` is a channel, ``"p_A" in recording`` tests for it, ``len(recording)`` is the number of samples.
 
     Parameters
     ----------
@@ -79,12 +81,12 @@ class Recording:
     history : tuple of str, optional
         One line for each processing step.
     bridged : array_like of bool, shape (n,), optional
-        Rows whose values were missing and are interpolated (`recordings.corrections`); None where there are none.
+        Rows whose missing values were interpolated (`recordings.corrections`); None if there are none.
 
     Raises
     ------
     InputError
-        If lengths differ, a unit is missing, a value is no number or the rate is not positive.
+        If lengths differ, a unit is missing, a value is not a number or the rate is not positive.
 
     Examples
     --------
@@ -109,12 +111,13 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
     bridged: NDArray[np.bool_] | None = None
-    _results: dict[Hashable, _Result] = field(default_factory=dict, init=False)
+    _results: dict[Hashable, _CachedResult] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
+        """Check the arguments and replace them by read-only copies."""
         try:
-            t = _frozen(self.t)
-            channels = {name: _frozen(values) for name, values in self.channels.items()}
+            t = _freeze(self.t)
+            channels = {name: _freeze(values) for name, values in self.channels.items()}
             rate = float(self.rate)
         except (TypeError, ValueError) as error:
             raise InputError(f"the values of a recording must be numbers: {error}") from None
@@ -140,18 +143,11 @@ class Recording:
             object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arguments = (
-            self.t,
-            dict(self.channels),
-            dict(self.units),
-            self.rate,
-            dict(self.provenance),
-            self.history,
-            self.bridged,
-        )
-        return type(self), arguments
+        channels, units, provenance = map(dict, (self.channels, self.units, self.provenance))
+        return type(self), (self.t, channels, units, self.rate, provenance, self.history, self.bridged)
 
     def __getitem__(self, name: str) -> Array:
+        """Return the samples (n,) of a channel; raise InputError if it is absent."""
         try:
             return self.channels[name]
         except KeyError:
@@ -164,24 +160,26 @@ class Recording:
     def __len__(self) -> int:
         return int(self.t.size)
 
-    def _extent(self) -> str:
-        return f"{counted(len(self), 'sample')}, {self.rate:g} Hz, {self.duration:g} s"
+    def _format_extent(self) -> str:
+        """Format number of samples, rate and duration."""
+        return f"{format_count(len(self), 'sample')}, {self.rate:g} Hz, {self.duration:g} s"
 
     def __repr__(self) -> str:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items()) or "no channels"
-        return f"Recording({channels}; {self._extent()})"
+        return f"Recording({channels}; {self._format_extent()})"
 
     def _repr_html_(self) -> str:
+        """Render minimum, mean, maximum and missing samples of each channel as a table for notebooks."""
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]
-            ends = [f"{statistic(finite):.6g}" if finite.size else "" for statistic in (np.min, np.mean, np.max)]
-            rows.append((name, LONG_NAMES.get(name, ""), self.units[name], *ends, values.size - finite.size))
-        heads = ("channel", "", "unit", "least", "mean", "most", "missing")
-        lines = ["".join(f"<th>{head}</th>" for head in heads)]
+            statistics = [f"{statistic(finite):.6g}" if finite.size else "" for statistic in (np.min, np.mean, np.max)]
+            rows.append((name, LONG_NAMES.get(name, ""), self.units[name], *statistics, values.size - finite.size))
+        headings = ("channel", "", "unit", "least", "mean", "most", "missing")
+        lines = ["".join(f"<th>{head}</th>" for head in headings)]
         lines += ["".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows]
         table = "".join(f"<tr>{line}</tr>" for line in lines)
-        return f"<table><caption>Recording: {escape(self._extent())}</caption>{table}</table>"
+        return f"<table><caption>Recording: {escape(self._format_extent())}</caption>{table}</table>"
 
     @property
     def duration(self) -> float:
@@ -190,55 +188,70 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the recorded pressures, positions, speeds and flows of its file that no channel is made of."""
+        """Names of the measured pressures, positions, speeds and flows in its file that are in no channel."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
+    @property
+    def remarks(self) -> dict[str, str]:
+        """Entries in the header of its file, such as operator, machine and oil temperature."""
+        return clean_remarks(self.provenance)
+
     def unit_in_log(self, name: str) -> str | None:
-        """Return the unit that a channel has in the log it was read from; None for SI, counts or no log."""
+        """Return the unit of a channel in the log that it was read from; None for SI units, counts or no log."""
         units = self.provenance.get("log_units")
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
+    def format_value(self, name: str, value: float, digits: int = 6, *, is_span: bool = False) -> str:
+        """Format a value of a channel in the unit of the log; `is_span`: a difference, to which no offset applies."""
+        unit = self.units[name]
+        display_unit = self.unit_in_log(name) or unit
+        if display_unit != unit:
+            offset = from_si(0.0, display_unit, unit) if is_span else 0.0  # as that of degC
+            value = from_si(value, display_unit, unit) - offset
+        return f"{value:.{digits}g} {display_unit}"
+
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are shown, that of the log, else bar."""
+        """Unit in which pressures are displayed, that of the log or else bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
-        return next((unit for unit in units if unit in SHOWN_UNITS), "bar")
+        return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 
     def between(self, start: float, stop: float) -> Recording:
         """Return the samples with start <= t < stop [s]."""
         return self._select((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
 
-    def samples(self, chosen: slice) -> Recording:
-        """Return the samples of a slice, times as they are."""
-        return self._select(chosen, f"cut to samples {chosen.start} to {chosen.stop}")
+    def samples(self, rows: slice) -> Recording:
+        """Return the samples of a slice, with their times."""
+        return self._select(rows, f"cut to samples {rows.start} to {rows.stop}")
 
-    def _select(self, chosen: Any, note: str) -> Recording:
-        channels = {name: values[chosen] for name, values in self.channels.items()}
-        bridged = None if self.bridged is None else self.bridged[chosen]
-        return replace(self, t=self.t[chosen], channels=channels, history=(*self.history, note), bridged=bridged)
+    def _select(self, rows: Any, note: str) -> Recording:
+        """Return the selected rows, a slice or a mask (n,), with `note` added to the history."""
+        channels = {name: values[rows] for name, values in self.channels.items()}
+        bridged = None if self.bridged is None else self.bridged[rows]
+        return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
-        """Return the same recording with the named channels alone."""
+        """Return the recording with the named channels only."""
         part = replace(self, channels={name: self[name] for name in names})
-        object.__setattr__(part, "_results", self._results)
+        object.__setattr__(part, "_results", self._results)  # shared, see `compute_once`
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
         """Return values and units of the time, `t`, and the channels, and a description in JSON values.
 
-        The description holds rate, provenance and history. Raises InputError where a value is none of JSON's.
+        The description contains rate, provenance and history. Raises InputError for values that JSON does not have.
         """
-        from sealscope.recordings.formats.table import description_of
+        from sealscope.recordings.formats.table import make_description
 
-        description = description_of(self.rate, self.provenance, self.history)
+        description = make_description(self.rate, self.provenance, self.history)
         return {"t": self.t, **self.channels}, {"t": "s", **self.units}, description
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a data frame of copies: index ``t [s]``, columns such as ``p_A [Pa]``.
 
-        Its ``attrs`` hold the units by column, the rate, the provenance and the history; `from_pandas` reads them.
-        Raises MissingExtra without pandas, and InputError where the provenance holds other values than JSON's.
+        Its ``attrs`` contain the units by column, the rate, the provenance and the history, which `from_pandas` reads.
+        Raises MissingExtra without pandas, and InputError if the provenance has values that JSON does not have.
         """
         from sealscope.recordings.frames import to_pandas
 
@@ -247,14 +260,14 @@ class Recording:
     def to_xarray(self) -> xarray.Dataset:
         """Return a data set of copies over the coordinate ``t``, with the variables and attributes of NetCDF files.
 
-        Raises MissingExtra without xarray, and InputError where the provenance holds other values than JSON's.
+        Raises MissingExtra without xarray, and InputError if the provenance has values that JSON does not have.
         """
         from sealscope.recordings.frames import to_xarray
 
         return to_xarray(*self.series())
 
     def plot(self, channels: Iterable[str] | None = None) -> NDArray[Any]:
-        """Draw channels over time, those of one unit in one picture, in the units of the log or of a workshop.
+        """Plot channels over time, one panel for each unit, in the units of the log or else practical ones.
 
         Parameters
         ----------
@@ -264,7 +277,7 @@ class Recording:
         Returns
         -------
         axes : ndarray
-            Of `matplotlib.axes.Axes`, (k,), one for each unit, above one another.
+            `matplotlib.axes.Axes` (k,), one for each unit, above one another.
 
         Raises
         ------
@@ -274,24 +287,24 @@ class Recording:
             matplotlib is not installed.
         """
         names = list(self.channels if channels is None else channels)
-        by_unit: dict[str, list[tuple[str, Array]]] = {}
+        channels_by_unit: dict[str, list[tuple[str, Array]]] = {}
         for name in names:
             values, unit = self[name], self.units[name]
-            shown = self.unit_in_log(name) or (self.pressure_unit if unit == "Pa" else _SHOWN.get(unit, unit))
-            values = values if shown == unit else from_si(values, shown, CHANNEL_UNITS.get(name, unit))
-            by_unit.setdefault(shown, []).append((name, values))
-        if not by_unit:
+            plot_unit = self.unit_in_log(name) or (self.pressure_unit if unit == "Pa" else _PLOT_UNITS.get(unit, unit))
+            values = values if plot_unit == unit else from_si(values, plot_unit, CHANNEL_UNITS.get(name, unit))
+            channels_by_unit.setdefault(plot_unit, []).append((name, values))
+        if not channels_by_unit:
             raise InputError("a recording must have channels to be drawn, got none")
         try:
             from matplotlib.figure import Figure
         except ImportError:
             raise MissingExtra("a drawing needs matplotlib: pip install 'sealscope[report]'") from None
-        axes = Figure(layout="constrained").subplots(len(by_unit), sharex=True, squeeze=False)[:, 0]
-        for picture, (unit, lines) in zip(axes, by_unit.items(), strict=True):
+        axes = Figure(layout="constrained").subplots(len(channels_by_unit), sharex=True, squeeze=False)[:, 0]
+        for panel, (unit, lines) in zip(axes, channels_by_unit.items(), strict=True):
             for name, values in lines:
-                picture.plot(self.t, values, label=name)
-            picture.set(ylabel=f"{', '.join(name for name, _ in lines)} [{unit}]")
-            picture.legend()
+                panel.plot(self.t, values, label=name)
+            panel.set(ylabel=f"{', '.join(name for name, _ in lines)} [{unit}]")
+            panel.legend()
         axes[-1].set(xlabel="t [s]")
         return np.asarray(axes)
 
@@ -300,7 +313,7 @@ class Recording:
     def from_pandas(
         cls, frame: pandas.DataFrame, *, map: ChannelMap | None = None, rate: float | None = None
     ) -> Recording:
-        """Make a recording of a data frame, by the rules that hold for files.
+        """Make a recording from a data frame, by the same rules as for files.
 
         Parameters
         ----------
@@ -311,7 +324,7 @@ class Recording:
         map : mapping of str to str or "auto", optional
             Channel (or ``t``) -> column, as for `read`.
         rate : float, optional
-            Sampling rate [Hz], in place of a time. It is inferred from the time otherwise.
+            Sampling rate [Hz], in place of a time; by default inferred from the time.
 
         Returns
         -------
@@ -323,37 +336,37 @@ class Recording:
         MissingExtra
             If pandas is not installed.
         InputError
-            If no column is a channel, a unit is of another dimension, a value is no number, or there is neither time
-            nor rate.
+            If no column is a channel, a unit has the wrong dimension, a value is not a number, or there is neither
+            time nor rate.
         """
         from sealscope.recordings.frames import read_pandas
 
-        request = Wanted(map or {}, rate)
+        request = Request(map or {}, rate)
         try:
-            with whole("a data frame", "data frame"):
-                return recording_of(read_pandas(frame, request))
+            with raising_unreadable("a data frame", "data frame"):
+                return make_recording(read_pandas(frame, request))
         except UnreadableFile as error:
             raise InputError(str(error)) from None
 
 
-def recording_of(fields: RecordingFields) -> Recording:
-    """Return the recording that a reader's fields make."""
-    return Recording(*fields[:-1])
+def make_recording(fields: RecordingFields) -> Recording:
+    """Make a recording from the fields that a reader returns."""
+    return Recording(*fields[:-1])  # without the `kind` of the file
 
 
-def remembered(
+def compute_once(
     recording: Recording, key: Hashable, compute: Callable[[Recording], _T], channels: Iterable[str] | None = None
 ) -> _T:
-    """Return `compute(recording)`, computed once for a recording and a `key`, and kept as long as the recording is.
+    """Return `compute(recording)`, computed once for each recording and `key` and cached with the recording.
 
-    `channels`: those that the result depends on (default: all that the recording has). The views that
-    `Recording.only` makes share results which depend on the same channels.
+    `channels`: channels that the result depends on (default: all). Views by `Recording.only` share results that depend
+    on the same channels.
     """
-    present = frozenset(recording.channels)
-    names = present if channels is None else present.intersection(channels)
-    result = recording._results.setdefault((key, names), _Result())
-    with result.lock:
-        if not result.known:
-            result.value, result.known = compute(recording), True
-        value: _T = result.value
+    all_channels = frozenset(recording.channels)
+    names = all_channels if channels is None else all_channels.intersection(channels)
+    cached = recording._results.setdefault((key, names), _CachedResult())
+    with cached.lock:
+        if not cached.known:
+            cached.value, cached.known = compute(recording), True
+        value: _T = cached.value
     return value

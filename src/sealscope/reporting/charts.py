@@ -1,4 +1,4 @@
-"""Charts of the page: what each shows, in which unit, as data for the script and as a still picture."""
+"""Build the page's charts: their lines in display units, their data for the script, and their still pictures."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import COUNTS, Array, Recording
 from sealscope.reporting.features import ChamberDetails
 from sealscope.reporting.picture import Picture, ticks
-from sealscope.reporting.series import DrawnTimes, coded, coded_times, ordered_time, time_base
+from sealscope.reporting.series import DrawnTimes, choose_drawn_times, encode_times, encode_values, ordered_time
 from sealscope.signals.details import QUANTITIES
 from sealscope.units import from_si, to_si
 
 PRODUCT = QUANTITIES[-1]
 SAMPLES = "samples"
-#: points of a series drawn by the script, and in the still picture
+#: Points of a series drawn by the script, and in the still picture.
 POINTS, STILL_POINTS = 16_000, 800
-#: samples drawn one by one round the onset, so that the ringing itself can be looked at
+#: Samples around the onset that are all drawn, so that the ringing is visible.
 NEAR_SAMPLES = 6_000
-
-#: largest value drawn; least extent of an axis, and over the size of its values: what is less is a constant
-_LARGEST, _LEAST, _LEAST_SHARE = 1e100, 1e-100, 1e-12
-#: unit of pressures -> unit of their details
+#: Largest value drawn. Values count as constant if their range is below the second number, or below the third relative
+#: to their size.
+_MAX_DRAWN, _MIN_EXTENT, _MIN_RELATIVE_EXTENT = 1e100, 1e-100, 1e-12
+#: Unit of pressures -> unit of their details.
 _DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
-#: SI unit of other channels -> unit shown
-_SHOWN = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
+#: SI unit of other channels -> display unit.
+_DISPLAY_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A moment to see on every chart: `t` [s] on the recording's own time axis, and its label.
+    """A moment marked on every chart: `t` [s] on the recording's time axis, and its label.
 
-    `known=True` says that the moment is known from elsewhere (the leak was put in on purpose); it is drawn apart from
-    the onset of the diagnosis. Raises InputError when `t` is not finite.
+    `known=True` marks a moment that is known independently of the diagnosis, such as the onset of a leak that was put
+    in on purpose; it is drawn in another style. Raises InputError if `t` is not finite.
     """
 
     t: float
@@ -51,7 +51,7 @@ class Mark:
 
 
 class ChartLine(NamedTuple):
-    """One line of a chart: its label, the style's name in the style sheet, and its values in the chart's unit."""
+    """One line of a chart: label, name of its style in the style sheet, and values in the chart's unit."""
 
     label: str
     style: str
@@ -61,9 +61,9 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart.
 
-    `base`: the time axis of its lines (all samples, the centres of the RMS windows, or the instants of the leak's
-    course); `band`: whether the second and third lines are the ends of the first one's interval; `limits`: the least
-    and greatest value shown, None where every value is.
+    `base`: time axis of its lines (all samples, centres of the RMS windows, or times of the leak over the recording);
+    `band`: whether the second and third line are the interval of the first; `limits`: ends of the axis, None to show
+    all values; `level`: repair limit, None if there is none.
     """
 
     key: str
@@ -79,67 +79,71 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """The level in the key of the chart, with a remark if it lies above the frame."""
-        above = self.level is not None and self.limits is not None and self.level > self.limits[1]
-        return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if above else "")
+        """Text of the level in the chart's key, with a remark if it lies above the frame."""
+        is_above = self.level is not None and self.limits is not None and self.level > self.limits[1]
+        return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if is_above else "")
 
     @property
     def is_cut(self) -> bool:
-        """Test whether any values lie beyond the limits."""
+        """True if values lie beyond the limits."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
-def shown_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Return the display unit of a channel and its values (n,) in it; all but pressures keep the unit of their log."""
+def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
+    """Convert a channel (n,) to its display unit; return the unit and the values.
+
+    It is `pressure_unit` for pressures, counts for raw counts, otherwise that of the log, and degC for temperatures.
+    """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
     if unit is not None or si_unit == "K":
         unit = unit or "degC"
         return unit, from_si(recording[name], unit, si_unit)
-    shown, size = shown_unit(si_unit, pressure_unit)
-    return shown, recording[name] / size
+    unit, scale = display_unit(si_unit, pressure_unit)
+    return unit, recording[name] / scale
 
 
-def shown_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Return the display unit of a channel and its size in the channel's own unit.
+def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
+    """Return the display unit of a channel in `unit`, and the value of one display unit in `unit`.
 
-    Raises InputError for an unknown pressure unit.
+    `detail`: for a wavelet detail. Raises InputError for an unknown pressure unit.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
     if unit == COUNTS:
         return "counts", 1.0
     pressure = _DETAIL_UNITS[pressure_unit] if detail else pressure_unit
-    shown = pressure if unit == "Pa" else _SHOWN.get(unit, unit)
-    return shown, to_si(1.0, shown, unit)
+    display = pressure if unit == "Pa" else _DISPLAY_UNITS.get(unit, unit)
+    return display, to_si(1.0, display, unit)
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Return the unit in which a detail of a channel is shown (squared for d3d4), and its size in the channel's own."""
-    shown, size = shown_unit(unit, pressure_unit, detail=True)
-    return (f"{shown}²", size**2) if name == PRODUCT else (shown, size)
+    """Return the display unit of a detail, squared for d3d4, and its value in the channel's unit (squared)."""
+    display, scale = display_unit(unit, pressure_unit, detail=True)
+    return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
 
-def label_of(name: str) -> str:
+def detail_label(name: str) -> str:
     """Return the displayed name of a detail."""
     return "d3·d4" if name == PRODUCT else name
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Return the charts of the channels that have samples, those of one kind and unit together."""
+    """Build the charts of all channels with samples; channels of one kind and unit share a chart."""
     charts = []
     for key, title, height, members in _CHANNELS:
         units: dict[str, list[ChartLine]] = {}
         for name, style in zip(members, "ab", strict=False):
             if name in recording and np.isfinite(recording[name]).any():
-                unit, values = shown_values(recording, name, pressure_unit)
+                unit, values = display_values(recording, name, pressure_unit)
                 units.setdefault(unit, []).append(ChartLine(name, style, values))
         for i, (unit, lines) in enumerate(units.items()):
             charts.append(Chart(f"{key}-{i}", "channels", title, unit, tuple(lines), height=height))
     return charts
 
 
+#: Key, title, height and channels of the charts.
 _CHANNELS = (
     ("u", "Command", 140, ("u",)),
     ("x", "Piston position", 140, ("x",)),
@@ -152,82 +156,96 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Return the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
+    """Build the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
     charts = []
-    for names, quantity, key, height in (
+    for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
-        ((PRODUCT,), label_of(PRODUCT), "-d3d4", 150),
+        ((PRODUCT,), detail_label(PRODUCT), "-d3d4", 150),
     ):
         for chamber in chambers:
             if not chamber.window_t.size:
                 continue
             channel = chamber.channel
-            unit, size = detail_unit(chamber.unit, names[0], pressure_unit)
-            lines = tuple(ChartLine(label_of(name), name, chamber.window_rms[name] / size) for name in names)
+            unit, scale = detail_unit(chamber.unit, names[0], pressure_unit)
+            lines = tuple(ChartLine(detail_label(name), name, chamber.window_rms[name] / scale) for name in names)
             title = f"RMS of {quantity} of {channel}"
-            charts.append(Chart(f"rms-{channel}{key}", "rms", title, unit, lines, f"windows-{channel}", height))
+            charts.append(Chart(f"rms-{channel}{suffix}", "rms", title, unit, lines, f"windows-{channel}", height))
     return charts
 
 
 #: The leak over the recording, and the groups of charts in their order on the page.
 COURSE = "course"
 GROUPS = (COURSE, "rms", "channels", "details")
-#: The repair limit is drawn inside the frame up to this many times what else is shown.
-_LEVEL_SHOWN = 4.0
+#: The axis is extended to the repair limit up to this multiple of its other upper end.
+_MAX_LIMIT_RATIO = 4.0
 
 
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
-    """Return the chart of the leak over the recording with its interval and the repair limit, where it is known."""
+    """Build the chart of the leak over the recording, with its interval and the repair limit; [] if it is not known."""
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
         return []
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (course.low, course.high))
     lines = (ChartLine("leak", "a", course.lpm), ChartLine("low", "d1", low), ChartLine("high", "d1", high))
-    bottom, top = _limits(course.lpm, low, high)
+    bottom, top = _y_limits(course.lpm, low, high)
     level = diagnosis.repair_lpm
-    if level is not None and top < level < _LEVEL_SHOWN * top:
-        top = 1.06 * level
+    if level is not None and top < level < _MAX_LIMIT_RATIO * top:
+        top = 1.06 * level  # with a margin
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
-    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, True, (bottom, top), level)]
+    return [
+        Chart(
+            key=COURSE,
+            group=COURSE,
+            title=title,
+            unit="L/min",
+            lines=lines,
+            base=COURSE,
+            height=height,
+            band=True,
+            limits=(bottom, top),
+            level=level,
+        )
+    ]
 
 
-def _limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
-    """Return the least and greatest value to show: zero, every estimate and every interval.
+def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
+    """Compute the limits of the axis, which include zero, all estimates and all intervals.
 
-    Where that is more than twice as far as zero, the estimates and 9 in 10 ends of the intervals, it is those: a single
-    wide interval would press the curve flat.
+    If that doubles the range or more, only 90 % of the intervals' ends are included, as a few wide intervals would
+    flatten the curve.
     """
-    always = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
-    ends = [(end[np.isfinite(end)], least) for end, least in ((low, True), (high, False)) if np.any(np.isfinite(end))]
-    whole = [*always, *(float(end.min() if least else end.max()) for end, least in ends)]
-    most = [*always, *(float(np.quantile(end, 0.1 if least else 0.9)) for end, least in ends)]
-    shown = whole if max(whole) - min(whole) <= 2.0 * (max(most) - min(most)) else most
-    margin = 0.06 * (max(shown) - min(shown)) or 0.5
-    return min(shown) - margin, max(shown) + margin
+    required = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
+    low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
+    with_all, with_most = [*required, *low_ends, *high_ends], [*required]
+    with_most += [np.quantile(low_ends, 0.1)] if low_ends.size else []
+    with_most += [np.quantile(high_ends, 0.9)] if high_ends.size else []
+    included = with_all if max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most)) else with_most
+    margin = 0.06 * (max(included) - min(included)) or 0.5
+    return float(min(included) - margin), float(max(included) + margin)
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Return the charts of the details themselves, one each, the chambers side by side."""
+    """Build a chart for each detail of each chamber; the chambers are next to each other."""
     charts = []
-    for d in QUANTITIES:
+    for name in QUANTITIES:
         for chamber in chambers:
-            unit, size = detail_unit(chamber.unit, d, pressure_unit)
+            unit, scale = detail_unit(chamber.unit, name, pressure_unit)
             style = "b" if chamber.channel == "p_B" else "a"
-            line = ChartLine(label_of(d), style, chamber.values[d] / size)
-            title = f"{label_of(d)} of {chamber.channel}"
-            charts.append(Chart(f"{d}-{chamber.channel}", "details", title, unit, (line,), height=130))
+            line = ChartLine(detail_label(name), style, chamber.values[name] / scale)
+            title = f"{detail_label(name)} of {chamber.channel}"
+            charts.append(Chart(f"{name}-{chamber.channel}", "details", title, unit, (line,), height=130))
     return charts
 
 
-#: What stands on every chart: its style, when it begins and when it ends [s], None for an instant.
+#: A mark or interval on every chart: style, begin and end [s], None for a single moment.
 Moment = tuple[str, float, float | None]
 
 
 class DrawnCharts(NamedTuple):
-    """All charts as a page shows them.
+    """All charts in the form that a page needs.
 
-    `data`: for the script (plain JSON values); `still`: by chart key, for the template; `base`: times at which the
-    channels are drawn; `span`: their ends [s]; `fine`: ends of the stretch whose samples are drawn one by one [s].
+    `data`: plain JSON values for the script; `still`: key of a chart -> still picture; `base`: times at which the
+    channels are drawn; `span`: first and last of them [s]; `fine`: ends of the interval in which all samples are drawn.
     """
 
     data: dict[str, Any]
@@ -244,52 +262,53 @@ def draw(
     diagnosis: Diagnosis,
     marks: Sequence[Mark],
 ) -> DrawnCharts:
-    """Decimate and code every chart's lines, and lay out the still picture of each.
+    """Decimate and encode the lines of all charts, and draw the still picture of each.
 
-    Peaks are kept: each bucket contributes its least and its greatest sample.
+    Peaks are preserved, as each bucket contributes its minimum and its maximum.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
-    base = time_base(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
-    few = time_base(recording.t, recording.rate, STILL_POINTS)
+    base = choose_drawn_times(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
+    still_base = choose_drawn_times(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
     axes: dict[str, Array] = {SAMPLES: base.t} | {f"windows-{c.channel}": c.window_t for c in chambers}
     if diagnosis.course is not None:
         axes[COURSE] = diagnosis.course.t
-    onset, interval = _onset_within(diagnosis, span)
+    onset, interval = _clip_onset(diagnosis, span)
     low, high = interval or (None, None)
     moments: list[Moment] = [] if interval is None else [("band", *interval)]
     moments += [] if onset is None else [("mark", onset, None)]
     moments += [(f"mark {'known' if mark.known else 'other'}", mark.t, None) for mark in marks]
-    coded_charts, still = [], {}
+    encoded_charts, still = [], {}
     for chart in charts:
-        lines = [_drawable(line.values) for line in chart.lines]
-        t, points = axes[chart.base], lines
+        values_of_lines = [_clip_values(line.values) for line in chart.lines]
+        still_t, still_values = axes[chart.base], values_of_lines
         if chart.base == SAMPLES:
-            t, points, lines = few.t, [few.reduce(line) for line in lines], [base.reduce(line) for line in lines]
-        named = zip(chart.lines, lines, strict=True)
-        series = [{"label": line.label, "style": line.style, **coded(values)} for line, values in named]
-        shown = {name: getattr(chart, name) for name in ("key", "title", "unit", "height", "band", "limits", "level")}
-        coded_charts.append({**shown, "axis": chart.base, "series": series})
-        still[chart.key] = still_chart(chart, t, points, span, moments)
+            still_t, still_values = still_base.t, [still_base.reduce(values) for values in values_of_lines]
+            values_of_lines = [base.reduce(values) for values in values_of_lines]
+        pairs = zip(chart.lines, values_of_lines, strict=True)
+        series = [{"label": line.label, "style": line.style, **encode_values(values)} for line, values in pairs]
+        entries = {name: getattr(chart, name) for name in ("key", "title", "unit", "height", "band", "limits", "level")}
+        encoded_charts.append({**entries, "axis": chart.base, "series": series})
+        still[chart.key] = render_still(chart, still_t, still_values, span, moments)
     data = {
         "span": span,
-        "axes": {name: coded_times(t) for name, t in axes.items() if any(chart.base == name for chart in charts)},
+        "axes": {name: encode_times(t) for name, t in axes.items() if any(chart.base == name for chart in charts)},
         "onset": {"t": onset, "low": low, "high": high},
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
-        "charts": coded_charts,
+        "charts": encoded_charts,
     }
     t = ordered_time(recording.t, recording.rate)[0]
     return DrawnCharts(data, still, base, span, (float(t[base.fine.start]), float(t[base.fine.stop - 1])))
 
 
-def _drawable(values: Array) -> Array:
-    """Clip values to +-1e100, so that no scale overflows."""
-    return np.where(np.isfinite(values), np.clip(values, -_LARGEST, _LARGEST), values)
+def _clip_values(values: Array) -> Array:
+    """Clip values to +-`_MAX_DRAWN`, so that no scale overflows."""
+    return np.where(np.isfinite(values), np.clip(values, -_MAX_DRAWN, _MAX_DRAWN), values)
 
 
-def _onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset and its interval [s] as drawn: an end outside the recording, or unbounded, is cut."""
+def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
+    """Return the onset and its interval [s], with the interval clipped to the recording; None if not known."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None
@@ -299,17 +318,17 @@ def _onset_within(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[floa
     return float(onset), (low, high)
 
 
-def still_chart(
+def render_still(
     chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
 ) -> Picture:
-    """Return the still picture of a chart, in a frame 860 wide and `chart.height` high."""
-    lines = [_drawable(line) for line in lines]
-    stacked = np.concatenate(lines)
-    finite = stacked[np.isfinite(stacked)]
+    """Draw the still picture of a chart, 860 wide and `chart.height` high, from values of its `lines` at times `t`."""
+    lines = [_clip_values(line) for line in lines]
+    all_values = np.concatenate(lines)
+    finite = all_values[np.isfinite(all_values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    size = max(abs(low), abs(high))
-    if high - low <= max(_LEAST, _LEAST_SHARE * size):
-        pad = max(0.5, 1e-6 * size)
+    max_magnitude = max(abs(low), abs(high))
+    if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):
+        pad = max(0.5, 1e-6 * max_magnitude)
         low, high = low - pad, high + pad
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
@@ -328,6 +347,7 @@ def still_chart(
         picture.area("interval", t, *lines[1:3])
     if chart.level is not None and chart.level <= high:
         picture.level("level", chart.level)
-    for line_style, line in zip(chart.lines[: 1 if chart.band else None], lines, strict=False):
-        picture.line(f"line {line_style.style}", t, line, line_style.label, digits=0)
+    drawn_lines = chart.lines[:1] if chart.band else chart.lines
+    for chart_line, values in zip(drawn_lines, lines, strict=False):
+        picture.line(f"line {chart_line.style}", t, values, chart_line.label, digits=0)
     return picture

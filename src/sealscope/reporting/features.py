@@ -1,4 +1,4 @@
-"""The details and their RMS as the page shows them: of every stretch of a recording that can be transformed."""
+"""Compute the wavelet details and their RMS for the page, from all parts of a recording that can be transformed."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from sealscope.errors import InputError
 from sealscope.recordings.quality import uniform_segments
 from sealscope.recordings.recording import Array, Recording
 from sealscope.reporting.series import ordered_time
-from sealscope.signals.details import QUANTITIES, details, shortest
+from sealscope.signals.details import QUANTITIES, details, min_samples
 from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, rms, windowed_rms
 
+#: RMS windows that each half of a recording needs for a comparison.
 HALF_WINDOWS = 10
 
 
 class ChamberDetails(NamedTuple):
     """d1..d4 and d3d4 of one chamber's pressure.
 
-    `values`: name -> (n,) over the whole recording, NaN where the transform would touch an end or a fault of the data;
-    `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,), NaN between two stretches. Unit: the
-    channel's, d3d4 its square.
+    `values`: name -> (n,) over the whole recording, NaN if the transform reaches an end or a defect of the data;
+    `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,), NaN between two parts. d1..d4 are in
+    the channel's unit, d3d4 in its square.
     """
 
     channel: str
@@ -42,62 +43,60 @@ class DetailChange(NamedTuple):
 
     @property
     def percent(self) -> float | None:
-        """``100 (after - before) / before`` [%], None where it cannot be formed."""
+        """``100 (after - before) / before`` [%]; None if one of the two is missing or `before` is 0."""
         if self.before is None or self.after is None or self.before <= 0:
             return None
         return 100 * (self.after - self.before) / self.before
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """Return the details of one chamber over its usable stretches, and a sentence on what was left out.
+    """Compute the details of one chamber over its usable parts; return them with a note on samples that are left out.
 
-    Bad data raise nothing: then the details are None, and the sentence is the reason.
+    If the data cannot be transformed, the details are None and the note is the reason.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
-    n, series = len(recording), recording[channel]
+    n, signal = len(recording), recording[channel]
     t = ordered_time(recording.t, recording.rate)[0]
-    needed = shortest()
+    n_needed = min_samples()
     parts = uniform_segments(recording, [channel])
-    usable = [part for part in parts if part.stop - part.start >= needed]
+    usable = [part for part in parts if part.stop - part.start >= n_needed]
     if not usable:
-        longest = max((part.stop - part.start for part in parts), default=0)
-        return (
-            None,
-            f"No details of {channel}: they need {needed} samples without a fault, the most there are is {longest}.",
-        )
+        n_longest = max((part.stop - part.start for part in parts), default=0)
+        need = f"they need {n_needed} samples without a fault, the most there are is {n_longest}"
+        return None, f"No details of {channel}: {need}."
     values = {name: np.full(n, np.nan) for name in QUANTITIES}
-    windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each stretch
+    windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each part
     for part in usable:
         try:
-            transformed = details(series[part])
+            transformed = details(signal[part])
             rows, inside = transformed.quantities(), transformed.inside()
-            ends, levels = windowed_rms(rows[:, inside], first=inside.start)
+            ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
-        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):
-            where = transformed.inside(level)
-            values[name][part][where] = row[where]
+        for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 reaches as far as d4
+            unaffected = transformed.inside(level)
+            values[name][part][unaffected] = row[unaffected]
         if ends.size:
             centres = t[part.start] + (ends - WINDOW_SIZE / 2) / recording.rate
-            if windows:  # a point without a value parts two stretches
+            if windows:  # NaN breaks the drawn line between two parts
                 windows.append((centres[:1], np.full((len(QUANTITIES), 1), np.nan)))
-            windows.append((centres, levels))
+            windows.append((centres, window_rows))
     notes = []
-    left_out = n - sum(part.stop - part.start for part in usable)
-    if left_out:
-        pieces = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''}"
-        notes.append(f"{channel}: the details are of {pieces} without a fault; {left_out} of {n} samples are left out.")
+    n_left_out = n - sum(part.stop - part.start for part in usable)
+    if n_left_out:
+        parts_text = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''} without a fault"
+        notes.append(f"{channel}: the details are of {parts_text}; {n_left_out} of {n} samples are left out.")
     if not windows:
         notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW_SIZE} samples.")
         windows.append((np.empty(0), np.empty((len(QUANTITIES), 0))))
-    window_t, levels = (np.concatenate(parts, axis=-1) for parts in zip(*windows, strict=True))
-    window_rms = dict(zip(QUANTITIES, levels, strict=True))
+    window_t, window_rows = (np.concatenate(arrays, axis=-1) for arrays in zip(*windows, strict=True))
+    window_rms = dict(zip(QUANTITIES, window_rows, strict=True))
     return ChamberDetails(channel, recording.units[channel], values, window_t, window_rms), " ".join(notes)
 
 
 class Parts(NamedTuple):
-    """The two parts of a recording whose RMS are compared, t < `end` and t >= `start` [s]; their names; why these."""
+    """The two parts of a recording that are compared, t < `end` and t >= `start` [s]; `text`: reason for the choice."""
 
     end: float
     start: float
@@ -106,9 +105,10 @@ class Parts(NamedTuple):
 
 
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
-    """Before and after the onset's interval; without an onset the halves, or the whole of a short recording alone.
+    """Choose the parts of a recording to compare: before and after the onset's interval, or the two halves.
 
-    A half of fewer than `HALF_WINDOWS` windows is not compared: it would show the stroke and not the seal.
+    A recording without an onset whose halves have fewer than `HALF_WINDOWS` windows is not divided, as the difference
+    would reflect the stroke and not the seal.
     """
     t = ordered_time(recording.t, recording.rate)[0]
     if diagnosis.onset_s is not None:
@@ -126,16 +126,14 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 
 
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
-    """RMS in the first and the second part for each detail of each chamber; None where a part has no samples."""
+    """Compute the RMS of each detail of each chamber in the two parts; None for a part without samples."""
     t = ordered_time(recording.t, recording.rate)[0]
-    early, late = t < parts.end, t >= parts.start
-    return [
-        DetailChange(chamber.channel, name, _rms(values[early]), _rms(values[late]))
-        for chamber in chambers
-        for name, values in chamber.values.items()
-    ]
+    first, second = t < parts.end, t >= parts.start
+    series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())
+    return [DetailChange(channel, name, _rms(values[first]), _rms(values[second])) for channel, name, values in series]
 
 
 def _rms(values: Array) -> float | None:
+    """Compute the RMS of the finite values; None if there are none."""
     finite = values[np.isfinite(values)]
     return float(rms(finite)) if finite.size else None

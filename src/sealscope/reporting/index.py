@@ -1,4 +1,4 @@
-"""The index of a folder of pages: one line a recording with what to do, the most severe first."""
+"""Write the index of a folder of pages: a row for each recording with its verdict and action, the most severe first."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from pathlib import Path
 from urllib.parse import quote
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.recordings.formats.columns import counted
+from sealscope.paragraphs import format_count
 from sealscope.reporting import messages, template
 
-#: Verdicts as an index orders them.
+#: Order of the verdicts in an index.
 _ORDER = ("leak", "cannot tell", "no leak")
 
 
-def severity(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Return the sort key of a page: leaks by size, then `cannot tell`, then the total leakage."""
-    leak_severity = diagnosis.severity
-    size = 0.0 if leak_severity is None or leak_severity.of_limit is None else leak_severity.of_limit[0]
-    flow = diagnosis.total_leakage.lpm if diagnosis.total_leakage is not None else None
-    flow = flow if diagnosis.leak_lpm is None else diagnosis.leak_lpm
-    return (_ORDER.index(diagnosis.verdict), -size, -(flow or 0.0), diagnosis.file)
+def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
+    """Return the sort key of a page: by verdict, then leak over the repair limit, then flow, then name."""
+    severity = diagnosis.severity
+    limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
+    total_lpm = None if diagnosis.total_leakage is None else diagnosis.total_leakage.lpm
+    lpm = total_lpm if diagnosis.leak_lpm is None else diagnosis.leak_lpm
+    return (_ORDER.index(diagnosis.verdict), -limit_ratio, -(lpm or 0.0), diagnosis.file)
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index of `pages`, each a page's path in the folder of `path` and its diagnosis."""
-    ordered = sorted(pages, key=lambda page: severity(page[1]))
+    """Write the index of pages in its folder, given the path and the diagnosis of each page."""
+    ordered = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     rows = [
@@ -42,6 +42,5 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
         }
         for page, diagnosis in ordered
     ]
-    return template.write(
-        path, template.render("index.html.j2", title=f"{counted(len(pages), 'recording')}: {summary}", rows=rows)
-    )
+    title = f"{format_count(len(pages), 'recording')}: {summary}"
+    return template.write(path, template.render("index.html.j2", title=title, rows=rows))

@@ -1,4 +1,4 @@
-"""Sentences on a diagnosis for page and terminal: `messages.toml` holds the words, this file chooses and fills in."""
+"""Format a diagnosis for the page and the terminal: choose texts of `messages.toml` and fill in their values."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
 from typing import Any
 
+from sealscope.diagnosis.decision.combination import ORDER
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE
+from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, TotalLeakage
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.states import MachineState
 from sealscope.errors import printable
-from sealscope.paragraphs import WIDTH, paragraph, paragraphs
-from sealscope.recordings.formats.columns import counted, listed
+from sealscope.paragraphs import WIDTH, format_count, join_names, paragraph, paragraphs
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import suggested_map
+from sealscope.recordings.formats.headings.proposal import suggest_map_entry
 from sealscope.units import from_si
 
 ABSENT = "–"
@@ -26,17 +26,18 @@ ABSENT = "–"
 
 @cache
 def _texts() -> dict[str, dict[str, str]]:
+    """Load `messages.toml`: section -> key -> text."""
     return tomllib.loads((resources.files("sealscope.reporting") / "messages.toml").read_text(encoding="utf-8"))
 
 
 def say(name: str, /, **values: Any) -> str:
-    """Return the text `section.key` with its values."""
+    """Return the text `section.key` of `messages.toml` with `values` in its placeholders."""
     section, _, key = name.partition(".")
     return _texts()[section][key].format(**values)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return `value` with `digits` significant digits, a dash for None or NaN; no exponent where that is short."""
+    """Format `value` with `digits` significant digits, without an exponent from 1e-6 to 1e9; a dash for None or NaN."""
     if value is None or isnan(value):
         return ABSENT
     if not isfinite(value):
@@ -50,51 +51,46 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """Return a time in seconds (one decimal, more below 10 s), from an hour on as h:mm:ss as well."""
+    """Format a time in seconds, with one decimal from 10 s on, and from an hour on also as h:mm:ss."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
     text = f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s"
     if abs(seconds) >= 3600:
-        whole = int(abs(seconds))
-        text += f" ({'-' * (seconds < 0)}{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d})"
+        minutes, whole_seconds = divmod(int(abs(seconds)), 60)
+        text += f" ({'-' * (seconds < 0)}{minutes // 60}:{minutes % 60:02d}:{whole_seconds:02d})"
     return text.replace("-", "−")
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict as the heading of page and card: the summary of the terminal and of JSON, as a sentence."""
+    """Format the verdict as a sentence for the heading of page and card."""
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
         key = diagnosis.cause
-    elif key == "no leak" and not diagnosis.known_healthy:  # one from the start would be hidden
+    elif key == "no leak" and not diagnosis.known_healthy:  # a leak from the start cannot be excluded
         key = "none began"
     return _texts()["headline"].get(key, key[0].upper() + key[1:])
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the cause of the change, None if there is none or it is not certain."""
+    """Return the cause of the change; None if there is none, or if it is a leak that the verdict does not state."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Test whether the verdict needs its reason: nothing can be told, or something other than a leak changed."""
+    """Return True if the reason is shown with the verdict: `cannot tell`, or a change that is no leak."""
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
-def state(diagnosis: Diagnosis) -> str:
-    """Return the state of the machine as NAMUR NE 107 names it, with its letter and its severity."""
-    return state_text(diagnosis.state)
-
-
 def state_text(machine_state: MachineState) -> str:
-    """Return a state of NE 107 in words."""
+    """Format a machine's state by NAMUR NE 107 with its symbol and severity."""
     severity = f", severity {machine_state.severity} of 1000" if machine_state.severity else ""
     return f"{machine_state.name} ({machine_state.symbol} of NE 107{severity})"
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Return since when oil leaks; None where there is no leak to date."""
+    """Format the onset of the leak with its interval; None without a leak."""
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -115,24 +111,26 @@ def how_much(diagnosis: Diagnosis) -> str | None:
             return say("how_much.at_most", high=number(interval[1], 2))
         return None
     if leak is None:
-        share = _pump_share(diagnosis)
-        return _why_no_flow(diagnosis) if share is None else f"{share}; {_why_no_flow(diagnosis)}"
+        fraction = _pump_fraction(diagnosis)
+        return _why_no_flow(diagnosis) if fraction is None else f"{fraction}; {_why_no_flow(diagnosis)}"
     if interval is None:
         return f"{number(leak)} L/min"
     return say("how_much.interval", leak=number(leak), low=number(interval[0]), high=number(interval[1]))
 
 
-def _pump_share(diagnosis: Diagnosis) -> str | None:
+def _pump_fraction(diagnosis: Diagnosis) -> str | None:
+    """Format the leak as a fraction of the pump's flow; None if it is not known."""
     severity = diagnosis.severity
-    known = severity is not None and severity.pump_share is not None
-    return f"{_percent(severity.pump_share[0])} of the pump's flow in this duty" if known else None  # type: ignore[union-attr, index]
+    if severity is None or severity.pump_share is None:
+        return None
+    return f"{_format_percent(severity.pump_share[0])} of the pump's flow in this duty"
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Give the reason for a leak without L/min, and the remedy."""
+    """Return the reason why the leak has no L/min, and the remedy."""
     if "leak_lpm" not in diagnosis.refuses:
-        small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
-        return say(f"how_much.{'too_small' if small else 'channels'}")
+        is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
+        return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
     if raw_counts(diagnosis):
         return say("how_much.counts")
     if diagnosis.machine is None or diagnosis.machine.stated:
@@ -140,13 +138,13 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
     return say(f"how_much.{'machine' if diagnosis.measured_ratio is None else 'machine_or_area'}")
 
 
-def rests_on(diagnosis: Diagnosis) -> str | None:
-    """Describe the machine behind every L/min of the diagnosis, None if it is not known."""
+def flow_basis(diagnosis: Diagnosis) -> str | None:
+    """Format the machine data on which all L/min of the diagnosis are based; None if no machine is known."""
     return None if diagnosis.machine is None else machine_text(diagnosis.machine)
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Format the area and displacement behind a flow, and their origin."""
+    """Format the area and displacement on which flows are based, and their origin."""
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -162,113 +160,120 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Return the leak against the repair limit, else beside the pump's flow; None where neither is known."""
+    """Format the leak relative to the repair limit, or else to the pump's flow; None if neither is known."""
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
         return None
     if severity.level is not None and severity.of_limit is not None:
-        low, high = severity.of_limit[1:]
-        share = f"{_span(low, high)} times" if high >= 10.0 else f"{_span(100.0 * low, 100.0 * high)} % of"
+        _, low, high = severity.of_limit
+        percent = _format_range(100.0 * low, 100.0 * high)
+        share = f"{_format_range(low, high)} times" if high >= 10.0 else f"{percent} % of"
         return say(f"how_bad.{severity.level}", share=share, limit=f"{limit}{'' if limit.stated else ', the default'}")
     if limit.stated:
         return say("how_bad.no_area", limit=limit)
-    return None if diagnosis.leak_lpm is None else _pump_share(diagnosis)
+    return None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis)
 
 
-def _span(low: float, high: float) -> str:
-    """Return a range with two digits; a single number where its ends are the same."""
-    ends = number(low, 2), number(high, 2)
-    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+def _format_range(low: float, high: float) -> str:
+    """Format a range with two digits, or a single number if both ends are then equal."""
+    return " to ".join(dict.fromkeys((number(low, 2), number(high, 2))))
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a share of the pump's flow and as a creep; None if none is known."""
+    """Format the leak in mL/min, as a fraction of the pump's flow and as a creep; None if none is known."""
     severity = diagnosis.severity
     if severity is None:
         return None
     creep = severity.creep_mm_per_min
     parts = [
         None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
-        None if diagnosis.leak_lpm is None else _pump_share(diagnosis),
+        None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),
         None if creep is None else f"as much as a piston that creeps by {number(creep[0], 2)} mm/min",
     ]
     return "; ".join(part for part in parts if part) or None
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the leakage of pump and piston together and the smallest detectable step, None if not known.
+    """Format the leakage of pump and piston together and the smallest detectable step; None if not known.
 
-    `basis`: with what L/min rests on.
+    `basis`: whether to add the machine data on which L/min are based.
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
         return None
     pressure = f"{number(from_si(leakage.pressure, diagnosis.pressure_unit, 'Pa'), 2)} {diagnosis.pressure_unit}"
-    findable = f"{number(leakage.findable_lpm, 2)} L/min"
     if leakage.lpm is None or leakage.interval_lpm is None:
-        known = leakage.pump_share is not None
-        key = "share" if known else "not_measured"
-        text = say(f"leakage.{key}", share=_percent(leakage.pump_share), pressure=pressure)
-        if leakage.findable_share is None:
-            return text
-        size = _percent(leakage.findable_share) + ("" if known else " of the pump's flow")
-        return text + say("leakage.findable", size=size if leakage.findable_lpm is None else f"{size}, {findable}")
+        return _leakage_fraction(leakage, pressure)
     low, high = leakage.interval_lpm
     key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
     figures = {"lpm": number(leakage.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
     text = say(f"leakage.{key}", pressure=pressure, **figures)
-    if basis and diagnosis.verdict != "leak" and (machine := rests_on(diagnosis)) is not None:
+    if basis and diagnosis.verdict != "leak" and (machine := flow_basis(diagnosis)) is not None:
         text += f" ({machine})"
     text += "" if leakage.healthy_lpm is None else say("leakage.healthy", lpm=number(leakage.healthy_lpm, 2))
-    return text + ("" if leakage.findable_lpm is None else say("leakage.findable", size=findable))
+    step = f"{number(leakage.findable_lpm, 2)} L/min"
+    return text + ("" if leakage.findable_lpm is None else say("leakage.findable", size=step))
+
+
+def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
+    """Format a leakage without L/min as a fraction of the pump's flow, and the smallest detectable step."""
+    is_known = leakage.pump_share is not None
+    key = "share" if is_known else "not_measured"
+    text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
+    if leakage.findable_share is None:
+        return text
+    step = _format_percent(leakage.findable_share) + ("" if is_known else " of the pump's flow")
+    step += "" if leakage.findable_lpm is None else f", {number(leakage.findable_lpm, 2)} L/min"
+    return text + say("leakage.findable", size=step)
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Format the leakage of pump and piston in a few words, None if it is not known or there is a leak."""
+    """Format the leakage of pump and piston briefly; None if it is not known or there is a leak."""
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
         return None
     if leakage.lpm is None or leakage.interval_lpm is None:
-        return None if leakage.pump_share is None else f"in all {_percent(leakage.pump_share)} of the pump's flow"
+        percent = _format_percent(leakage.pump_share)
+        return None if leakage.pump_share is None else f"in all {percent} of the pump's flow"
     low, high = leakage.interval_lpm
     return f"in all {number(leakage.lpm, 2)} L/min" if low > 0.0 else f"in all at most {number(high, 2)} L/min"
 
 
 def states_flow(diagnosis: Diagnosis) -> bool:
-    """Test whether the diagnosis states any L/min."""
-    return diagnosis.leak_lpm is not None or (
-        diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
-    )
+    """Return True if the diagnosis states a flow in L/min."""
+    leakage = diagnosis.total_leakage
+    return diagnosis.leak_lpm is not None or (leakage is not None and leakage.lpm is not None)
 
 
-def _percent(share: float | None) -> str:
-    return ABSENT if share is None else f"{number(100.0 * share, 2)} %"
+def _format_percent(fraction: float | None) -> str:
+    """Format a fraction in percent, a dash for None."""
+    return ABSENT if fraction is None else f"{number(100.0 * fraction, 2)} %"
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the share of healthy recordings like this one, the score against its threshold, and its meaning."""
+    """Format the odds that a healthy recording looks like this one, the score and its threshold, and false alarms."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
-    odds, other = _odds(diagnosis), cause(diagnosis)
+    odds, found_cause = _odds(diagnosis), cause(diagnosis)
     odds = "" if odds is None else f"{odds}; "
     relation = "over" if diagnosis.score > diagnosis.threshold else "not over"
-    if diagnosis.verdict != "leak" and other is not None and diagnosis.alarmed:
-        odds, relation = f"that something changed: {odds}", f"for {other}, over"
-    judge = diagnosis.methods[0].detector if diagnosis.methods else ""
+    if diagnosis.verdict != "leak" and found_cause is not None and diagnosis.alarmed:
+        odds, relation = f"that something changed: {odds}", f"for {found_cause}, over"
+    detector = diagnosis.methods[0].detector if diagnosis.methods else ""
     return say(
         "how_sure.score", odds=odds, score=number(diagnosis.score), relation=relation,
-        threshold=number(diagnosis.threshold), judge=f" of {judge}" if judge else "",
+        threshold=number(diagnosis.threshold), judge=f" of {detector}" if detector else "",
         false_alarms=false_alarms(diagnosis),
     )  # fmt: skip
 
 
-def in_short(diagnosis: Diagnosis) -> str:
-    """Format the share of healthy recordings like this one, or the false alarms allowed if it is not stated."""
+def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
+    """Format the odds that a healthy recording looks like this one, or the false-alarm probability without them."""
     return _odds(diagnosis) or false_alarms(diagnosis)
 
 
 def _odds(diagnosis: Diagnosis) -> str | None:
-    """Format the share of healthy recordings like this one, or with as much change if nothing changed."""
+    """Format the odds that a healthy recording looks like this one, or if nothing changed, shows as much change."""
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
         return odds
@@ -276,7 +281,7 @@ def _odds(diagnosis: Diagnosis) -> str | None:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the false-alarm probability of the threshold."""
+    """Format the false-alarm probability of the threshold as a percentage and as 1 in n."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))
@@ -286,85 +291,87 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """List the next checks, most useful first."""
-    level = None if diagnosis.severity is None else diagnosis.severity.level
-    judge = diagnosis.methods[0].detector if diagnosis.methods else ""
-    confirmed = say(f"once_confirmed.{level or 'plan'}", limit=diagnosis.limit)
-    named = diagnosis.named_cause is not None
-    if named and diagnosis.verdict == "leak":
-        steps = [diagnosis.next_check, say("next.repeat"), confirmed]
-    elif named:
+    severity_level = None if diagnosis.severity is None else diagnosis.severity.level
+    deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""
+    confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
+    has_named_cause = diagnosis.named_cause is not None
+    if diagnosis.verdict == "leak":
+        steps = [diagnosis.next_check, say("next.repeat" if has_named_cause else "next.creep"), confirmed]
+    elif has_named_cause:
         steps = [diagnosis.next_check, say("next.resolved")]
-    elif diagnosis.verdict == "leak":
-        steps = [diagnosis.next_check, say("next.creep"), confirmed]
-    elif diagnosis.verdict == "no leak" and judge == RMS_CHANGE:
-        steps = [say("next.ringing"), say("next.longer")]
     elif diagnosis.verdict == "no leak":
-        steps = [diagnosis.next_check, say("next.longer")]
+        steps = [say("next.ringing") if deciding_detector == RMS_CHANGE else diagnosis.next_check, say("next.longer")]
     else:
+        estimates_flow = any(method.usable for method in diagnosis.methods if method.detector in ORDER)
         steps = [say("next.cause"), say("next.record")]
-    # a baseline that was left out, such as the recording itself, is no fault of its data
+        if not estimates_flow and any(method.usable for method in diagnosis.methods):
+            steps.reverse()  # a channel is missing: record it first
+        if diagnosis.unused and not estimates_flow:
+            steps.insert(0, say("next.map"))
+    # a baseline that was left out, such as the recording itself, is no defect of the data
     findings = (finding for finding in diagnosis.quality if finding.code != "baseline_left_out")
-    trouble = [finding for finding in findings if finding.severity != "note"]
-    if trouble:
-        names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in trouble]
-        key = "rule_out" if named or diagnosis.verdict == "leak" else "care"
-        key, place = ("findings", 1) if not named and diagnosis.verdict == "cannot tell" else (key, 0)
-        steps.insert(place, say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
+    defects = [finding for finding in findings if finding.severity != "note"]
+    if defects:
+        names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in defects]
+        key, position = ("rule_out" if has_named_cause or diagnosis.verdict == "leak" else "care"), 0
+        if not has_named_cause and diagnosis.verdict == "cannot tell":
+            key, position = "findings", 1
+        steps.insert(position, say(f"next.{key}", faults=", ".join(dict.fromkeys(names))))
     return tuple(steps)
 
 
 def quality_summary(diagnosis: Diagnosis) -> str:
-    """Count the findings, and name the worst severity among them."""
+    """Format the number of findings and the worst severity among them."""
     severities = {finding.severity for finding in diagnosis.quality}
     worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
-    return f"{counted(len(diagnosis.quality), 'finding')}{worst}"
+    return f"{format_count(len(diagnosis.quality), 'finding')}{worst}"
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Name the pressures in raw counts and the remedy; None if there are none."""
+    """Format a note on pressures in raw counts, with the remedy; None if there are none."""
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
 
-def not_used(diagnosis: Diagnosis) -> str | None:
-    """Name the recorded pressures, positions, speeds and flows without a channel; None if there are none."""
+def format_unused_columns(diagnosis: Diagnosis) -> str | None:
+    """Format a note on recorded columns that look usable but have no channel, with --map options; None if none."""
     if not diagnosis.unused:
         return None
-    lines = " ".join(f"--map '{suggested_map(Label.parse(name))}'" for name in diagnosis.unused[:4])
-    return f"{listed(diagnosis.unused)}: recorded, and used for no channel; if they are: {lines}"
+    lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
+    return f"{join_names(diagnosis.unused)}: recorded, and used for no channel; if they are: {lines}"
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Return the verdict, its figures and the next step as plain text of about five lines; `width`: columns [1]."""
-    sure = in_short(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
+    """Format the verdict, its figures and the next step as about five lines of text; `width`: columns of a line."""
+    odds = odds_or_false_alarms(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
-        ("state", state(diagnosis)),
-        *_figures(diagnosis),
+        ("state", state_text(diagnosis.state)),
+        *_figure_rows(diagnosis),
         ("leakage", total_leakage(diagnosis) if diagnosis.verdict == "no leak" else None),
         ("cause", cause(diagnosis)),
-        ("reason", diagnosis.reason) if shows_reason(diagnosis) else ("how sure", sure),
+        ("reason", diagnosis.reason) if shows_reason(diagnosis) else ("how sure", odds),
         ("data", quality_summary(diagnosis) if diagnosis.quality else None),
         ("units", raw_counts(diagnosis)),
-        ("not used", not_used(diagnosis)),
+        ("not used", format_unused_columns(diagnosis)),
         ("next", next_steps(diagnosis)[0]),
     ]
-    return _lines(diagnosis, rows, width)
+    return _format_lines(diagnosis, rows, width)
 
 
 def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Return the verdict and its figures as plain text, with every method and finding.
+    """Format the verdict, its figures, and all methods and findings as text; `width`: columns of a line.
 
-    `width`: columns [1]. Without colours, and without control characters that a file name or header could bring.
+    The text has no colours, and no control characters, which file names or headers could contain.
     """
     rows: list[tuple[str, str | None]] = [
-        ("state", state(diagnosis)),
-        *_figures(diagnosis),
+        ("state", state_text(diagnosis.state)),
+        *_figure_rows(diagnosis),
         ("which is", other_sizes(diagnosis)),
         ("leakage", total_leakage(diagnosis)),
         ("cause", cause(diagnosis)),
         ("how sure", how_sure(diagnosis)),
         ("reason", diagnosis.reason),
-        ("not used", not_used(diagnosis)),
+        ("not used", format_unused_columns(diagnosis)),
     ]
     for method in diagnosis.methods:
         odds = "" if method.odds is None else f"{method.odds}; "
@@ -373,24 +380,25 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
         rows.append(("method", f"{method.detector}: {method.summary} ({figures})"))
     rows += [(finding.severity, finding.text) for finding in diagnosis.quality]
     rows += [("" if k else "next", step) for k, step in enumerate(next_steps(diagnosis)[:2])]
-    return _lines(diagnosis, rows, width)
+    return _format_lines(diagnosis, rows, width)
 
 
-def _figures(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
-    size, basis = how_much(diagnosis), rests_on(diagnosis)
+def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
+    """Build the rows on onset, size and severity of the leak."""
+    size, basis = how_much(diagnosis), flow_basis(diagnosis)
     if size is not None and basis is not None and diagnosis.leak_lpm is not None:
         size = f"{size}; {basis}"
     return [("since", since(diagnosis)), ("how much", size), ("how bad", how_bad(diagnosis))]
 
 
-def _lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Return a line with the verdict, and a paragraph for each row that has a text."""
+def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
+    """Format a line with the verdict, and a paragraph for each row with a text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, 12, width)))
 
 
-def flow(diagnosis: Diagnosis) -> str:
-    """Return the leak with its interval, or its bound, in a few words."""
+def format_leak_flow(diagnosis: Diagnosis) -> str:
+    """Format the leak with its interval, or its upper bound."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -400,25 +408,25 @@ def flow(diagnosis: Diagnosis) -> str:
 
 
 def what_to_do(diagnosis: Diagnosis) -> str:
-    """Return the first thing to do; the reason where there is no verdict."""
+    """Return the first next step, or the reason for `cannot tell`."""
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 
-#: Columns of a file's name in a table; a longer name has a line of its own.
-_FILE = 22
+#: Width of the file's name in a table; a longer name is written on a separate line.
+_FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as one line of a table: file, date, verdict, L/min, and the remedy of a change.
+    """Format a diagnosis as a line of a table: file, date, verdict and L/min; a second line states what to do.
 
-    `start_s`: when the recording began [s since 1970].
+    `start_s`: start of the recording [s since 1970].
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
-    file = file if len(file) <= _FILE else f"{file}\n{'':{_FILE}}"
-    line = f"{file:<{_FILE}} {date:<10} {diagnosis.verdict:<11} {flow(diagnosis)}"
-    named = cause(diagnosis)
-    if diagnosis.verdict == "no leak" and named is None:
+    file = file if len(file) <= _FILE_COLUMNS else f"{file}\n{'':{_FILE_COLUMNS}}"
+    line = f"{file:<{_FILE_COLUMNS}} {date:<10} {diagnosis.verdict:<11} {format_leak_flow(diagnosis)}"
+    found_cause = cause(diagnosis)
+    if diagnosis.verdict == "no leak" and found_cause is None:
         return line
-    before = "" if named is None or diagnosis.verdict == "leak" else f"{named}: "
-    return f"{line}\n{paragraph(before + what_to_do(diagnosis), '    ')}"
+    prefix = "" if found_cause is None or diagnosis.verdict == "leak" else f"{found_cause}: "
+    return f"{line}\n{paragraph(prefix + what_to_do(diagnosis), '    ')}"

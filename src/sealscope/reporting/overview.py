@@ -1,4 +1,4 @@
-"""A recording in a few lines of a terminal: where it comes from, its channels as small curves, and what is wrong."""
+"""Format an overview of a recording for the terminal: origin, channels as small curves, notes and findings."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import numpy as np
 
 from sealscope.paragraphs import WIDTH, paragraph
 from sealscope.recordings.channels import LONG_NAMES, Array
-from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.reporting.charts import shown_values
+from sealscope.reporting.charts import display_values
 
 _BARS = "▁▂▃▄▅▆▇█"
 #: Width of a curve in characters.
-CURVE = 20
+CURVE_WIDTH = 20
 
 
-def curve(values: Array, width: int = CURVE) -> str:
-    """Draw values (n,) as `width` bars between their least and largest, blank for missing samples."""
-    known = values[np.isfinite(values)]
-    if not known.size:
+def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
+    """Draw values (n,) as `width` bars scaled between minimum and maximum, blank for missing samples."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
         return " " * width
-    low, high = float(known.min()), float(known.max())
+    low, high = float(finite.min()), float(finite.max())
     edges = np.linspace(0, values.size, min(width, values.size) + 1).astype(int)
     bars = []
     for begin, end in pairwise(edges):
@@ -33,14 +32,14 @@ def curve(values: Array, width: int = CURVE) -> str:
         if not part.size:
             bars.append(" ")
             continue
-        # a middle sample, not a mean: a mean over many strokes would show a line
-        share = (float(part[part.size // 2]) - low) / (high - low) if high > low else 0.0
-        bars.append(_BARS[min(int(share * len(_BARS)), len(_BARS) - 1)])
+        # middle sample instead of mean: the mean over many strokes is constant
+        fraction = (float(part[part.size // 2]) - low) / (high - low) if high > low else 0.0
+        bars.append(_BARS[min(int(fraction * len(_BARS)), len(_BARS) - 1)])
     return "".join(bars)
 
 
-def _short(value: float) -> str:
-    """Format a number with four digits, without an exponent where it is large."""
+def _format_short(value: float) -> str:
+    """Format a number with four digits; from 1e4 to 1e9 as an integer instead of with an exponent."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
@@ -50,16 +49,15 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""
     seconds = len(recording) / recording.rate
-    lines = [
-        paragraph(f"{name}: {kind}{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}", indent=2)
-    ]
+    clock = f"{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}"
+    lines = [paragraph(f"{name}: {kind}{clock}", indent=2)]
     for channel, values in recording.channels.items():
-        unit, values_shown = shown_values(recording, channel, recording.pressure_unit)
-        known = values_shown[np.isfinite(values_shown)]
-        ends = f"{_short(known.min())} to {_short(known.max())} {unit}" if known.size else "no values"
+        unit, converted = display_values(recording, channel, recording.pressure_unit)
+        finite = converted[np.isfinite(converted)]
+        ends = f"{_format_short(finite.min())} to {_format_short(finite.max())} {unit}" if finite.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
-        lines.append(line + curve(values, max(CURVE // 2, WIDTH - len(line))))
-    texts = [f"{name}: {value}" for name, value in remarks_of(provenance).items()]
+        lines.append(line + draw_curve(values, max(CURVE_WIDTH // 2, WIDTH - len(line))))
+    texts = [f"{name}: {value}" for name, value in recording.remarks.items()]
     texts += [f"not used: {', '.join(recording.unused)}"] if recording.unused else []
     texts += [f"note: {line}" for line in recording.history]
     texts += [f"{finding.severity}: {finding.text}" for finding in findings] or ["no defect of the data"]

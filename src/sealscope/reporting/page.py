@@ -20,8 +20,8 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark
-from sealscope.reporting.particulars import particulars_of
-from sealscope.reporting.schematic import circuit_of, columns_of, schematic
+from sealscope.reporting.particulars import collect_particulars
+from sealscope.reporting.schematic import build_circuit, channel_columns, schematic
 from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP
 
 if TYPE_CHECKING:
@@ -51,9 +51,9 @@ def report(
     recording : Recording
         The recording that was judged.
     path : str or path-like
-        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is complete under its name or not there
-        at all. A PDF is printed by a browser of Chromium's family or by WeasyPrint, whichever is on the machine. The
-        card is a picture of 1200 x 630 pixels with machine, date, verdict, L/min and its curve; a browser draws it.
+        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is written atomically. A PDF is printed
+        by a browser of Chromium's family or by WeasyPrint, whichever is installed. The card is a picture of 1200 x 630
+        pixels with machine, date, verdict, L/min and its curve, which is drawn by a browser.
     diagnosis : Diagnosis, optional
         Its diagnosis; by default that of `sealscope.diagnose` with the `rig`.
     rig : Rig, str or path-like, optional
@@ -61,11 +61,11 @@ def report(
     marks : sequence of Mark, optional
         Further moments on every chart.
     truth_onset_s, truth_leak_lpm : float, optional
-        What is known to be true, shown beside the verdict [s], [L/min].
+        True onset [s] and leak [L/min], if known, to be shown next to the verdict.
     title : str, optional
         Title of the page; by default the name of the recording.
     pressure_unit : {"bar", "MPa", "kPa", "psi"}, optional
-        Unit in which pressures are shown, by default that of the log, else bar.
+        Unit of the pressures on the page; by default that of the log, or bar if it states none.
 
     Returns
     -------
@@ -75,9 +75,9 @@ def report(
     Raises
     ------
     InputError
-        The recording is empty, the path is no page's or cannot be written, or a unit or rig is not known.
+        The recording is empty, the path has another suffix or cannot be written, or a unit or rig is not known.
     MissingExtra
-        A PDF or a picture is asked for, and nothing on the machine makes it.
+        No program for making a PDF or a picture is installed.
 
     Examples
     --------
@@ -87,7 +87,7 @@ def report(
     >>> page.read_text(encoding="utf-8")[:15]
     '<!DOCTYPE html>'
     """
-    target = template.check_page(path)
+    target = template.parse_page_path(path)
     if diagnosis is None:
         from sealscope.diagnosis.diagnose import diagnose
 
@@ -105,20 +105,24 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
     return report(recording, path, diagnosis, **options)
 
 
-def _rig_of(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Return the rig of the call, else that of the diagnosis, else None."""
+def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
+    """Return the rig that is shown: `rig` if given, else the packaged rig of the diagnosis.
+
+    None if `rig` states no dimensions, or the diagnosis has no packaged rig.
+    """
     from sealscope.parameters import load_rig, rig_names
 
     if rig is not None:
         loaded = load_rig(rig)
         return loaded if states_rig(loaded) else None
     machine = diagnosis.machine
-    known = machine is not None and machine.stated_by != "nobody" and machine.rig in rig_names()
-    return load_rig(machine.rig) if known and machine is not None else None
+    if machine is None or machine.stated_by == "nobody" or machine.rig not in rig_names():
+        return None
+    return load_rig(machine.rig)
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Return the marks of a page; raise InputError where there is nothing to report."""
+    """Return the marks of a page, with the true onset if it is known; raise InputError for an empty recording."""
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -133,10 +137,10 @@ def render_card(
     truth_onset_s: float | None = None,
     title: str | None = None,
 ) -> str:
-    """Return the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `report`."""
-    shown = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
+    """Render the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `report`."""
+    card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
-    particulars = particulars_of(recording, _rig_of(diagnosis, rig))
+    particulars = collect_particulars(recording, _choose_rig(diagnosis, rig))
     name = Path(diagnosis.file).name
     subtitle = (name, particulars.get("Operator"), particulars.get("Oil temperature"))
     return template.render(
@@ -146,14 +150,14 @@ def render_card(
         title=title or particulars.get("Machine", name),
         date=particulars.get("Date", ""),
         subtitle=" · ".join(text for text in subtitle if text),
-        charts=shown,
-        drawn=charts.draw(recording, [], shown, diagnosis, all_marks),
+        charts=card_charts,
+        drawn=charts.draw(recording, [], card_charts, diagnosis, all_marks),
         width=WIDTH,
         height=HEIGHT,
     )
 
 
-@np.errstate(all="ignore")  # what overflows is not drawn
+@np.errstate(all="ignore")  # values that overflow are not drawn
 def render_page(
     recording: Recording,
     diagnosis: Diagnosis,
@@ -165,22 +169,22 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Return the page as a string of HTML; arguments and errors as for `report`."""
+    """Render the page as HTML; arguments and errors as for `report`."""
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit
     diagnosis = replace(diagnosis, pressure_unit=pressure_unit)
-    known_rig, all_marks = _rig_of(diagnosis, rig), _all_marks(recording, marks, truth_onset_s)
-    details = [features.chamber_details(recording, name) for name in CHAMBERS]
-    chambers = [chamber for chamber, _ in details if chamber is not None]
-    shown = [
+    known_rig, all_marks = _choose_rig(diagnosis, rig), _all_marks(recording, marks, truth_onset_s)
+    details_and_notes = [features.chamber_details(recording, name) for name in CHAMBERS]
+    chambers = [chamber for chamber, _ in details_and_notes if chamber is not None]
+    page_charts = [
         *charts.course_charts(diagnosis),
         *charts.rms_charts(chambers, pressure_unit),
         *charts.channel_charts(recording, pressure_unit),
         *charts.detail_charts(chambers, pressure_unit),
     ]
-    drawn = charts.draw(recording, chambers, shown, diagnosis, all_marks)
-    circuit = circuit_of(known_rig, recording, diagnosis.machine)
+    drawn = charts.draw(recording, chambers, page_charts, diagnosis, all_marks)
+    circuit = build_circuit(known_rig, recording, diagnosis.machine)
     facts = f"{len(recording)} samples at {recording.rate:g} Hz, {messages.clock(recording.duration)}"
     return template.render(
         "page.html.j2",
@@ -188,51 +192,54 @@ def render_page(
         messages=messages,
         title=title or Path(diagnosis.file).name,
         subtitle=f"{diagnosis.file} · {facts}",
-        particulars=particulars_of(recording, known_rig),
+        particulars=collect_particulars(recording, known_rig),
         truth=(truth_onset_s, truth_leak_lpm),
         marks=all_marks,
-        groups={group: [chart for chart in shown if chart.group == group] for group in charts.GROUPS},
+        groups={group: [chart for chart in page_charts if chart.group == group] for group in charts.GROUPS},
         drawn=drawn,
         window=WINDOW_SIZE,
         step=WINDOW_STEP,
-        notes=[note for _, note in details if note],
+        notes=[note for _, note in details_and_notes if note],
         schematic=Markup(schematic(recording, diagnosis, circuit)),
         rig=known_rig,
         circuit=circuit,
-        columns=columns_of(recording),
+        columns=channel_columns(recording),
         recording=recording,
-        channels=[_summary(recording, name, pressure_unit) for name in recording.channels],
-        provenance=list(_flat(recording.provenance)),
-        chart_data=drawn.data if shown else None,
-        **_changes(recording, diagnosis, chambers, pressure_unit),
+        channels=[_summarise_channel(recording, name, pressure_unit) for name in recording.channels],
+        provenance=list(_flatten(recording.provenance)),
+        chart_data=drawn.data if page_charts else None,
+        **_change_rows(recording, diagnosis, chambers, pressure_unit),
     )
 
 
-def _changes(
+def _change_rows(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    """Return the RMS of each detail in both parts in the unit shown, and the end of the scale of their changes [%]."""
+    """Build the values for the table of changes: RMS of each detail in both parts, and the end of the bars [%]."""
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
     for change in features.changes(recording, chambers, parts):
-        unit, size = charts.detail_unit(recording.units[change.channel], change.name, pressure_unit)
-        before, after = (None if value is None else value / size for value in (change.before, change.after))
-        label = charts.label_of(change.name)
+        unit, scale = charts.detail_unit(recording.units[change.channel], change.name, pressure_unit)
+        before, after = (None if value is None else value / scale for value in (change.before, change.after))
+        label = charts.detail_label(change.name)
         rows.append((change.channel, label, unit, before, after, change.percent))
-    largest = max([10.0, *(abs(row[-1]) for row in rows if row[-1] is not None)])
-    return {"changes": rows, "bar_limit": min(100.0, 10.0 * ceil(largest / 10.0)), "parts": parts}
+    max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])
+    return {"changes": rows, "bar_limit": min(100.0, 10.0 * ceil(max_change / 10.0)), "parts": parts}
 
 
-def _summary(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    unit, values = charts.shown_values(recording, name, pressure_unit)
+def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
+    """Compute minimum, mean and maximum of a channel in its display unit, and the number of missing samples."""
+    unit, values = charts.display_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
-    low, mean, high = (float(f(finite)) if finite.size else None for f in (np.min, np.mean, np.max))
+    statistics = (np.min, np.mean, np.max)
+    low, mean, high = (float(statistic(finite)) if finite.size else None for statistic in statistics)
     return {"name": name, "unit": unit, "low": low, "mean": mean, "high": high, "missing": values.size - finite.size}
 
 
-def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield (dotted name, text) of all entries of nested mappings."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
-            yield from _flat(inner, f"{prefix}{key}.")
+            yield from _flatten(inner, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", inner if isinstance(inner, str) else json.dumps(inner, default=str)

@@ -1,4 +1,4 @@
-"""A chart as SVG: shapes and labels in a frame, given in the values of its axes."""
+"""Build a chart as SVG shapes and labels in a frame, from values of its axes."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 
 from sealscope.recordings.recording import Array
 
-#: Symbols by the first word of their style, as paths from where they stand.
+#: First word of a style -> path of its symbol, relative to its position.
 SYMBOLS = {
     "point": "m-3 0a3 3 0 1 0 6 0a3 3 0 1 0-6 0z",
     "bound": "m-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0zm4 4v12m-3.5-4l3.5 4l3.5-4",
     "beyond": "m0-4l5 9h-10z",
     "absent": "m-3-3l6 6m0-6l-6 6",
 }
-#: Least extent of a box, so that it can be seen.
-_LEAST = 2.0
+#: Smallest side of a box, so that it is visible.
+_MIN_BOX = 2.0
 
 
 class SvgPath(NamedTuple):
-    """A part of a picture: its style's name in the style sheet, its path, and what it says where it is pointed at."""
+    """A shape of a picture: name of its style in the style sheet, SVG path, and tooltip."""
 
     style: str
     path: str
@@ -30,7 +30,7 @@ class SvgPath(NamedTuple):
 
 
 class SvgText(NamedTuple):
-    """A text at a place of the picture; `turned`: it reads upwards."""
+    """A text at a position in the picture; `turned`: it reads upwards."""
 
     x: float
     y: float
@@ -43,8 +43,8 @@ class SvgText(NamedTuple):
 class Picture:
     """A picture with a frame of `width` x `height`; `shapes` are drawn in their order, then the `labels`.
 
-    `x_ends`, `y_ends`: ends of the axes, those of a logarithmic x (`log`) in decades; `margins`: left of the frame,
-    above, right and below.
+    `x_ends`, `y_ends`: ends of the axes, as powers of ten for a logarithmic x axis (`log`); `margins`: left of the
+    frame, above, right and below.
     """
 
     width: float
@@ -58,7 +58,7 @@ class Picture:
 
     @property
     def view_box(self) -> str:
-        """The shown part of the plane, an SVG viewBox."""
+        """The SVG viewBox: frame and margins."""
         left, top, right, bottom = self.margins
         return f"{-left:g} {-top:g} {left + self.width + right:g} {top + self.height + bottom:g}"
 
@@ -83,68 +83,69 @@ class Picture:
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
-        """Draw the line through points (n,), broken where y is missing; places with so many decimals."""
+        """Draw the line through points (n,), broken at missing y; `digits`: decimals of the coordinates."""
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        drawn = np.isfinite(y)
-        begins = drawn & ~np.append(False, drawn[:-1])
-        points = zip(begins[drawn], self.x(x[drawn]), self.y(y[drawn]), strict=True)
+        """Format the line through points (n,) as an SVG path, which begins anew after missing y."""
+        is_drawn = np.isfinite(y)
+        is_first = is_drawn & ~np.append(False, is_drawn[:-1])
+        points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
         return "".join(f"{'M' if first else 'L'}{a:.{digits}f} {b:.{digits}f}" for first, a, b in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between two lines (n,) where both are known."""
-        there = np.isfinite(low) & np.isfinite(high)
-        if there.any():
-            around = np.append(x[there], x[there][::-1]), np.append(high[there], low[there][::-1])
-            self.draw(style, self._path(*around) + "z")
+        """Draw the area between two lines (n,), without points at which one of them is missing."""
+        is_known = np.isfinite(low) & np.isfinite(high)
+        if is_known.any():
+            outline = np.append(x[is_known], x[is_known][::-1]), np.append(high[is_known], low[is_known][::-1])
+            self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
         """Draw a box from `begin` to `end`, from `low` to `high` or over the whole height."""
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
-        right, bottom = max(float(self.x(end)), left + _LEAST), max(bottom, top + _LEAST)
+        right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw an upright line over the whole height."""
+        """Draw a vertical line over the whole height."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a line over the whole width."""
+        """Draw a horizontal line over the whole width."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
-        """Draw one of the `SYMBOLS`, `down` units of the picture below its top."""
+        """Draw one of the `SYMBOLS` at `x`, `down` units below the top of the frame."""
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
-        """Draw a point and its interval."""
+        """Draw a point, and a vertical line over its interval `ends` of y."""
         self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
         self.symbol(style, x, float(self.y(y)), title)
 
     def frame(self, count: int) -> None:
-        """Draw the frame, and about so many levels with their values."""
+        """Draw the frame, and about `count` horizontal grid lines with their values."""
         for value in ticks(*self.y_ends, count):
             self.level("grid", value)
             self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
         self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
 
     def below(self, x: float, text: str, anchor: str = "middle") -> None:
-        """Write a text under the frame."""
+        """Write a text below the frame at `x`."""
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """Return round values (1, 2 or 5 times a power of ten apart) between low and high, about `count` of them."""
-    raw = (high - low) / count
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = float(next(m for m in (1, 2, 5, 10) if m * power >= raw * 0.999) * power)
+    """Choose about `count` round values between low and high, with steps of 1, 2 or 5 times a power of ten."""
+    min_step = (high - low) / count
+    power = 10.0 ** np.floor(np.log10(min_step))
+    step = float(next(m for m in (1, 2, 5, 10) if m * power >= min_step * 0.999) * power)
     first = int(np.ceil(low / step - 1e-9))
     return [float(f"{i * step:.12g}") for i in range(first, int(np.floor(high / step + 1e-9)) + 1)]
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 times the powers of ten between two decades."""
+    """List 1, 2 and 5 times the powers of ten between 10^low and 10^high."""
     values = [float(f"{m}e{power}") for power in range(math.floor(low), math.ceil(high) + 1) for m in (1, 2, 5)]
     return [value for value in values if low <= math.log10(value) <= high]

@@ -1,4 +1,4 @@
-"""The actuator as a labelled schematic after ISO 1219, drawn from the rig: rods, throttles, make-up, or its valve."""
+"""Draw the actuator as a labelled schematic after ISO 1219, with the rig's rods, throttles, make-up or valve."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sealscope.parameters import Rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages, template
 
-#: Values of the rig that the page names: parameter, unit shown, SI per unit.
+#: Label -> parameter of the rig, display unit, value of that unit in SI.
 _VALUES = {
     "A_A": ("cylinder.A_A", "mm²", 1e-6),
     "A_B": ("cylinder.A_B", "mm²", 1e-6),
@@ -21,19 +21,18 @@ _VALUES = {
     "closed_A": ("line.closed_A", "%", 1e-2),
     "closed_B": ("line.closed_B", "%", 1e-2),
 }
-#: Two areas that differ by more have the rod on one side only; by less, two rods that are not quite alike.
-_ALIKE = 0.95
-#: Height of the cylinder's bore in the drawing, and of a rod whose thickness is not known.
+#: A cylinder counts as double-rod if the smaller area is at least this fraction of the larger one.
+_MIN_DOUBLE_ROD_RATIO = 0.95
+#: Height of the cylinder's bore in the drawing, and of a rod of unknown diameter.
 _BORE, _ROD = 78.0, 18.0
 
 
 class Circuit(NamedTuple):
     """The drawn parts of a machine.
 
-    `cylinder`: its kind in words; `rods`: the sides that the rod leaves, "A", "B" or "AB"; `rod`: its height in the
-    drawing, of a single rod in proportion to the bore: sqrt(1 - A_small / A_large); `throttles`, `make_up`, `bypass`:
-    whether the lines have them; `valve`: whether a servo valve drives it; `values`: symbol -> value with its unit, ""
-    where it is not known.
+    `cylinder`: name of its kind; `rods`: sides with a rod, "A", "B" or "AB"; `rod`: height of the rod in the drawing,
+    for a single rod sqrt(1 - A_small / A_large) of the bore; `throttles`, `make_up`, `bypass`: whether the lines have
+    them; `valve`: whether a servo valve drives the cylinder; `values`: label -> value with unit, "" if not known.
     """
 
     cylinder: str
@@ -46,46 +45,46 @@ class Circuit(NamedTuple):
     values: dict[str, str]
 
 
-def circuit_of(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
-    """Choose the parts to draw; of an unknown machine only those of every pump-controlled actuator.
+def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
+    """Choose the parts to draw; without a rig only the parts of every pump-controlled actuator are drawn.
 
-    `machine`: what is stated of one without a rig. A bypass is drawn where its flow meter was recorded.
+    `machine`: stated areas and displacement of a machine without a rig. A bypass is drawn if its flow is recorded.
     """
     bypass, values = "q_leak" in recorded, dict.fromkeys(_VALUES, "")
     if rig is None:
         cylinder: tuple[str, str, float] = ("cylinder", "AB", _ROD)
         if machine is not None and machine.area_stated and machine.areas is not None:
-            cylinder = _cylinder_of(machine.areas)
+            cylinder = _cylinder_parts(machine.areas)
             values["A_A"], values["A_B"] = (_value_text(area, "mm²", 1e-6) for area in machine.areas)
         if machine is not None and machine.displacement_stated:
             values["q_b"] = _value_text(machine.displacement, "cm³/rev", 1e-6)
-        return Circuit(*cylinder, False, False, bypass, False, values)
+        return Circuit(*cylinder, throttles=False, make_up=False, bypass=bypass, valve=False, values=values)
     return Circuit(
-        *_cylinder_of((rig.cylinder.A_A, rig.cylinder.A_B)),
+        *_cylinder_parts((rig.cylinder.A_A, rig.cylinder.A_B)),
         throttles=rig.line.orifices == "present" or max(rig.line.closed_A, rig.line.closed_B) > 0,
         make_up=rig.makeup.check_valves != "absent",
         bypass=bypass,
-        valve=rig.valve.spool == "present",
-        values={label: _value_text(float(rig[name]), unit, size) for label, (name, unit, size) in _VALUES.items()},
+        valve=rig.circuit.valve_controlled,
+        values={label: _value_text(float(rig[name]), unit, scale) for label, (name, unit, scale) in _VALUES.items()},
     )
 
 
-def _cylinder_of(areas: tuple[float, float]) -> tuple[str, str, float]:
-    """Return kind, sides of the rod and its height in the drawing of a cylinder with areas of sides A and B."""
+def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
+    """Return (kind, sides with a rod, height of the rod in the drawing) of a cylinder with the areas of A and B."""
     ratio = min(areas) / max(areas)
-    if ratio > _ALIKE:
+    if ratio > _MIN_DOUBLE_ROD_RATIO:
         return "double-rod cylinder", "AB", _ROD
-    rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)
+    rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)  # at most 0.8 of the bore, so that both remain visible
     return "single-rod cylinder", "A" if areas[0] <= areas[1] else "B", rod
 
 
-def _value_text(value: float, unit: str, size: float) -> str:
-    """Return a value in its unit, with the digits that a data sheet states."""
-    return f"{messages.number(value / size, 4)} {unit}"
+def _value_text(value: float, unit: str, scale: float) -> str:
+    """Format an SI value with four digits in a `unit` that is `scale` SI units."""
+    return f"{messages.number(value / scale, 4)} {unit}"
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:
-    """Draw the machine as SVG: the sensors with their column names, and the oil that bypasses the piston."""
+    """Draw the machine as SVG, with its sensors, their columns in the file, and the leak past the piston."""
     leaking = diagnosis.verdict == "leak"
     amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
     return template.render(
@@ -93,15 +92,15 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
         leaking=leaking,
         leak_label=f"leak {amount}".strip() if leaking else "",
         recorded={name: name in recording for name in CHANNEL_UNITS},
-        column=columns_of(recording),
+        column=channel_columns(recording),
         c=circuit,
         values=circuit.values,
         verdict=diagnosis.verdict,
     )
 
 
-def columns_of(recording: Recording) -> dict[str, str]:
-    """Map each channel to its column in the file, if the file names it differently."""
+def channel_columns(recording: Recording) -> dict[str, str]:
+    """Return channel -> column of the file; {} if the recording does not state them."""
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

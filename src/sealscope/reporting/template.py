@@ -1,4 +1,4 @@
-"""Rendering and writing of the pages: each is one HTML file with nothing outside it."""
+"""Render and write the pages; each is one HTML file that loads nothing from outside."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 _PACKAGE = "sealscope.reporting"
-#: Signs that a terminal or a browser obeys and nobody sees: controls, and what turns the direction of writing.
-_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+#: Invisible characters that a terminal or browser interprets: control codes, and changes of the writing direction.
+_CONTROL_CHARACTERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 @cache
 def _environment(package: str) -> jinja2.Environment:
-    """Set up the templates of a package, which may extend and include those of this one."""
+    """Build the environment for the templates of a package, which may use those of this package."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -39,7 +39,8 @@ def _environment(package: str) -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    environment.globals |= {"packaged": partial(packaged, package=package), "symbols": SYMBOLS, "version": _version()}
+    read_file = partial(read_package_file, package=package)
+    environment.globals |= {"packaged": read_file, "symbols": SYMBOLS, "version": _installed_version()}
     environment.filters |= {"script_hash": _script_hash, "script_json": _script_json}
     return environment
 
@@ -47,19 +48,19 @@ def _environment(package: str) -> jinja2.Environment:
 def render(
     template: str, *, package: str = _PACKAGE, chart_data: Any = None, scripts: Sequence[str] = (), **context: Any
 ) -> str:
-    """Fill in a template of a package.
+    """Render a template of a package with `context`.
 
-    `scripts`: files of the package that the page runs; with `chart_data`, plain JSON values, those of the charts.
-    Control characters that a file's name or description brought are replaced.
+    `scripts`: files of the package that the page runs; `chart_data`: plain JSON values of charts, whose scripts are
+    then added. Control characters, which may come from names and descriptions in files, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
-    text = page.render(context, chart_data=chart_data, scripts=[packaged(name, package) for name in names])
-    return _CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
+    text = page.render(context, chart_data=chart_data, scripts=[read_package_file(name, package) for name in names])
+    return _CONTROL_CHARACTERS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def packaged(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file to include unchanged in a page, from a package or else from this one."""
+def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
+    """Read a file that a page includes unchanged, from a package, or from this one if the package lacks it."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -74,15 +75,15 @@ def _script_hash(code: str) -> Markup:
 
 
 def _script_json(value: Any) -> Markup:
-    """Format plain JSON values for an element `script`, escaped so that none ends it."""
+    """Format plain JSON values for an element `script`, with <, > and & escaped."""
     from markupsafe import Markup
 
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
-def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Return the path of a page to write, `card`: or of its picture; raises InputError for a wrong kind of file."""
+def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
+    """Return the path of a page, or if `card` also of its picture; raise InputError for another suffix."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
@@ -90,19 +91,21 @@ def check_page(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page as UTF-8, or as a PDF if the name ends in .pdf; whole or not at all.
+    """Write a page atomically, as UTF-8, or as a PDF if the name ends in .pdf.
 
-    Raises InputError where it cannot be written, MissingExtra where nothing on the machine prints a PDF.
+    Raises InputError if it cannot be written, MissingExtra if no program for printing a PDF is installed.
     """
     if Path(path).suffix.lower() == ".pdf":
         print_page(page, path)
         return Path(path)
     with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace", newline="\n")  # a file's name
+        # the name of a file may contain bytes that are no UTF-8
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace", newline="\n")
     return Path(path)
 
 
-def _version() -> str:
+def _installed_version() -> str:
+    """Return the version of the installed package for a page's foot."""
     try:
         return metadata.version("sealscope")
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The wavelet's filters, and how far each level's detail reaches into the signal around it."""
+"""A wavelet's filters and their reach in each level, and checks of numeric arguments."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sealscope.errors import InputError
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: More levels than this would need more than 61 000 samples of db8 for one coefficient.
+#: Most levels: one coefficient of db8 at level 12 depends on 61 000 samples.
 MAX_LEVELS = 12
 
 
 @cache
 def discrete_wavelet(name: str) -> Any:
-    """Load PyWavelets' discrete wavelet of a name; raise InputError for an unknown one."""
+    """Load PyWavelets' discrete wavelet with this name; raise InputError for an unknown one."""
     import pywt
 
     if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
@@ -34,14 +34,13 @@ def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
     """Return the low-pass and high-pass taps h, g of the analysis, in the order of a causal convolution.
 
     ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, the same with g for d_j. Each of shape (taps,); for an orthogonal
-    wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, as PyWavelets
-    holds them.
+    wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, in PyWavelets.
     """
     filters = discrete_wavelet(wavelet)
     return np.array(filters.dec_lo, dtype=np.float64), np.array(filters.dec_hi, dtype=np.float64)
 
 
-def checked_levels(levels: int) -> int:
+def require_levels(levels: int) -> int:
     """Convert `levels` to an int from 1 to MAX_LEVELS; raise InputError for anything else."""
     if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)) or not 1 <= levels <= MAX_LEVELS:
         raise InputError(f"levels must be a whole number from 1 to {MAX_LEVELS}, got {levels!r}")
@@ -49,18 +48,18 @@ def checked_levels(levels: int) -> int:
 
 
 def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
-    """Count the samples before and after a sample that its details read, in each level, (levels, 2).
+    """Count the samples before and after a sample that its detail depends on, in each level, (levels, 2).
 
     ``before_j = (L/2 - 1)(2^j - 1)``, ``after_j = (L/2)(2^j - 1)`` with L taps, PyWavelets' alignment. For db8: 7, 21,
     49, 105 before and 8, 24, 56, 120 after.
     """
-    half = int(discrete_wavelet(wavelet).dec_len) // 2
-    spread = 2 ** np.arange(1, checked_levels(levels) + 1, dtype=np.int64) - 1
-    return np.stack([(half - 1) * spread, half * spread], axis=1)
+    half_length = int(discrete_wavelet(wavelet).dec_len) // 2
+    total_dilation = 2 ** np.arange(1, require_levels(levels) + 1, dtype=np.int64) - 1  # of this level and those above
+    return np.stack([(half_length - 1) * total_dilation, half_length * total_dilation], axis=1)
 
 
-def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
-    """Convert `values` to doubles; raise InputError unless real, finite and of `ndim` dimensions where stated."""
+def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
+    """Convert `values` to doubles; raise InputError unless they are real, finite and of `ndim` dimensions, if given."""
     try:
         array = np.asarray(values)
         if np.iscomplexobj(array) or array.dtype.kind in "SUMm":
@@ -71,18 +70,18 @@ def finite_array(values: ArrayLike, name: str = "signal", ndim: int | None = Non
     if array.ndim == 0 or (ndim is not None and array.ndim != ndim):
         dimensions = f"{ndim}-dimensional" if ndim else "at least one-dimensional"
         raise InputError(f"{name} must be {dimensions}, got shape {array.shape}")
-    finite = np.isfinite(array)
-    if not finite.all():
-        first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        count = int(array.size - np.count_nonzero(finite))
+    is_finite = np.isfinite(array)
+    if not is_finite.all():
+        first = tuple(int(i) for i in np.argwhere(~is_finite)[0])
+        n_bad = int(array.size - np.count_nonzero(is_finite))
         where = first[0] if array.ndim == 1 else first
         raise InputError(
-            f"{name} must be finite, got {array[first]} at sample {where} ({count} of {array.size} samples)"
+            f"{name} must be finite, got {array[first]} at sample {where} ({n_bad} of {array.size} samples)"
         )
     return array
 
 
-def whole_number(value: object, name: str, unit: str = "") -> int:
+def require_positive_int(value: object, name: str, unit: str = "") -> int:
     """Convert `value` to an int; raise InputError unless it is a whole number of 1 or more."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")

@@ -1,9 +1,9 @@
-"""RMS over sliding windows, of a whole series and of a stream; both give the same bits.
+"""RMS over sliding windows, of a complete series and of a stream, with identical results.
 
-The transform comes first and the windows are laid over its coefficients (by default 1000 samples, 500 apart:
-"Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are
-summed over pieces of gcd(size, step) samples, and a window adds its pieces in their order. Nothing is subtracted
-again, so a long or drifting series loses no digits as it would with a running sum.
+The windows lie over the coefficients of the transformed signal (by default 1000 samples, 500 apart: "Understanding
+Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over pieces
+of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts nothing, so
+that long or drifting series lose no precision.
 """
 
 from __future__ import annotations
@@ -16,13 +16,8 @@ from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
 from sealscope.signals.details import Details
-from sealscope.signals.filters import (
-    Array,
-    IntArray,
-    finite_array,
-    whole_number,
-)
-from sealscope.storage.plain_state import count_of, numbers_of, part_of
+from sealscope.signals.filters import Array, IntArray, require_finite, require_positive_int
+from sealscope.storage.plain_state import require_count, require_numbers, require_part
 
 WINDOW_SIZE = 1000
 WINDOW_STEP = 500
@@ -44,7 +39,7 @@ def rms(series: ArrayLike) -> Any:
 
     Raises InputError for an empty series or one that is not finite.
     """
-    x = finite_array(series, "series")
+    x = require_finite(series, "series")
     if x.shape[-1] == 0:
         raise InputError("series must have at least 1 sample, got 0")
     value = np.sqrt(np.mean(np.square(x), axis=-1))
@@ -56,32 +51,31 @@ def windowed_rms(
 ) -> WindowedRms:
     """Compute the RMS of each window of `size` samples, every `step` samples, over the last axis of (..., n).
 
-    `first` is the sample number of the series' first value and moves `ends` alone. Of `Details` every level is taken,
-    only where no level touches the padding, and `ends` counts samples of the signal. A series shorter than one window
-    gives no window.
+    `first`: sample number of the first value, which is added to `ends`. Of `Details` all levels are used, without
+    samples that depend on padding, and `ends` are samples of the signal. A series shorter than one window has none.
 
     Raises InputError for a series that is not finite, and for a size or a step below 1.
     """
     if isinstance(series, Details):
         inside = series.inside()
         return windowed_rms(series.values[:, inside], size, step, first=first + inside.start)
-    return RmsStream(size, step, first=first).update(finite_array(series, "series"))
+    return RmsStream(size, step, first=first).update(require_finite(series, "series"))
 
 
 class RmsStream:
-    """RMS over sliding windows of live series: the windows of `windowed_rms`, bit for bit, from blocks of any size.
+    """RMS over sliding windows of live series: identical to `windowed_rms`, from blocks of any size.
 
-    Behind a `DetailStream` take its `settling` and `first`: the windows are then those of ``windowed_rms(details)``. A
-    value that is not finite spoils the windows it lies in and no other.
+    After a `DetailStream` use its `settling` as `skip` and its `first`: the windows are then those of
+    ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
 
     Parameters
     ----------
     size, step : int
         Samples of a window, and from one window to the next.
     skip : int, default 0
-        How many values at the beginning of the stream to leave out.
+        Number of values to omit at the beginning of the stream.
     first : int, default 0
-        Sample number of the first value that is kept.
+        Sample number of the first value that is used.
 
     Raises
     ------
@@ -99,17 +93,18 @@ class RmsStream:
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
-        self.size, self.step = whole_number(size, "size", " sample"), whole_number(step, "step", " sample")
+        self.size = require_positive_int(size, "size", " sample")
+        self.step = require_positive_int(step, "step", " sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
             raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
         self._piece = math.gcd(self.size, self.step)
         self._skip, self._next_end = int(skip), int(first) + self.size
-        self._rest: Array | None = None  # samples of the piece that is not full yet, (..., fewer than piece)
-        self._sums: Array | None = None  # sums of squares of the pieces that later windows still need, (..., pieces)
-        self._ahead = 0  # pieces that no window needs (step > size), still to be passed over
+        self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
+        self._sums: Array | None = None  # sums of squares of the pieces of later windows, (..., pieces)
+        self._n_unused = 0  # number of pieces to skip, which are in no window (step > size)
 
     def update(self, block: ArrayLike) -> WindowedRms:
-        """Take the next block and return the windows that it completes, possibly none.
+        """Add the next block and return the windows that it completes, possibly none.
 
         Parameters
         ----------
@@ -119,7 +114,7 @@ class RmsStream:
         Returns
         -------
         WindowedRms
-            Their `ends` (w,), the sample one past each window's last, and `rms` (..., w).
+            `ends` (w,), the sample one past each window's last, and `rms` (..., w).
 
         Raises
         ------
@@ -129,27 +124,27 @@ class RmsStream:
         x = np.asarray(block, dtype=np.float64)
         if x.ndim == 0:
             raise InputError("block must be at least one-dimensional, got a single number")
-        lead = x.shape[:-1]
+        leading_axes = x.shape[:-1]
         if self._rest is None or self._sums is None:
-            self._rest = self._sums = np.empty((*lead, 0))
-        if lead != self._rest.shape[:-1]:
-            raise InputError(f"block must have leading axes {self._rest.shape[:-1]} as before, got {lead}")
-        passed = min(self._skip, x.shape[-1])
-        self._skip -= passed
-        x = np.concatenate([self._rest, x[..., passed:]], axis=-1)
-        full = x.shape[-1] // self._piece * self._piece
-        self._rest = x[..., full:].copy()
-        sums = np.concatenate([self._sums, _piece_sums(x[..., :full], self._piece)], axis=-1)
-        passed = min(self._ahead, sums.shape[-1])
-        self._ahead -= passed
-        sums = sums[..., passed:]
+            self._rest = self._sums = np.empty((*leading_axes, 0))
+        if leading_axes != self._rest.shape[:-1]:
+            raise InputError(f"block must have leading axes {self._rest.shape[:-1]} as before, got {leading_axes}")
+        n_omitted = min(self._skip, x.shape[-1])
+        self._skip -= n_omitted
+        x = np.concatenate([self._rest, x[..., n_omitted:]], axis=-1)
+        n_full = x.shape[-1] // self._piece * self._piece
+        self._rest = x[..., n_full:].copy()
+        sums = np.concatenate([self._sums, _piece_sums(x[..., :n_full], self._piece)], axis=-1)
+        n_skipped = min(self._n_unused, sums.shape[-1])
+        self._n_unused -= n_skipped
+        sums = sums[..., n_skipped:]
         values = _rms_of_pieces(sums, self.size, self.step)
-        windows = values.shape[-1]
-        used = windows * (self.step // self._piece)
-        self._ahead += max(0, used - sums.shape[-1])
-        self._sums = sums[..., used:].copy()
-        ends = self._next_end + self.step * np.arange(windows, dtype=np.int64)
-        self._next_end += windows * self.step
+        n_windows = values.shape[-1]
+        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window
+        self._n_unused += max(0, n_finished - sums.shape[-1])
+        self._sums = sums[..., n_finished:].copy()
+        ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)
+        self._next_end += n_windows * self.step
         return WindowedRms(ends, values)
 
     def state_dict(self) -> dict[str, Any]:
@@ -159,41 +154,41 @@ class RmsStream:
             "step": self.step,
             "skip": self._skip,
             "next_end": self._next_end,
-            "ahead": self._ahead,
+            "ahead": self._n_unused,
             "rest": None if self._rest is None else self._rest.copy(),
             "sums": None if self._sums is None else self._sums.copy(),
         }
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Continue the stream that `state_dict` described; raise InputError for a wrong state."""
-        size, step, rest, sums = (part_of(state, name, object) for name in ("size", "step", "rest", "sums"))
-        stream = cls(size, step, skip=count_of(state, "skip"))
-        stream._next_end, stream._ahead = count_of(state, "next_end"), count_of(state, "ahead")
+        """Continue the stream of a `state_dict`; raise InputError for an invalid state."""
+        size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
+        stream = cls(size, step, skip=require_count(state, "skip"))
+        stream._next_end, stream._n_unused = require_count(state, "next_end"), require_count(state, "ahead")
         if rest is None and sums is None:
             return stream
-        lead = np.shape(rest)[:-1]
-        if rest is None or sums is None or lead != np.shape(sums)[:-1]:
+        leading_axes = np.shape(rest)[:-1]
+        if rest is None or sums is None or leading_axes != np.shape(sums)[:-1]:
             raise InputError("saved state must have rest and sums of the same leading axes, got others")
-        stream._rest = numbers_of(state, "rest", np.shape(rest))
-        stream._sums = numbers_of(state, "sums", np.shape(sums))
+        stream._rest = require_numbers(state, "rest", np.shape(rest))
+        stream._sums = require_numbers(state, "sums", np.shape(sums))
         return stream
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Compute the sum of squares of each full piece, (..., n // piece), pairwise along a contiguous row."""
-    pieces = x.shape[-1] // piece
-    pieces_of_x = np.ascontiguousarray(x[..., : pieces * piece])
-    return np.asarray(np.add.reduce(np.square(pieces_of_x.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], pieces)
+    """Compute the sum of squares of each complete piece, (..., n // piece), by pairwise summation."""
+    n_pieces = x.shape[-1] // piece
+    in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
+    return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """Compute the RMS of each whole window from its pieces' sums of squares (..., pieces), added in their order."""
+    """Compute the RMS of each complete window from its pieces' sums of squares (..., pieces), added in order."""
     piece = math.gcd(size, step)
-    per_window, per_step = size // piece, step // piece
-    windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)
-    total = np.zeros((*sums.shape[:-1], windows))
-    if windows:
+    per_window, per_step = size // piece, step // piece  # pieces
+    n_windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)
+    squares = np.zeros((*sums.shape[:-1], n_windows))
+    if n_windows:
         for i in range(per_window):
-            total += sums[..., i : i + (windows - 1) * per_step + 1 : per_step]
-    return np.asarray(np.sqrt(total / size))
+            squares += sums[..., i : i + (n_windows - 1) * per_step + 1 : per_step]
+    return np.asarray(np.sqrt(squares / size))

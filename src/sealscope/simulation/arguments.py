@@ -1,4 +1,4 @@
-"""The arguments of an experiment, each declared once: `Experiment.of`, `simulate` and the command line follow."""
+"""The arguments of an experiment, declared once for `Experiment.of`, `simulate` and the command line."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.simulation.changes import ParameterDrift
     from sealscope.simulation.commands import Command
-    from sealscope.simulation.courses import Force, Position
     from sealscope.simulation.faults import Fault
     from sealscope.simulation.leaks import Leak
+    from sealscope.simulation.targets_and_loads import Force, Position
 
 Method = Literal["auto", "rk4", "imex"]
 _COMMAND = (
@@ -34,12 +34,12 @@ _FAULT = (
 )
 _ERROR = "Rms error that a pressure may have, such as '20[Pa]', by which the step is chosen; 100 Pa by default"
 _LOAD = (
-    "Force against +x beside the rig's own (cylinder.F_l), in a command's words: '2 kN', '500 N sin(2t)', 'step 2 kN "
-    "at 3 s'; terms over the piston's position and velocity may be added: '200 N/mm over x', '5 kN/mm over x from 50 "
-    "mm', '2 kN s/m over v'; or 'file LOAD.csv': F [N] over t [s], x [m] or v [m/s]"
+    "Force against +x in addition to the rig's own (cylinder.F_l), in a command's words: '2 kN', '500 N sin(2t)', "
+    "'step 2 kN at 3 s'; terms over the piston's position and velocity may be added: '200 N/mm over x', '5 kN/mm over "
+    "x from 50 mm', '2 kN s/m over v'; or 'file LOAD.csv': F [N] over t [s], x [m] or v [m/s]"
 )
 _CONTROLLER = (
-    "What follows a target and assumes the rig as it is: 'pi', 'flatness', 'fault-tolerant', "
+    "Controller that follows a target, with the rig's parameters: 'pi', 'flatness', 'fault-tolerant', "
     "'fault-tolerant-flatness', or your own as 'FILE.py:NAME' or 'MODULE:NAME'; 'pi' by default"
 )
 

@@ -1,4 +1,4 @@
-"""Commands: the voltage that a test sends to the servo drive, as data."""
+"""Commands: the voltage sent to the servo drive as a function of time, as data and as text."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.units import parse_quantity
 
 
-def number_text(value: float) -> str:
-    """Format a number as the shortest text that reads back exactly."""
+def format_number(value: float) -> str:
+    """Format a number as the shortest text that is parsed back to exactly the same number."""
     return repr(float(value)).removesuffix(".0")
 
 
@@ -45,15 +45,15 @@ class Sine:
 
     def __str__(self) -> str:
         phase, offset = (
-            f" {'-' if value < 0 else '+'} {number_text(abs(value))}" if value else ""
+            f" {'-' if value < 0 else '+'} {format_number(abs(value))}" if value else ""
             for value in (self.phase, self.offset)
         )
-        return f"{number_text(self.amplitude)} sin({number_text(self.omega)}t{phase}){offset}"
+        return f"{format_number(self.amplitude)} sin({format_number(self.omega)}t{phase}){offset}"
 
 
 @dataclass(frozen=True)
 class MultiSine:
-    """u = the sum of two sines or more, the last of which may have an offset."""
+    """u = sum of two or more sines, of which only the last may have an offset."""
 
     parts: tuple[Sine, ...]
 
@@ -71,7 +71,7 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """u rises evenly from 0 to `level` within `rise` [s], stays, and falls back likewise, every `period` [s]."""
+    """Periodic trapezoid: u rises from 0 to `level` [V] within `rise` [s], and falls half a `period` [s] later."""
 
     level: float
     rise: float
@@ -85,18 +85,18 @@ class Trapezoid:
 
     def volts(self, t: Array) -> Array:
         """Compute u [V] at times t [s]."""
-        since = np.mod(np.maximum(t, 0.0), self.period)
-        up, down = since / self.rise, (since - 0.5 * self.period) / self.rise
-        return np.asarray(self.level * (np.clip(up, 0.0, 1.0) - np.clip(down, 0.0, 1.0)))
+        time_in_period = np.mod(np.maximum(t, 0.0), self.period)
+        rise, fall = time_in_period / self.rise, (time_in_period - 0.5 * self.period) / self.rise  # completed fractions
+        return np.asarray(self.level * (np.clip(rise, 0.0, 1.0) - np.clip(fall, 0.0, 1.0)))
 
     def __str__(self) -> str:
-        level, rise, period = map(number_text, (self.level, self.rise, self.period))
+        level, rise, period = map(format_number, (self.level, self.rise, self.period))
         return f"trapezoid {level} within {rise} s every {period} s"
 
 
 @dataclass(frozen=True)
 class Alternating:
-    """Sines in turn, each for a whole number of its periods from its own zero, again and again: (periods, sine)."""
+    """A repeated sequence of sines, each from its zero crossing for a whole number of its periods: (periods, sine)."""
 
     parts: tuple[tuple[int, Sine], ...]
 
@@ -107,13 +107,13 @@ class Alternating:
 
     def volts(self, t: Array) -> Array:
         """Compute u [V] at times t [s]."""
-        lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])
+        lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
         ends = np.cumsum(lengths)
-        since = np.mod(t, ends[-1])
-        part = np.minimum(np.searchsorted(ends, since, side="right"), ends.size - 1)
+        time_in_cycle = np.mod(t, ends[-1])
+        part = np.minimum(np.searchsorted(ends, time_in_cycle, side="right"), ends.size - 1)
         amplitude = np.array([sine.amplitude for _, sine in self.parts])
         omega = np.array([sine.omega for _, sine in self.parts])
-        u = amplitude[part] * np.sin(omega[part] * (since - (ends - lengths)[part]))
+        u = amplitude[part] * np.sin(omega[part] * (time_in_cycle - (ends - lengths)[part]))
         return np.asarray(np.where(t >= 0, u, 0.0))
 
     def __str__(self) -> str:
@@ -122,10 +122,10 @@ class Alternating:
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A course that is linear between points, and constant before the first and after the last.
+    """A signal that is linear between points, and constant before the first and after the last.
 
-    `t`, `y`: (n,) times [s] that do not fall, and values; of two points at one time the later holds from there on.
-    `words`: what it is called, in the form that parsers read. Of two equal ones all three are the same.
+    `t`, `y`: (n,) non-decreasing times [s] and values; two points at one time are a jump. `words`: its text, as parsers
+    read it. Polylines are equal if points and text are.
     """
 
     t: Array
@@ -140,18 +140,20 @@ class Polyline:
         """Compute u [V] at times t [s]."""
         return self.value_at(t)
 
-    def bends(self) -> tuple[float, ...]:
-        """List the times [s] of its jumps and bends; none for a table too long to follow each."""
-        return tuple(map(float, np.unique(self.t))) if self.t.size < _LONGEST_FOLLOWED else ()
+    def breakpoints(self) -> tuple[float, ...]:
+        """Return the times [s] at which the slope changes or the value jumps; () for a table of very many points."""
+        return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] from which it differs from 0: 0 for a start beyond 0, infinity for a course of zeros."""
-        first = int(np.argmax(self.y > 0)) if np.any(self.y > 0) else -1
-        return math.inf if first < 0 else float(self.t[first - 1]) if first else 0.0
+        """Find the time [s] at which the signal starts to rise above 0; infinity if it never does."""
+        if not np.any(self.y > 0):
+            return math.inf
+        first_positive = int(np.argmax(self.y > 0))
+        return float(self.t[first_positive - 1]) if first_positive else 0.0
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """Begin and end [s] of a linear rise from 0 to 1, None for another course."""
+        """Begin and end [s] of the rise, if the signal is one linear rise from 0 to 1; else None."""
         return (float(self.t[0]), float(self.t[1])) if self.y.tolist() == [0.0, 1.0] else None
 
     def __eq__(self, other: object) -> bool:
@@ -166,17 +168,17 @@ class Polyline:
         return self.words
 
 
-_LONGEST_FOLLOWED = 1000
+_MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the course through points (t, y)."""
+    """Make the polyline through points (t, y)."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
 
-def tabulated(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Make the course through the points of a table; raise InputError for falling times and infinite values."""
+def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
+    """Make the polyline through the points of a table; raise InputError for falling times or values not finite."""
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
@@ -185,23 +187,23 @@ def tabulated(t: Array, y: Array, what: str = "a table") -> Polyline:
 
 
 def step(level: float, start: float = 0.0) -> Polyline:
-    """Make u = 0 before `start` [s], `level` [V] from then on."""
-    return polyline([(start, 0.0), (start, level)], f"step {number_text(level)} at {number_text(start)} s")
+    """Make the command that jumps from 0 to `level` [V] at `start` [s]."""
+    return polyline([(start, 0.0), (start, level)], f"step {format_number(level)} at {format_number(start)} s")
 
 
 def ramp(level: float, start: float, stop: float) -> Polyline:
-    """Make u that rises linearly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
+    """Make the command that rises linearly from 0 at `start` [s] to `level` [V] at `stop` [s] and stays there."""
     if not stop > start:
         raise InputError(f"a ramp must stop after it starts, got {start:g} s to {stop:g} s")
-    words = f"ramp {number_text(level)} from {number_text(start)} s to {number_text(stop)} s"
+    words = f"ramp {format_number(level)} from {format_number(start)} s to {format_number(stop)} s"
     return polyline([(start, 0.0), (stop, level)], words)
 
 
 @dataclass(frozen=True)
 class Chirp:
-    """u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))).
+    """Sine with a frequency that changes linearly from f_0 to f_1 [Hz] over `duration` T [s], and stays at f_1.
 
-    The frequency goes from f_0 to f_1 [Hz] over T [s] and stays at f_1 afterwards.
+    u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))) up to T.
     """
 
     amplitude: float
@@ -215,25 +217,25 @@ class Chirp:
 
     def volts(self, t: Array) -> Array:
         """Compute u [V] at times t [s]."""
-        within = np.minimum(t, self.duration)
-        cycles = self.f_0 * within + (self.f_1 - self.f_0) * within**2 / (2.0 * self.duration)
-        return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - within)))
+        sweep_time = np.minimum(t, self.duration)
+        cycles = self.f_0 * sweep_time + (self.f_1 - self.f_0) * sweep_time**2 / (2.0 * self.duration)
+        return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - sweep_time)))
 
     def __str__(self) -> str:
-        amplitude, f_0, f_1, duration = map(number_text, (self.amplitude, self.f_0, self.f_1, self.duration))
+        amplitude, f_0, f_1, duration = map(format_number, (self.amplitude, self.f_0, self.f_1, self.duration))
         return f"chirp {amplitude} from {f_0} Hz to {f_1} Hz over {duration} s"
 
 
-#: SplitMix64: the step from state to state, and by which shifts and factors a state is mixed.
-GOLDEN, MIX = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB))
+#: SplitMix64: increment of the state, and the (shift, factor) pairs and last shift that mix it into a random number.
+GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)), 31
 
 
 @dataclass(frozen=True)
 class PseudoRandom:
     """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
 
-    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014): any slot is known at
-    once, however many stand before it.
+    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), which is computed
+    without those before it.
     """
 
     amplitude: float
@@ -248,43 +250,41 @@ class PseudoRandom:
         """Compute u [V] at times t [s]."""
         slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
-        z = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
+        state = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
         for shift, factor in MIX:
-            z = (z ^ (z >> np.uint64(shift))) * np.uint64(factor)
-        signs = np.where((z ^ (z >> np.uint64(31))) >> np.uint64(63), 1.0, -1.0)
+            state = (state ^ (state >> np.uint64(shift))) * np.uint64(factor)
+        random_bits = state ^ (state >> np.uint64(LAST_SHIFT))
+        signs = np.where(random_bits >> np.uint64(63), 1.0, -1.0)
         return np.where(t >= 0, self.amplitude * signs, 0.0)
 
     def __str__(self) -> str:
-        return f"prbs {number_text(self.amplitude)} every {number_text(self.hold)} s seed {self.seed}"
+        return f"prbs {format_number(self.amplitude)} every {format_number(self.hold)} s seed {self.seed}"
 
 
-def recorded(t: Array, u: Array, origin: str = "recorded") -> Polyline:
-    """Make a recorded course: linear between its samples, its last value afterwards."""
+def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
+    """Make the polyline through the samples of a recorded signal; `origin` names it in messages and texts."""
     if t.size < 2 or np.any(np.diff(t) == 0):
-        raise InputError(f"a recorded course must have two samples or more, one at a time, got {t.size} ({origin})")
-    return replace(tabulated(t, u, f"a recorded course ({origin})"), words=f"file {origin}")
+        raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
+    return replace(polyline_from_table(t, u, f"a recorded signal ({origin})"), words=f"file {origin}")
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command of the channel `u` of a recording; its first sample is at t = 0."""
-    return recorded(recording.t - recording.t[0], recording["u"], origin)
+    """Make the command that a recording has in its channel `u`, with its first sample at t = 0."""
+    return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
 
-#: Samples of a command that are looked at together, so that a long one does not fill the memory.
-_CHECKED_AT_ONCE = 1_000_000
+#: Samples of a command that are checked at once, which bounds the memory.
+_CHECK_CHUNK = 1_000_000
 
 
 def check_command(command: Command, t: Array, limit: float) -> None:
-    """Raise InputError where the command leaves +-`limit` [V], the converter's range.
-
-    That, or no number, at any of the times `t` [s].
-    """
-    for start in range(0, t.size, _CHECKED_AT_ONCE):
-        part = t[start : start + _CHECKED_AT_ONCE]
+    """Check that the command is within +-`limit` [V] at the times `t` [s]; raise InputError otherwise, or for NaN."""
+    for start in range(0, t.size, _CHECK_CHUNK):
+        part = t[start : start + _CHECK_CHUNK]
         u = command.volts(part)
-        bad = ~(np.abs(u) <= limit * (1 + 1e-12))
-        if bad.any():
-            k = int(np.argmax(bad))
+        is_beyond = ~(np.abs(u) <= limit * (1 + 1e-12))  # True for NaN
+        if is_beyond.any():
+            k = int(np.argmax(is_beyond))
             raise InputError(
                 f"command must stay within +-{limit:g} V, got {u[k]:.4g} V at t = {part[k]:.4g} s ({command})"
             )
@@ -300,30 +300,33 @@ _SIGNED = rf"[-+]\s*{UNSIGNED}"
 _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
     (
         rf"trapezoid\s+({_N})\s*v?\s+within\s+({_T})\s+every\s+({_T})",
-        lambda g: Trapezoid(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
+        lambda g: Trapezoid(_parse_number(g[0], 0.0), parse_seconds(g[1]), parse_seconds(g[2])),
     ),
-    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: step(_number(g[0], 0.0), seconds(g[1]))),
+    (rf"step\s+({_N})\s*v?(?:\s+at\s+({_T}))?", lambda g: step(_parse_number(g[0], 0.0), parse_seconds(g[1]))),
     (
         rf"ramp\s+({_N})\s*v?\s+(?:from\s+({_T})\s+)?(?:to|over)\s+({_T})",
-        lambda g: ramp(_number(g[0], 0.0), seconds(g[1]), seconds(g[2])),
+        lambda g: ramp(_parse_number(g[0], 0.0), parse_seconds(g[1]), parse_seconds(g[2])),
     ),
     (
         rf"chirp\s+({_N})\s*v?\s+from\s+({_N})\s*(?:hz)?\s+to\s+({_N})\s*(?:hz)?\s+over\s+({_T})",
-        lambda g: Chirp(_number(g[0], 0.0), _number(g[1], 0.0), _number(g[2], 0.0), seconds(g[3])),
+        lambda g: Chirp(
+            _parse_number(g[0], 0.0), _parse_number(g[1], 0.0), _parse_number(g[2], 0.0), parse_seconds(g[3])
+        ),
     ),
     (
         rf"prbs\s+({_N})\s*v?\s+every\s+({_T})(?:\s+seed\s+(\d+))?",
-        lambda g: PseudoRandom(_number(g[0], 0.0), seconds(g[1]), int(g[2] or 0)),
+        lambda g: PseudoRandom(_parse_number(g[0], 0.0), parse_seconds(g[1]), int(g[2] or 0)),
     ),
 )
 
 
-def seconds(text: str | None) -> float:
-    """Compute the time [s] of a match of `TIME`; 0 for None."""
+def parse_seconds(text: str | None) -> float:
+    """Parse a time [s] that matches `TIME`; 0 for None."""
     return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 
-def _number(text: str | None, default: float) -> float:
+def _parse_number(text: str | None, default: float) -> float:
+    """Parse a number of a command, `default` for None; raise InputError if it is not finite."""
     if text is None:
         return default
     value = float(text.replace(" ", ""))
@@ -332,16 +335,16 @@ def _number(text: str | None, default: float) -> float:
     return value
 
 
-_LONGEST_TEXT = 1000
+_MAX_CHARACTERS = 1000
 
 
-def plain_text(text: str, what: str) -> str:
-    """Reduce the blanks in the text of an option to single ones, except in a path after ``file``.
+def normalize_blanks(text: str, what: str) -> str:
+    """Replace each run of blanks in an option's text by one blank, except in a path after ``file``.
 
-    Raises InputError for one of more than 1000 characters.
+    Raises InputError for a text of more than 1000 characters; `what` names the option.
     """
-    if len(text) > _LONGEST_TEXT:
-        raise InputError(f"{what} must be of at most {_LONGEST_TEXT} characters, got {len(text)}")
+    if len(text) > _MAX_CHARACTERS:
+        raise InputError(f"{what} must be of at most {_MAX_CHARACTERS} characters, got {len(text)}")
     if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):
         return " ".join(filter(None, file.groups()))
     return " ".join(text.split())
@@ -350,40 +353,38 @@ def plain_text(text: str, what: str) -> str:
 _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*({_SIGNED})?\s*\)", re.IGNORECASE)
 
 
-def _sines(text: str) -> Sine | MultiSine | None:
-    """Read a sine or a sum of sines, the offset after the last; None for another text."""
+def _parse_sines(text: str) -> Sine | MultiSine | None:
+    """Parse a sine or a sum of sines, with an offset after the last; return None for any other text."""
     parts: list[Sine] = []
     end = 0
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
-        sign = -1.0 if match[1] == "-" else 1.0
-        parts.append(Sine(sign * _number(match[2], 1.0), _number(match[3], 1.0), _number(match[4], 0.0)))
+        sign, amplitude, omega, phase = match.groups()
+        factor = -1.0 if sign == "-" else 1.0
+        parts.append(Sine(factor * _parse_number(amplitude, 1.0), _parse_number(omega, 1.0), _parse_number(phase, 0.0)))
         end = match.end()
     rest = re.fullmatch(rf"\s*({_SIGNED})?\s*v?", text[end:], re.IGNORECASE)
     if rest is None or not parts:
         return None
-    parts[-1] = replace(parts[-1], offset=_number(rest[1], 0.0))
+    parts[-1] = replace(parts[-1], offset=_parse_number(rest[1], 0.0))
     return parts[0] if len(parts) == 1 else MultiSine(tuple(parts))
 
 
 def parse_command(text: str) -> Command:
-    """Read a command from text.
-
-    Raises InputError that shows the forms when the text is none of them.
-    """
+    """Parse a command; raise InputError, which lists the forms, if the text has none of them."""
     stripped = text.strip()
     if stripped.lower().startswith("file "):
         from sealscope.recordings import read
 
         path = stripped[5:].strip()
         return recorded_command(read(path), path)
-    stripped = plain_text(text, "command")
+    stripped = normalize_blanks(text, "command")
     if "period" in stripped.lower():
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"
-        parts = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
-        turns = [(int(part[1]), parse_command(part[2])) for part in parts if part]
-        if len(turns) == len(parts) and all(isinstance(sine, Sine) for _, sine in turns):
-            return Alternating(tuple(turns))  # type: ignore[arg-type]
-    if (sines := _sines(stripped)) is not None:
+        matches = [re.fullmatch(form, part, re.IGNORECASE) for part in stripped.split(",")]
+        parts = [(int(match[1]), parse_command(match[2])) for match in matches if match]
+        if len(parts) == len(matches) and all(isinstance(sine, Sine) for _, sine in parts):
+            return Alternating(tuple(parts))  # type: ignore[arg-type]
+    if (sines := _parse_sines(stripped)) is not None:
         return sines
     for pattern, make in _FORMS:
         match = re.fullmatch(pattern, stripped, re.IGNORECASE)

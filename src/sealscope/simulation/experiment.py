@@ -11,25 +11,27 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
-from sealscope.calls import with_arguments_of
+from sealscope.calls import take_fields_of
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.arguments import Arguments, Method
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
 from sealscope.simulation.commands import Command, Sine, check_command
-from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import Leak, Thinned, parse_leak
+from sealscope.simulation.targets_and_loads import Force, Position, command_or_target, parse_force
 from sealscope.units import parse_quantity
 
 if TYPE_CHECKING:
     from sealscope.control import Controller
     from sealscope.parameters import Rig
 
-#: Most samples a recording may have (about 1.4 GB of channels), so that a slip of the unit cannot fill the memory.
-MOST_SAMPLES = 20_000_000
-#: Most steps of the solver that may be asked for: an hour at 3.6 us.
-MOST_STEPS = 1_000_000_000
+#: Most samples of a recording (about 1.4 GB of channels), so that a wrong unit cannot fill the memory.
+MAX_SAMPLES = 20_000_000
+#: Most steps of the solver in a run: an hour at 3.6 us.
+MAX_STEPS = 1_000_000_000
+#: Times at which a drift is checked.
+_N_DRIFT_CHECKS = 2001
 #: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md).
 LONGEST_STEP = 1e-3
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
@@ -38,42 +40,48 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Return the stated method, or choose by the rig: implicit-explicit with throttles, explicit without."""
+    """Return the stated method, or choose it for `auto`: implicit-explicit for a rig with throttles, else explicit.
+
+    Raises InputError for a method that does not suit the rig.
+    """
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
-    throttled = rig.line.orifices == "present"
-    if method == "imex" and not throttled:
+    is_throttled = rig.line.orifices == "present"
+    if method == "imex" and not is_throttled:
         raise InputError("method imex needs throttles (line.orifices = present), got line.orifices = absent; use rk4")
-    euler = rig.motor.integrator == "euler"
-    if euler and (method == "imex" or (throttled and method == "auto")):
+    is_euler = rig.motor.integrator == "euler"
+    if is_euler and (method == "imex" or (is_throttled and method == "auto")):
         raise InputError("motor.integrator = euler (eq. 4.2 taken literally) needs method rk4, got imex")
     if method == "auto":
-        return "imex" if throttled else "rk4"
+        return "imex" if is_throttled else "rk4"
     return method
 
 
-def check_target(target: Position, t: Array, half: float) -> None:
-    """Raise InputError where a target leaves the stroke, +-`half` [m], at any of the times `t` [s]."""
+def check_target(target: Position, t: Array, half_stroke: float) -> None:
+    """Check that a target is within +-`half_stroke` [m] at the times `t` [s]; raise InputError otherwise."""
     x = np.broadcast_to(target.value_at(t), t.shape)
-    bad = ~(np.abs(x) <= half)
-    if bad.any():
-        k = int(np.argmax(bad))
+    is_outside = ~(np.abs(x) <= half_stroke)
+    if is_outside.any():
+        k = int(np.argmax(is_outside))
         raise InputError(
-            f"position must stay within the stroke, +-{1e3 * half:g} mm, got {1e3 * x[k]:.4g} mm at t = {t[k]:.4g} s "
-            f"({target})"
+            f"position must stay within the stroke, +-{1e3 * half_stroke:g} mm, got {1e3 * x[k]:.4g} mm at "
+            f"t = {t[k]:.4g} s ({target})"
         )
 
 
 def check_circuit(rig: Rig) -> None:
-    """Raise InputError for a single-rod cylinder in a closed circuit from which its rod cannot displace oil."""
-    c, m = rig.cylinder, rig.makeup
-    if rig.valve.spool == "present":
+    """Check that a single-rod cylinder in a closed circuit has valves for the oil that its rod displaces.
+
+    Raises InputError otherwise.
+    """
+    cylinder, makeup = rig.cylinder, rig.makeup
+    if not rig.circuit.pump_feeds_chambers:
         return
-    if c.A_A != c.A_B and not (m.check_valves == "pilot-operated" or m.G_relief > 0):
+    if cylinder.A_A != cylinder.A_B and not (makeup.check_valves == "pilot-operated" or makeup.G_relief > 0):
         raise InputError(
-            f"a single-rod cylinder (A_A = {1e6 * c.A_A:g} mm^2, A_B = {1e6 * c.A_B:g} mm^2) must have "
-            "makeup.check_valves = pilot-operated, through which its rod displaces oil, got "
-            f"makeup.check_valves = {m.check_valves}"
+            f"a single-rod cylinder (A_A = {1e6 * cylinder.A_A:g} mm^2, A_B = {1e6 * cylinder.A_B:g} mm^2) must "
+            "have makeup.check_valves = pilot-operated, through which its rod displaces oil, got "
+            f"makeup.check_valves = {makeup.check_valves}"
         )
 
 
@@ -123,21 +131,21 @@ class Experiment:
         if not (math.isfinite(self.duration) and self.duration > 0):
             raise InputError(f"duration must be > 0 s and finite, got {self.duration}")
         samples = self.duration * self.rate
-        if samples < 1 or samples > MOST_SAMPLES:
+        if samples < 1 or samples > MAX_SAMPLES:
             raise InputError(
-                f"duration x daq.sample_rate must be 1 to {MOST_SAMPLES} samples, got {samples:.4g} "
+                f"duration x daq.sample_rate must be 1 to {MAX_SAMPLES} samples, got {samples:.4g} "
                 f"({self.duration:g} s at {self.rate:g} Hz)"
             )
         if self.seed < 0:
             raise InputError(f"seed must be >= 0, got {self.seed}")
-        half = self.rig.cylinder.L / 2
-        if not abs(self.x_0) <= half:
-            raise InputError(f"x_0 must be within the stroke, -{half:g} m to {half:g} m, got {self.x_0}")
+        half_stroke = self.rig.cylinder.L / 2
+        if not abs(self.x_0) <= half_stroke:
+            raise InputError(f"x_0 must be within the stroke, -{half_stroke:g} m to {half_stroke:g} m, got {self.x_0}")
         step = LONGEST_STEP if self.step is None else self.step
-        if step > 0 and self.duration / step > MOST_STEPS:
-            what = f"at least, of {step:g} s" if self.step is None else f"step = {step:g} s"
+        if step > 0 and self.duration / step > MAX_STEPS:
+            origin = f"at least, of {step:g} s" if self.step is None else f"step = {step:g} s"
             raise InputError(
-                f"a run must have at most {MOST_STEPS} steps of the solver, got {self.duration / step:.4g} ({what})"
+                f"a run must have at most {MAX_STEPS} steps of the solver, got {self.duration / step:.4g} ({origin})"
             )
         if self.step is not None and self.error is not None:
             raise InputError(
@@ -147,28 +155,29 @@ class Experiment:
         choose_method(self.rig, self.method)
         check_circuit(self.rig)
         if self.target is not None:
-            check_target(self.target, self.sample_times(), half)
+            check_target(self.target, self.sample_times(), half_stroke)
         elif self.controller is not None:
             raise InputError(
                 f"a controller must have a target to follow ('position 50 mm sin(2t)'), got {self.command}"
             )
         else:
-            command, u_max = self.commanded, self.rig.daq.u_max
+            command, u_max = self.voltage_command, self.rig.daq.u_max
+            # a small enough sine needs no samples
             if not (isinstance(command, Sine) and abs(command.offset) + abs(command.amplitude) <= u_max):
                 check_command(command, self.sample_times(), u_max)
         for drift in self.drifts:
-            drift.check(np.linspace(0.0, self.duration, 2001))
-        self._effects()
+            drift.check(np.linspace(0.0, self.duration, _N_DRIFT_CHECKS))
+        self._all_effects()  # raises InputError for a fault that this rig cannot have
 
     @staticmethod
-    @with_arguments_of(Arguments)
+    @take_fields_of(Arguments)
     def of(arguments: Arguments) -> Experiment:
-        """Make an experiment of numbers in SI units and texts with units; the arguments are those of `simulate`.
+        """Make an experiment from numbers in SI units and texts with units; the arguments are those of `simulate`.
 
         Returns
         -------
         Experiment
-            With all texts read; InputError for whatever breaks a rule.
+            With all texts parsed; InputError for an argument that breaks a rule.
 
         Examples
         --------
@@ -178,14 +187,14 @@ class Experiment:
         """
         from sealscope.parameters import load_rig
 
-        numbers: dict[str, Any] = {}
+        quantities: dict[str, Any] = {}  # in SI units, by argument
         for declared in fields(arguments):
             value, unit = getattr(arguments, declared.name), declared.metadata["unit"]
             if unit and value is not declared.default:
                 value = parse_quantity(value, unit, name=declared.name, finite=False)
             if unit:
-                numbers[declared.name] = value
-        rate = numbers.pop("rate")
+                quantities[declared.name] = value
+        rate = quantities.pop("rate")
         if not isinstance(arguments.set, Mapping | None):
             raise InputError(f"set must map names of parameters to values, got {arguments.set!r}")
         overrides = {**(arguments.set or {}), **({} if rate is None else {"daq.sample_rate": rate})}
@@ -213,7 +222,7 @@ class Experiment:
             drifts=tuple(arguments.drifts),
             load=parse_force(arguments.load) if isinstance(arguments.load, str) else arguments.load,
             controller=controller,
-            **numbers,
+            **quantities,
         )
 
     def __repr__(self) -> str:
@@ -223,27 +232,28 @@ class Experiment:
         return f"<Experiment: {', '.join(parts)}, seed {self.seed}>"
 
     @property
-    def commanded(self) -> Command:
-        """The command that the rig gets, as the faults of the duty leave `command`; InputError for a target."""
+    def voltage_command(self) -> Command:
+        """The voltage command as changed by duty faults; InputError for a target."""
         if isinstance(self.command, Position):
             raise InputError(f"what a controller sends is known after its run only, got {self.command}")
-        return self._changed(self.command)
+        return self._with_duty_changes(self.command)
 
     @property
     def target(self) -> Position | None:
-        """The target of the controller, as the faults of the duty leave it; None where there is a command."""
+        """The controller's target as changed by duty faults; None for a voltage command."""
         if not isinstance(self.command, Position):
             return None
-        return replace(self.command, course=self._changed(self.command.course))
+        return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
-    def _changed(self, command: Command) -> Command:
+    def _with_duty_changes(self, command: Command) -> Command:
+        """Apply the changes of amplitude and frequency that faults of the kind `duty` make to a command."""
         for fault in self.faults:
-            command = fault.commanded(command)
+            command = fault.change_command(command)
         return command
 
     @property
-    def controlled(self) -> Controller | None:
-        """The controller that follows the target, its own or the one that knows the rig; None for a command."""
+    def active_controller(self) -> Controller | None:
+        """The controller that follows the target, as stated or PositionPI for the rig; None for a command."""
         if not isinstance(self.command, Position):
             return None
         from sealscope.control import PositionPI
@@ -251,39 +261,40 @@ class Experiment:
         return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
-        """Collect the changes in the machine within the run."""
-        return tuple(effect for effect in self._effects() if not effect.of_instrument)
+        """Collect the changes of the machine within the run."""
+        return tuple(effect for effect in self._all_effects() if not effect.changes_instrument)
 
-    def _effects(self) -> tuple[Effect, ...]:
-        drifting = [effect for drift in self.drifts for effect in drift.effects()]
-        return (*drifting, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
+    def _all_effects(self) -> tuple[Effect, ...]:
+        """Collect the changes of machine and instruments by drifts and faults."""
+        drift_effects = [effect for drift in self.drifts for effect in drift.effects()]
+        return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
-    def flowing(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Adapt leaks to the run's oil: a laminar one passes more where the oil is warmer than the rig's.
+    def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
+        """Scale the openings of laminar leaks with the viscosity of the run's oil: warmer oil leaks more.
 
-        Their coefficients are those at the rig's own viscosity.
+        Coefficients are those at the rig's viscosity.
         """
-        for fault in self.thins:
-            viscosity = fault.viscosity(self.rig)
-            leaks = tuple(
-                replace(leak, opening=Thinned(leak.opening, viscosity)) if viscosity and leak.law == "laminar" else leak
-                for leak in leaks
-            )
+        for fault in self.faults:
+            if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
+                leaks = tuple(
+                    replace(leak, opening=Thinned(leak.opening, viscosity)) if leak.law == "laminar" else leak
+                    for leak in leaks
+                )
         return leaks
 
     @property
-    def thins(self) -> tuple[Fault, ...]:
-        """The faults that change the oil's viscosity within the run."""
-        return tuple(fault for fault in self.faults if fault.viscosity(self.rig) is not None)
+    def changes_viscosity(self) -> bool:
+        """True if a fault changes the oil's viscosity within the run."""
+        return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
 
     def readings(self) -> Readings:
-        """Collect the changes at the instruments within the run."""
-        effects = tuple(effect for effect in self._effects() if effect.of_instrument)
+        """Collect the changes of the instruments within the run."""
+        effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
         return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
     @property
     def error_allowed(self) -> float:
-        """Error by which a step is chosen [Pa], the stated one or else the default."""
+        """The rms error of a pressure [Pa] by which a step is chosen, as stated or the default."""
         return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property
@@ -296,65 +307,59 @@ class Experiment:
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
-        """Time [s] at which the first leak opens within the run, None for a run without one."""
+        """Compute the time [s] at which the first leak opens; None if none opens within the run."""
         onsets = [leak.opening.onset() for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
         onsets = [onset for onset in onsets if onset < self.duration]
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Convert the experiment to plain values, without its truth (leaks, faults, drifts)."""
+        """Convert the experiment to plain values, without what a diagnosis must find (leaks, faults, drifts)."""
+        overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
             "rig": self.rig.name,
-            "overrides": {
-                row.name: f"{row.value} {row.unit}".strip()
-                for row in self.rig.table()
-                if row.source.startswith("set by")
-            },
+            "overrides": {row.name: f"{row.value} {row.unit}".strip() for row in overrides},
             "command": str(self.command),
             "duration_s": self.duration,
             "sample_rate_hz": self.rate,
             "seed": self.seed,
             "x_0_m": self.x_0,
             **({} if self.load is None else {"load": self.load.words}),
-            **({} if self.controlled is None else {"controller": repr(self.controlled)}),
+            **({} if self.active_controller is None else {"controller": repr(self.active_controller)}),
         }
 
     def key(self) -> str:
-        """Compute a short name that equal experiments alone share."""
-        values = {name: repr(value) for name, value in self.rig.present().items()}
-        inputs = [exact(self.command), *(exact(leak) for leak in self.leaks)]
-        inputs += [exact(change) for change in (*self.faults, *self.drifts)]
+        """Compute a hash of the experiment; equal experiments have equal keys."""
+        values = {name: repr(value) for name, value in self.rig.present_values().items()}
+        inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
+        inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
-        solver += [] if self.error is None else [self.error]
-        inputs += [exact(added) for added in (self.load, self.controlled) if added is not None]
+        solver += [] if self.error is None else [self.error]  # keys of experiments without an error stay as they were
+        inputs += [identity_values(added) for added in (self.load, self.active_controller) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def exact(value: Any) -> Any:
-    """Convert a command or a leak to plain values that differ wherever its numbers do.
+def identity_values(value: Any) -> Any:
+    """Convert a command, leak or other object to plain values that are equal only if all its numbers are equal.
 
-    Down to the last digit, and deep in a table.
+    Arrays become a hash of their bytes, dataclasses the list of their fields' values.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
-        return [type(value).__name__, *(exact(getattr(value, part.name)) for part in fields(value))]
+        return [type(value).__name__, *(identity_values(getattr(value, part.name)) for part in fields(value))]
     return repr(value)
 
 
 def _parse_several(
     argument: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str
 ) -> tuple[_Kind, ...]:
-    """Read the leaks or faults of an argument: one or several, as texts or as objects.
-
-    Raises InputError for anything else.
-    """
-    several = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
-    if not isinstance(several, Iterable):
+    """Parse an argument of one or several leaks or faults, as texts or as objects; raise InputError for others."""
+    items = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
+    if not isinstance(items, Iterable):
         raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {argument!r}")
     result = []
-    for item in several:
+    for item in items:
         if not isinstance(item, (str, kind)):
             raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {item!r}")
         parsed = parse(item) if isinstance(item, str) else item

@@ -1,7 +1,6 @@
-"""Faults of machine, sensors and duty over time, as data and as text: the table `faults.toml`, and one class.
+"""Faults of machine, sensors and duty over time, as data and as text (``pump leak x3 growing from 1 min to 2 min``).
 
-A text such as ``pump leak x3 growing from 1 min to 2 min`` is read by `parse_fault`; leaks across the piston stand in
-`leaks`.
+The kinds of faults are the entries of `faults.toml`; leaks across the piston are in `leaks`.
 """
 
 from __future__ import annotations
@@ -18,30 +17,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
-from sealscope.simulation.changes import RESOLUTION, SHORTEST_BLOCK, THROTTLES, Effect, Hold, fields_of
-from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, Polyline, number_text, plain_text
-from sealscope.simulation.leaks import WHEN, Part, from_time, opening_of
+from sealscope.simulation.changes import (
+    MAX_RELATIVE_CHANGE,
+    SHORTEST_BLOCK,
+    THROTTLES,
+    Effect,
+    Hold,
+    model_parameters_derived_from,
+)
+from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, Polyline, format_number, normalize_blanks
+from sealscope.simulation.leaks import WHEN, Groups, opening_from, parse_opening
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Most of a fault that comes or goes from one block of the solver to the next.
-SHARE_RESOLUTION = 5e-3
-#: Channels whose sensors can be faulty, and the parameter of each sensor that holds its relative error of gain.
-GAINS = {
-    **dict.fromkeys(("p_1", "p_2", "p_A", "p_B"), "gain_error"),
-    "x": "scale_error",
-    "q_leak": "gain_error",
-}
-#: A valve that moves is held within blocks of one output of the solver, whatever their length [s].
+#: Largest change of a fault from one block of the solver to the next, as a fraction of its full size.
+FAULT_MAX_CHANGE = 5e-3
+#: Channels whose sensors can be faulty, with the parameter that is the sensor's relative gain error.
+GAIN_PARAMETERS = {**dict.fromkeys(PRESSURES, "gain_error"), "x": "scale_error", "q_leak": "gain_error"}
+#: Shortest block [s] for a moving valve: as short as one output of the solver.
 _VALVE_BLOCK = 0.0
 _SPAN = rf"(?:\s+from\s+(?P<since>{TIME})(?:\s+to\s+(?P<until>{TIME}))?)?"
-#: When a fault is there: `from 60 s`, `growing from ..`; `from 60 s to 90 s` of a stuck sensor, `within 0.5 s` of a
-#: valve that is operated.
+#: Times of a fault in its text: `from 60 s` or `growing from ..`; `from 60 s to 90 s` for a stuck sensor; with `within
+#: 0.5 s` for an operated valve.
 _WHEN = {"grows": WHEN, "lasts": _SPAN, "operated": rf"{_SPAN}(?:\s+within\s+(?P<ramp>{TIME}))?"}
-#: What stands in braces in the patterns of `faults.toml`.
+#: Patterns that are inserted for the names in braces in `faults.toml`.
 _PATTERNS = {
     "number": NUMBER,
     "factor": rf"(?:x\s*(?P<times>{NUMBER})|(?P<percent>[-+]\s*{UNSIGNED})\s*%)",
@@ -53,13 +56,14 @@ _PATTERNS = {
 }
 
 
-def _number(text: str | None) -> float:
+def _parse_number(text: str | None) -> float:
+    """Parse a number of a fault's text, with or without a blank after its sign; 0 for None."""
     return float((text or "0").replace(" ", ""))
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """The effects and words of a kind of fault: an entry of `faults.toml`, whose head explains its keys."""
+    """The effects and the text of a kind of fault: an entry of `faults.toml`, whose head explains its keys."""
 
     name: str
     kind: str
@@ -79,57 +83,61 @@ class FaultRow:
     when: str = "grows"
 
     @property
-    def of_sensor(self) -> bool:
+    def is_sensor_fault(self) -> bool:
         """True for a fault of a sensor."""
         return self.kind.startswith("sensor")
 
-    def read(self, text: str) -> Fault | None:
-        """Read the fault of a text; None where it is another kind."""
+    def parse(self, text: str) -> Fault | None:
+        """Parse a text as a fault of this kind; return None if it does not match."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
             return None
-        part = match.groupdict()
-        place = part.get("at") or ""
-        place = place if self.of_sensor else place.upper()
-        return Fault(self.name, self._value(part), place, opening_of(part), _number(part.get("pace") or "1"))
+        groups = match.groupdict()
+        channel_or_side = groups.get("at") or ""
+        if not self.is_sensor_fault:
+            channel_or_side = channel_or_side.upper()  # side A or B
+        frequency_factor = _parse_number(groups.get("pace") or "1")
+        return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
 
-    def _value(self, part: Part) -> float:
-        if part.get("size") is not None:
-            unit = CHANNEL_UNITS.get(part["at"] or "", "Pa") if self.of_sensor else self.unit
-            return parse_quantity(part["size"] or "", unit, name=self.what)
-        if part.get("percent") is not None:
-            return 1.0 + _number(part["percent"]) / 100.0
-        if part.get("share") is not None:
-            return _number(part["share"]) / (100.0 if part["sign"] else 1.0)
-        return _number(part.get("times") or part.get("value") or ("1" if self.factor else "0"))
+    def _parse_value(self, groups: Groups) -> float:
+        """Parse a fault's value from the groups of its text: a size in SI units, a factor or a fraction."""
+        if groups.get("size") is not None:
+            unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
+            return parse_quantity(groups["size"] or "", unit, name=self.what)
+        if groups.get("percent") is not None:
+            return 1.0 + _parse_number(groups["percent"]) / 100.0
+        if groups.get("share") is not None:
+            return _parse_number(groups["share"]) / (100.0 if groups["sign"] else 1.0)  # in % or a fraction
+        return _parse_number(groups.get("times") or groups.get("value") or ("1" if self.factor else "0"))
 
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault other than a leak across the piston: the row `name` of `FAULTS`.
+    """A fault other than a leak across the piston; `name` is that of its row in `FAULTS`.
 
-    `value` is a factor or what is added, in SI units; `at` the side or the channel; `pace` of a duty: how many times as
-    fast it runs. Its `opening` says when: 0 is a healthy machine, 1 the whole fault; its text is what `parse_fault`
-    reads.
+    `value`: a factor, or an addend in SI units; `at`: the side or the channel; `opening`: extent of the fault over
+    time; `frequency_factor`: on the frequency of a duty. `str` gives the text that `parse_fault` reads.
     """
 
     name: str
     value: float = 0.0
     at: str = ""
-    opening: Polyline = field(default_factory=from_time)
-    pace: float = 1.0
+    opening: Polyline = field(default_factory=opening_from)
+    frequency_factor: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check channel or side, value, frequency factor and opening against the limits of the kind of fault."""
         row = self.row
-        if row.of_sensor and self.at not in GAINS:
-            raise InputError(f"a faulty sensor must be one of {', '.join(GAINS)}, got {self.at!r}")
-        if not row.of_sensor and "{at}" in row.words and self.at not in ("A", "B"):
+        if row.is_sensor_fault and self.at not in GAIN_PARAMETERS:
+            raise InputError(f"a faulty sensor must be one of {', '.join(GAIN_PARAMETERS)}, got {self.at!r}")
+        has_side = not row.is_sensor_fault and "{at}" in row.words  # its text names the side
+        if has_side and self.at not in ("A", "B"):
             raise InputError(f"a {self.name} must be A or B, got {self.at!r}")
         if not (math.isfinite(self.value) and row.least <= self.value <= row.most):
             raise InputError(f"{row.what} must {row.allowed}, got {self.value:g}")
-        if not 0.0 <= self.pace <= sys.float_info.max:
-            raise InputError(f"a duty's frequency must change by a factor >= 0, got {self.pace:g}")
+        if not 0.0 <= self.frequency_factor <= sys.float_info.max:
+            raise InputError(f"a duty's frequency must change by a factor >= 0, got {self.frequency_factor:g}")
         if self.name == "duty" and self.opening.rise is None:
             raise InputError(f"a duty must change at one time or grow from one to another, got {self.opening}")
 
@@ -144,104 +152,111 @@ class Fault:
         return self.row.kind
 
     def onset(self) -> float:
-        """Return the first time [s] at which the fault is present."""
+        """Return the time [s] at which the fault begins."""
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Build the effects on the machine or a sensor; raise InputError where the fault cannot be on this rig."""
+        """Build the fault's effects on the machine or a sensor; raise InputError if this rig cannot have the fault."""
         row = self.row
-        if row.needs is not None and rig[name := row.needs[0].format(at=self.at)] == 0:
-            raise InputError(f"{row.needs[1]} {name} > 0, got 0 ({self})")
+        if row.needs is not None:
+            pattern, rule = row.needs
+            if rig[name := pattern.format(at=self.at)] == 0:
+                raise InputError(f"{rule} {name} > 0, got 0 ({self})")
         if self.name in _EFFECTS:
             return _EFFECTS[self.name](self, rig)
         if row.factor:
-            size, step = self.value - 1.0, SHARE_RESOLUTION * max(abs(self.value - 1.0), 1e-3)
+            size = self.value - 1.0
+            max_change = FAULT_MAX_CHANGE * max(abs(size), 1e-3)  # above 0 for a factor of 1
         else:
             size = float(rig[row.adds]) if row.adds else self.value / (float(rig[row.over]) if row.over else 1.0)
-            step = SHARE_RESOLUTION * size or math.inf
-        whole = 1.0 if row.factor else 0.0
+            max_change = FAULT_MAX_CHANGE * size or math.inf
+        healthy = 1.0 if row.factor else 0.0
         return tuple(
             Effect(
-                name.format(at=self.at, gain=GAINS.get(self.at)),
-                lambda t: whole + size * self.opening.value_at(t),
-                step,
-                added=not row.factor,
-                jumps=self.opening.bends(),
-                shortest=_VALVE_BLOCK if row.when == "operated" else SHORTEST_BLOCK,
+                name.format(at=self.at, gain=GAIN_PARAMETERS.get(self.at)),
+                lambda t: healthy + size * self.opening.value_at(t),
+                max_change,
+                additive=not row.factor,
+                breakpoints=self.opening.breakpoints(),
+                min_block=_VALVE_BLOCK if row.when == "operated" else SHORTEST_BLOCK,
             )
             for name in row.parameters
         )
 
     def holds(self) -> tuple[Hold, ...]:
-        """List the readings that repeat themselves because of the fault."""
+        """List the spans over which a stuck sensor repeats its reading; empty for any other fault."""
         if self.name != "sensor stuck":
             return ()
         stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])
         return (Hold(self.at, self.onset(), stop),)
 
-    def commanded(self, command: Command) -> Command:
-        """Build the command that the rig receives in place of `command`."""
+    def change_command(self, command: Command) -> Command:
+        """Apply a duty fault to a command; any other fault returns it unchanged."""
         return ChangedDuty(command, self) if self.name == "duty" else command
 
-    def viscosity(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the function of times [s] for the oil's viscosity over the rig's; None for a constant one."""
+    def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
+        """Build the function of time [s] for the oil's viscosity relative to the rig's; None if it is constant."""
         if self.name != "oil":
             return None
-        from sealscope.physics.fluid import kinematic_viscosity, thermal_density
+        from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
 
         oil = rig.fluid
-        at_rig = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
+        rig_nu = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
 
-        def ratio(t: Array) -> Array:
-            T = self._warmth(rig, t)
-            thick = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / at_rig
-            return np.asarray(thick * thermal_density(T, oil.T_oil, oil.alpha))
+        def dynamic_viscosity_ratio(t: Array) -> Array:
+            """Compute the dynamic viscosity over the rig's: kinematic viscosity times density."""
+            T = self._oil_temperature(rig, t)
+            nu_ratio = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / rig_nu
+            return np.asarray(nu_ratio * thermal_density_ratio(T, oil.T_oil, oil.alpha))
 
-        return ratio
+        return dynamic_viscosity_ratio
 
-    def _warmth(self, rig: Rig, t: Array) -> Array:
+    def _oil_temperature(self, rig: Rig, t: Array) -> Array:
+        """Compute the oil's temperature [K] at times t [s] under a fault of the oil."""
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
     def __str__(self) -> str:
+        """Format the text that `parse_fault` reads."""
         words = self.row.words
         if self.name == "duty":
-            paced = self.pace != 1.0
-            words = "duty amplitude x{value}" if self.value != 1.0 or not paced else "duty"
-            words += f" frequency x{number_text(self.pace)}" if paced else ""
-        value, lpm = number_text(self.value), self.value / LITRE_PER_MINUTE
-        shares = {"percent": number_text(100.0 * self.value), "signed": f"{self.value:+.12g}"}
-        words = words.format(at=self.at, value=value, lpm=lpm, unit=CHANNEL_UNITS.get(self.at), **shares)
+            changes_frequency = self.frequency_factor != 1.0
+            words = "duty amplitude x{value}" if self.value != 1.0 or not changes_frequency else "duty"
+            words += f" frequency x{format_number(self.frequency_factor)}" if changes_frequency else ""
+        value, lpm = format_number(self.value), self.value / LITRE_PER_MINUTE
+        percent, signed = format_number(100.0 * self.value), f"{self.value:+.12g}"
+        unit = CHANNEL_UNITS.get(self.at)
+        words = words.format(at=self.at, value=value, lpm=lpm, unit=unit, percent=percent, signed=signed)
         return f"{words} {self.opening}"
 
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """The command `before`, made larger and faster as `change` states, without a jump in its phase."""
+    """The command `before` with amplitude and frequency changed by a duty fault, and a continuous phase."""
 
     before: Command
     change: Fault
 
-    def clock(self, t: Array) -> Array:
-        """Compute the time on the command's own clock: t + (pace - 1) x integral of the opening."""
+    def original_time(self, t: Array) -> Array:
+        """Compute the time [s] at which the original command is evaluated: t + (factor - 1) integral of opening."""
         start, stop = self.change.opening.rise or (math.inf, math.inf)
-        since = np.maximum(t - start, 0.0)
+        opening_integral = np.maximum(t - start, 0.0)
         if stop > start:
-            grown = np.minimum(since, stop - start)
-            since = grown**2 / (2.0 * (stop - start)) + np.maximum(t - stop, 0.0)
-        return np.asarray(t + (self.change.pace - 1.0) * since)
+            ramp_time = np.minimum(opening_integral, stop - start)
+            opening_integral = ramp_time**2 / (2.0 * (stop - start)) + np.maximum(t - stop, 0.0)
+        return np.asarray(t + (self.change.frequency_factor - 1.0) * opening_integral)
 
     def volts(self, t: Array) -> Array:
         """Compute u [V] at times t [s]."""
-        size = 1.0 + (self.change.value - 1.0) * self.change.opening.value_at(t)
-        return np.asarray(size * self.before.volts(self.clock(t)))
+        amplitude_factor = 1.0 + (self.change.value - 1.0) * self.change.opening.value_at(t)
+        return np.asarray(amplitude_factor * self.before.volts(self.original_time(t)))
 
     def __str__(self) -> str:
         return f"{self.before}, {self.change}"
 
 
-def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the change of the coefficients of the line's throttle; raise InputError for a rig without a line."""
-    from sealscope.physics.restrictors import behind_shut_off, orifice_coefficient
+def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
+    """Build the effects of a shut-off valve on its throttle's coefficients; InputError for a rig without lines."""
+    from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
     line = rig.line
@@ -249,44 +264,55 @@ def _shut_off(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
         raise InputError(f"a shut-off valve must be in a line (line.orifices = present), got absent ({fault})")
     c_line = orifice_coefficient(line.C_d, math.pi / 4.0 * line.d_line**2, rig.fluid.rho)
     open_coefficients = throttle_coefficients(rig.with_overrides({"line.open_A": 1.0, "line.open_B": 1.0}))
-    before = line.open_A if fault.at == "A" else line.open_B
+    initial_opening = line.open_A if fault.at == "A" else line.open_B
 
-    def effect(name: str, c: float) -> Effect:
-        initial = c if before >= 1.0 else behind_shut_off(c, c_line, before)
+    def build_effect(name: str, c_open: float) -> Effect:
+        """Build the effect on one throttle coefficient, `c_open` with an open valve."""
+        c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:
-            s = before + (fault.value - before) * fault.opening.value_at(t)
-            return np.asarray(np.where(s >= 1.0, c, behind_shut_off(c, c_line, s)) - initial)
+            """Compute the change of the coefficient by the valve in series with the throttle."""
+            opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
+            return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
-        return Effect(name, change, 1e-6 * c, added=True, jumps=fault.opening.bends(), shortest=_VALVE_BLOCK)
+        max_change = 1e-6 * c_open  # a block for each output while the valve moves
+        return Effect(
+            name, change, max_change, additive=True, breakpoints=fault.opening.breakpoints(), min_block=_VALVE_BLOCK
+        )
 
-    return tuple(effect(name, c) for name, c in zip(THROTTLES, open_coefficients, strict=True) if name[2] == fault.at)
+    names = [name for name in THROTTLES if name.startswith(f"c_{fault.at}_")]
+    return tuple(build_effect(name, open_coefficients[THROTTLES.index(name)]) for name in names)
 
 
-def _warmer(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the change of all numbers that follow the oil: its viscosity, density and bulk modulus.
+def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
+    """Build the effects of a changing oil temperature on viscosity, density, bulk modulus and all that depend on them.
 
-    Laminar gaps (pump, rod seals, piston, filters: R = 1/G) pass oil as 1/viscosity, viscous friction of piston and
-    shaft goes with it.
+    Conductances of laminar gaps go with 1/viscosity, filter resistances and viscous friction with the viscosity.
     """
-    from sealscope.physics.fluid import thermal_density, thermal_stiffness
+    from sealscope.physics.fluid import thermal_density_ratio, thermal_stiffness_ratio
 
-    thick, T_0 = fault.viscosity(rig), rig.fluid.T_oil
-    assert thick is not None
+    viscosity, T_0 = fault.viscosity_ratio(rig), rig.fluid.T_oil
+    assert viscosity is not None
 
-    def lighter(power: float) -> Callable[[Array], Array]:
-        return lambda t: np.asarray(thermal_density(fault._warmth(rig, t), T_0, rig.fluid.alpha) ** power)
+    def density_power(power: float) -> Callable[[Array], Array]:
+        """Build the function of time for a power of the relative density."""
+        alpha = rig.fluid.alpha
+        return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 
-    factors: list[tuple[str, Callable[[Array], Array]]] = [(name, thick) for name in ("F_v", "B_M", "R_A", "R_B")]
-    factors += [(name, lambda t: 1.0 / thick(t)) for name in ("G_pump", "G_ext_A", "G_ext_B")]
-    factors += [("K_oil", lambda t: thermal_stiffness(fault._warmth(rig, t), T_0))]
-    factors += [(name, lighter(power)) for name, power in fields_of("fluid.rho")]
-    return tuple(Effect(name, factor, RESOLUTION, jumps=fault.opening.bends()) for name, factor in factors)
+    # viscous friction of piston and motor, filter resistances
+    factors: list[tuple[str, Callable[[Array], Array]]] = [(name, viscosity) for name in ("F_v", "B_M", "R_A", "R_B")]
+    # leakage conductances of the pump and past the rod seals
+    factors += [(name, lambda t: 1.0 / viscosity(t)) for name in ("G_pump", "G_ext_A", "G_ext_B")]
+    factors += [("K_oil", lambda t: thermal_stiffness_ratio(fault._oil_temperature(rig, t), T_0))]
+    factors += [(name, density_power(power)) for name, power in model_parameters_derived_from("fluid.rho")]
+    return tuple(
+        Effect(name, factor, MAX_RELATIVE_CHANGE, breakpoints=fault.opening.breakpoints()) for name, factor in factors
+    )
 
 
-#: Faults that change more than a parameter or two.
-_EFFECTS = {"shut-off": _shut_off, "oil": _warmer}
-#: What faults change, by name.
+#: Faults whose effects do not follow from the parameters in their row.
+_EFFECTS = {"shut-off": _shut_off_effects, "oil": _oil_temperature_effects}
+#: The kinds of faults, by name.
 FAULTS: Mapping[str, FaultRow] = {
     name: FaultRow(name, **row)
     for name, row in tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8")).items()
@@ -294,16 +320,16 @@ FAULTS: Mapping[str, FaultRow] = {
 
 
 def parse_fault(text: str) -> Fault | None:
-    """Read a fault from text; None for ``none``.
+    """Parse a fault; return None for ``none``.
 
-    A rod seal's flow is that at the charge pressure; operations such as `circulation` are no faults. Raises InputError
-    that shows the forms when the text is none of them.
+    A rod seal's flow is that at the charge pressure. Operations of the rig, such as `circulation`, are stated in the
+    same way. Raises InputError, which lists the forms, if the text has none of them.
     """
-    stripped = plain_text(text, "fault")
+    stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):
         return None
     for row in FAULTS.values():
-        if fault := row.read(stripped):
+        if fault := row.parse(stripped):
             return fault
     raise InputError(
         "fault must be like 'pump leak x3 from 90 s', 'pump leak G = 5e-13', 'rod seal A 0.01 L/min from 90 s', "

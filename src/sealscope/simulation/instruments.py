@@ -1,4 +1,4 @@
-"""The instruments: from the truth to the readings of the rig's sensors and data acquisition (thesis, ch. 2.4)."""
+"""The instruments: from a simulated run to the readings of the rig's sensors and data acquisition (thesis, ch. 2.4)."""
 
 from __future__ import annotations
 
@@ -17,138 +17,138 @@ if TYPE_CHECKING:
 
 #: Half length of the anti-alias filter, in samples of the recording.
 FILTER_REACH = 16
-#: Highest order of a hum's harmonics.
+#: Highest harmonic of the mains hum.
 HUM_HARMONICS = 5
 _KAISER_BETA = 8.0
-_PASS = 0.9  # cut-off (-6 dB) as a share of the Nyquist frequency
+_CUTOFF_FRACTION = 0.9  # cut-off (-6 dB) over the Nyquist frequency
 
 
 class Outputs(Protocol):
     """Outputs of a run by name, such as a `Trajectory`."""
 
     def __getitem__(self, name: str) -> Array:
-        """Return an output over time."""
+        """Return the values of an output over time."""
         ...
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Compute the taps of the zero-phase anti-alias filter at `factor` times the recording's rate.
+    """Compute the taps (2 FILTER_REACH factor + 1,) of the anti-alias filter, a Kaiser-windowed sinc of unit gain.
 
-    (2 FILTER_REACH factor + 1,): a Kaiser-windowed sinc of gain 1, late by `delay` < 1 taps; a single 1 where there is
-    nothing to filter.
+    `factor`: the signal's rate over the recording's; `delay`: lag of the filter as a fraction of a tap, otherwise it
+    has zero phase. A single tap of 1 if there is nothing to filter.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
     reach = FILTER_REACH * factor
     offsets = np.arange(-reach, reach + 1) + delay
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1.0 - (offsets / reach) ** 2))) / np.i0(_KAISER_BETA)
-    taps = np.sinc((_PASS / factor if factor > 1 else 1.0) * offsets) * window
+    taps = np.sinc((_CUTOFF_FRACTION / factor if factor > 1 else 1.0) * offsets) * window
     return np.asarray(taps / taps.sum())
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """Compute `n` samples of `values`, one in `factor`, after a zero-phase Kaiser-windowed sinc.
+    """Reduce the rate of `values` by `factor` to `n` samples, behind the anti-alias filter (`anti_alias_taps`).
 
-    The sinc is at -6 dB at 0.9 of the new Nyquist frequency. `values` runs FILTER_REACH new samples beyond the last
-    one; before the first the signal is at rest at its first value. `delay` >= 0 in samples of `values`, whole or not:
-    the samples are those of that much earlier (for a fraction the same sinc, taken between its taps).
+    `values` must extend FILTER_REACH samples of the lower rate beyond the last one; before the first they are constant.
+    `delay` >= 0 in samples of `values`, whole or not: each sample is taken from that much earlier.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
     reach = FILTER_REACH * factor
-    whole_samples = math.floor(delay)
-    taps = anti_alias_taps(factor, delay - whole_samples)
-    if taps.size == 1:  # a whole delay of an unfiltered signal
+    whole_delay = math.floor(delay)
+    taps = anti_alias_taps(factor, delay - whole_delay)
+    if taps.size == 1:  # unfiltered, delayed by whole samples
         taps = np.r_[np.zeros(reach), 1.0, np.zeros(reach)]
-    padded = np.concatenate([np.full(reach + whole_samples, values[0]), values])
+    padded = np.concatenate([np.full(reach + whole_delay, values[0]), values])
     windows = np.lib.stride_tricks.sliding_window_view(padded, taps.size)[::factor]
     return np.asarray(windows[:n] @ taps)
 
 
-def lagging(values: Array, lag: float, rate: float) -> Array:
-    """Filter a signal at `rate` [Hz] by a transducer of the first order: lag dy/dt + y = signal.
+def filter_first_order(values: Array, lag: float, rate: float) -> Array:
+    """Filter a signal at `rate` [Hz] by a first-order transducer, lag dy/dt + y = signal; `lag` [s], 0: none.
 
-    Exact for a signal that is linear between its values, at rest before the first one; `lag` [s] of 0 leaves it as it
-    is.
+    Exact for a signal that is linear between its values and constant before the first.
     """
     if lag == 0.0:
         return values
     from scipy.signal import lfilter
 
     decay = math.exp(-1.0 / (lag * rate))
-    mean = (1.0 - decay) * lag * rate  # of the exponential over one interval
-    weight_of_sample = 1.0 - mean
-    filtered, _ = lfilter(
-        [weight_of_sample, mean - decay], [1.0, -decay], values, zi=[(1.0 - weight_of_sample) * values[0]]
-    )
+    mean_decay = (1.0 - decay) * lag * rate  # mean of exp(-t/lag) over one interval
+    b_0 = 1.0 - mean_decay
+    filtered, _ = lfilter([b_0, mean_decay - decay], [1.0, -decay], values, zi=[(1.0 - b_0) * values[0]])
     return np.asarray(filtered)
 
 
-def at_jittered(sampled: Callable[[Array], Array], values: Array, late: Array | None) -> Array:
-    """Compute samples of a clock that is `late` (n,) by -1 to 1 intervals of `values`; None: punctual.
+def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
+    """Sample `values` with a clock that is late by `lateness` (n,), a fraction -1 .. 1 of their interval; None: 0.
 
-    `sampled(values)` are the samples of a punctual clock; between the values a parabola is taken.
+    `sample(values)`: the samples (n,) of a clock without jitter. Values are interpolated by a parabola through three.
     """
-    punctual = sampled(values)
-    if late is None:
-        return punctual
-    before, after = sampled(np.r_[values[:1], values[:-1]]), sampled(np.r_[values[1:], values[-1:]])
-    return np.asarray(punctual + 0.5 * late * (after - before) + 0.5 * late**2 * (after - 2.0 * punctual + before))
+    center = sample(values)
+    if lateness is None:
+        return center
+    before, after = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])
+    return np.asarray(center + 0.5 * lateness * (after - before) + 0.5 * lateness**2 * (after - 2.0 * center + before))
 
 
-def convert(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Compute the pressure [Pa] as read back from the converter.
+def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
+    """Compute the sensitivity [V/Pa] of a pressure transducer: its voltage span over its range."""
+    return (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
 
-    The transducer saturates at its range, the converter counts in steps of `daq.step` [V].
+
+def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
+    """Compute the pressure [Pa] as read back from the analog-digital converter, in steps of `daq.step` [V].
+
+    The transducer saturates at its range.
     """
-    volts_per_pascal = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
-    volts = (
-        daq.sensor_volts_lo + (np.clip(pressure, sensor.range_lo, sensor.range_hi) - sensor.range_lo) * volts_per_pascal
-    )
-    top = 2 ** (daq.bits - 1)
-    codes = np.clip(np.rint(volts / daq.step), -top, top - 1)
-    return sensor.range_lo + (codes * daq.step - daq.sensor_volts_lo) / volts_per_pascal
+    sensitivity, saturated = volts_per_pascal(sensor, daq), np.clip(pressure, sensor.range_lo, sensor.range_hi)
+    volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity
+    n_positive_codes = 2 ** (daq.bits - 1)
+    codes = np.clip(np.rint(volts / daq.step), -n_positive_codes, n_positive_codes - 1)
+    return sensor.range_lo + (codes * daq.step - daq.sensor_volts_lo) / sensitivity
 
 
 def read_pressure(
-    true: Array,
-    common: Array,
+    pressure: Array,
+    common_noise: Array,
     sensor: PressureTransducer,
     daq: Daq,
     rate: float,
     random: np.random.Generator,
     parameter: Callable[[str, float], Array | float],
 ) -> Array:
-    """Compute the readings of one pressure channel [Pa].
+    """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
-    Gain and offset, own and common noise, drift, hum with its harmonics, saturation, conversion, stuck and lost
-    samples; `parameter(symbol, value)` is a parameter of the sensor over time,
-    `value` that of the rig.
+    In this order: gain, offset, drift, hum, noise of the channel and `common_noise` [Pa], saturation, conversion, stuck
+    and lost samples. `parameter(symbol, value)` is a parameter of the sensor over time, `value` that of the rig.
     """
-    t = np.arange(true.size) / rate
-    walk = np.cumsum(random.standard_normal(true.size)) * sensor.drift / np.sqrt(rate)
+    n = pressure.size
+    t = np.arange(n) / rate
+    drift = np.cumsum(random.standard_normal(n)) * sensor.drift / np.sqrt(rate)
     hum = parameter("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
-    noise = parameter("noise", sensor.noise) * random.standard_normal(true.size)
+    noise = parameter("noise", sensor.noise) * random.standard_normal(n)
     if sensor.hum_harmonics > 0:
-        hum = hum + parameter("hum", sensor.hum) * _harmonics(sensor, t, random)
+        hum = hum + parameter("hum", sensor.hum) * _hum_harmonics(sensor, t, random)
     gain, offset = 1.0 + parameter("gain_error", sensor.gain_error), parameter("offset", sensor.offset)
-    read = convert(gain * true + offset + walk + hum + noise + common, sensor, daq)
-    if sensor.stuck_rate > 0:  # a stuck reading holds for a second on average
-        for start in np.flatnonzero(random.random(true.size) < sensor.stuck_rate / rate):
-            read[start : start + 1 + int(random.exponential(rate))] = read[start]
-    read[random.random(true.size) < sensor.drop_rate / rate] = np.nan
-    return read
+    readings = digitize(gain * pressure + offset + drift + hum + noise + common_noise, sensor, daq)
+    if sensor.stuck_rate > 0:  # a reading is stuck for a second on average
+        for start in np.flatnonzero(random.random(n) < sensor.stuck_rate / rate):
+            readings[start : start + 1 + int(random.exponential(rate))] = readings[start]
+    readings[random.random(n) < sensor.drop_rate / rate] = np.nan
+    return readings
 
 
-def _harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, each with a phase of its own."""
+def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
+    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, with random phases."""
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
-    turns = sensor.hum_frequency * np.outer(orders, t) + phases[:, None]
-    return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * turns))
+    cycles = sensor.hum_frequency * np.outer(orders, t) + phases[:, None]
+    return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * cycles))
 
 
 def _quantize(values: Array, resolution: float) -> Array:
+    """Round values down to multiples of the resolution; 0 leaves them unchanged."""
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 
@@ -157,12 +157,11 @@ def record(
 ) -> Recording:
     """Record a trajectory with the rig's instruments.
 
-    `trajectory` is sampled `factor` times faster than the recording and runs FILTER_REACH samples longer; `u`: (n,)
-    command [V] at the recording's samples. Analog channels (pressures, flow meter) pass the anti-alias filter,
-    encoders are read at the instant; the clock of all but the command may jitter. The noise of each channel comes
-    from a stream of its own under `seed`, so that no channel's noise depends on another's settings. `readings`: what
-    changes at the instruments within the run. Of a valve-controlled rig neither angle nor speed of the motor, which
-    drives its supply, are recorded.
+    `trajectory` has `factor` outputs a sample and is FILTER_REACH samples longer than the recording; `u`: (n,) command
+    [V] at the samples; `readings`: changes of the instruments within the run. Analog channels (pressures, flow meter)
+    pass the anti-alias filter, encoders are read at the instant; the clock of all but the command may jitter. Each
+    channel has a random stream of its own from `seed`, so that its noise does not depend on other channels' settings.
+    The motor of a valve-controlled rig, which drives the supply, has no encoder: its angle and speed are not recorded.
     """
     n = u.size
     rate = rig.daq.sample_rate
@@ -170,29 +169,32 @@ def record(
     streams = dict(zip(names, np.random.SeedSequence(seed).spawn(len(names)), strict=True))
     random = {name: np.random.default_rng(stream) for name, stream in streams.items()}
     sensors = rig.sensors
-    instant = slice(0, n * factor, factor)
+    at_samples = slice(0, n * factor, factor)
     t = np.arange(n) / rate
     readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
+        """Make the function (symbol, rig's value) for a parameter of a channel's sensor over time."""
         return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
-    late = None
+    jitter_steps = None
     if rig.daq.jitter > 0:
-        late = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
+        jitter_steps = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
 
-    def read_at(values: Array) -> Array:
-        return at_jittered(lambda shifted: shifted[instant], values, late)
+    def read_instantly(values: Array) -> Array:
+        return sample_with_jitter(lambda signal: signal[at_samples], values, jitter_steps)
 
-    def filtered(values: Array, delay: float = 0.0) -> Array:
-        return at_jittered(lambda shifted: decimate(shifted, factor, n, delay), values, late)
+    def read_filtered(values: Array, delay: float = 0.0) -> Array:
+        return sample_with_jitter(lambda signal: decimate(signal, factor, n, delay), values, jitter_steps)
 
-    count = 2.0 * np.pi / sensors.theta.counts
-    theta = _quantize(read_at(trajectory["theta"]), count)
-    of_x = parameters_of("x")
-    x = (1.0 + of_x("scale_error", sensors.x.scale_error)) * read_at(trajectory["x"]) + of_x("offset", 0.0)
-    x = x + of_x("noise", sensors.x.noise) * random["x"].standard_normal(n)
-    common = readings.value("sensors.common_noise", sensors.common_noise, t) * random["common"].standard_normal(n)
+    angle_resolution = 2.0 * np.pi / sensors.theta.counts
+    theta = _quantize(read_instantly(trajectory["theta"]), angle_resolution)
+    x_parameter = parameters_of("x")
+    scale = 1.0 + x_parameter("scale_error", sensors.x.scale_error)
+    x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)
+    x = x + x_parameter("noise", sensors.x.noise) * random["x"].standard_normal(n)
+    common_noise_sd = readings.value("sensors.common_noise", sensors.common_noise, t)
+    common_noise = common_noise_sd * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
         "omega": np.diff(theta, prepend=theta[:1]) * rate,
@@ -201,15 +203,15 @@ def record(
     }
     for name in PRESSURES:
         sensor = getattr(sensors, name)
-        true = filtered(lagging(trajectory[name], sensor.lag, rate * factor), sensor.delay * rate * factor)
-        channels[name] = read_pressure(true, common, sensor, rig.daq, rate, random[name], parameters_of(name))
-    flow = sensors.q_leak
-    true = (1.0 + parameters_of("q_leak")("gain_error", 0.0)) * filtered(trajectory["q_leak"])
-    true = true + parameters_of("q_leak")("offset", 0.0)
-    read = true + parameters_of("q_leak")("noise", flow.noise) * random["q_leak"].standard_normal(n)
-    read = np.clip(read, -flow.range_hi, flow.range_hi)
-    channels["q_leak"] = read if flow.resolution == 0 else np.rint(read / flow.resolution) * flow.resolution
-    if rig.valve.spool == "present":  # the supply's motor has no encoder
+        lagged = filter_first_order(trajectory[name], sensor.lag, rate * factor)
+        pressure = read_filtered(lagged, sensor.delay * rate * factor)
+        channels[name] = read_pressure(pressure, common_noise, sensor, rig.daq, rate, random[name], parameters_of(name))
+    meter, q_parameter = sensors.q_leak, parameters_of("q_leak")
+    q = (1.0 + q_parameter("gain_error", 0.0)) * read_filtered(trajectory["q_leak"]) + q_parameter("offset", 0.0)
+    q = q + q_parameter("noise", meter.noise) * random["q_leak"].standard_normal(n)
+    q = np.clip(q, -meter.range_hi, meter.range_hi)
+    channels["q_leak"] = q if meter.resolution == 0 else np.rint(q / meter.resolution) * meter.resolution
+    if not rig.circuit.pump_is_measured:  # the supply's motor has no encoder
         del channels["omega"], channels["theta"]
     channels = {name: readings.hold_readings(name, values, t) for name, values in channels.items()}
     return Recording(t, channels, CHANNEL_UNITS, rate)

@@ -1,4 +1,4 @@
-"""Simulate an experiment: size its leaks, integrate, record as the instruments would, and keep the truth apart."""
+"""Simulate an experiment: size its leaks, integrate, record with the instruments, and return the truth separately."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.calls import checked_call, with_arguments_of
+from sealscope.calls import checked_call, take_fields_of
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -20,7 +20,13 @@ from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
 from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
-from sealscope.simulation.integrate import DETAIL_TOLERANCE, Trajectory, oversampling, sized_run, trajectory
+from sealscope.simulation.integrate import (
+    DETAIL_TOLERANCE,
+    Trajectory,
+    integrate_run,
+    oversampling,
+    run_with_sized_leaks,
+)
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open
 from sealscope.storage.atomic import atomic_write
@@ -29,22 +35,22 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Called with what is being done and how far it is, 0..1.
+#: Called with the name of the current task and its completed fraction, 0..1.
 Progress = Callable[[str, float], None]
-#: What the truth of a run holds at each sample, beside the powers (`powers`).
+#: Outputs in the truth of a run at each sample, in addition to the powers (`powers`).
 TRUE_OUTPUTS = (
     *("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up"),
     *("x_s", "i", "V"),
 )
-#: States that a proof compares, and the unit of each.
+#: States that a proof compares in addition to the pressures, with their units.
 _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of a run, which no rig would tell: leaks, faults, drifts, and states without noise at the samples.
+    """The truth of a run, which a recording does not show: leaks, faults, drifts, and outputs without noise.
 
-    `onset_s` and the mean are those of the leaks across the piston.
+    `outputs` are at the samples `t` [s]; `onset_s` and `mean_leak_lpm` are those of the leaks across the piston.
     """
 
     leaks: tuple[Leak, ...]
@@ -58,7 +64,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """The change of one quantity: `difference` and `tolerance` (None: reported only) in `unit`."""
+    """The change of one quantity at half the step: `difference` and `tolerance` (None: not limited) in `unit`."""
 
     name: str
     difference: float
@@ -73,7 +79,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Proof:
-    """The halving test of one experiment: the two steps [s] and every difference."""
+    """The comparison of an experiment at two steps [s], `step` and `halved`: the difference of every quantity."""
 
     method: str
     step: float
@@ -86,31 +92,30 @@ class Proof:
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
-        """Format the proof as lines of text: each change and its limit."""
+        """Format the proof as text, one line for each difference and its tolerance."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
         for row in self.differences:
             limit = "" if row.tolerance is None else f" (at most {row.tolerance:.3g})"
-            lines.append(
-                f"  {row.name:<18} {row.difference:10.3g} {row.unit}{limit}{'' if row.resolved else '  NOT RESOLVED'}"
-            )
+            mark = "" if row.resolved else "  NOT RESOLVED"
+            lines.append(f"  {row.name:<18} {row.difference:10.3g} {row.unit}{limit}{mark}")
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the difference furthest beyond, or nearest to, its tolerance."""
+        """Find the largest difference relative to its tolerance."""
         limited = [row for row in self.differences if row.tolerance]
         return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, its truth, and the proof where one was asked for."""
+    """A simulated experiment: the recording, its truth, and the proof if one was requested."""
 
     recording: Recording
     truth: Truth
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Describe the run in lines: its solver and step, leaks, other faults, and mean flows."""
+        """Describe the run in lines of text: solver and step, leaks, other faults, and mean flows."""
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
         lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
@@ -124,16 +129,16 @@ class Run:
 
 
 def simulate_experiment(experiment: Experiment, progress: Progress | None = None, *, prove: bool = False) -> Run:
-    """Simulate an experiment, and keep its truth apart from the recording.
+    """Simulate an experiment; return its recording, and separately its truth.
 
     Parameters
     ----------
     experiment : Experiment
-        What is simulated, as `Experiment.of` makes it.
+        The experiment, as `Experiment.of` makes it.
     progress : callable, optional
-        Called with what is being done (str) and how far it is (0 to 1).
+        Called with the name of the current task (str) and its completed fraction (0 to 1).
     prove : bool, optional
-        Integrate again at half the step, and compare (`Proof`).
+        Also integrate at half the step, and compare (`Proof`).
 
     Returns
     -------
@@ -146,130 +151,124 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     InputError
         The experiment is impossible, such as a leak larger than the pump's flow.
     SimulationFailed
-        The run diverged, fell below vacuum, or is not resolved by its step; with `prove`, also where halving the step
-        moves more than it may, unless the experiment allows it.
+        The run diverged, fell below vacuum, or is not resolved by its step; with `prove`, also if halving the step
+        changes more than the tolerance, unless the experiment allows it.
     """
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
 
-    def report(what: str) -> Callable[[float], None]:
-        def tell(reached: float) -> None:
+    def make_reporter(task: str) -> Callable[[float], None]:
+        """Build the function that reports the progress of a task from the simulated time [s]."""
+
+        def report(time: float) -> None:
             if progress is not None:
-                progress(what, min(1.0, reached / experiment.duration))
+                progress(task, min(1.0, time / experiment.duration))
 
-        return tell
+        return report
 
-    leaks, path = sized_run(experiment, progress, report("simulating"))
+    leaks, run = run_with_sized_leaks(experiment, progress, make_reporter("simulating"))
     proof = None
     if prove:
-        fine = trajectory(experiment, leaks, step=path.step / 2, progress=report("proving: half the step"))
-        proof = Proof(path.method, path.step, fine.step, compare(experiment, path, fine))
+        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=make_reporter("proving: half the step"))
+        proof = Proof(run.method, run.step, fine.step, compare_trajectories(experiment, run, fine))
         if not (proof.resolved or experiment.allow_unresolved):
             worst = proof.worst()
             raise SimulationFailed(
-                f"the run is under-resolved: halving the step of {path.step:.3g} s ({path.method}) moves {worst.name} "
+                f"the run is under-resolved: halving the step of {run.step:.3g} s ({run.method}) moves {worst.name} "
                 f"by {worst.difference:.4g} {worst.unit}, which must be <= {worst.tolerance:.4g} {worst.unit}; take a "
                 "smaller step"
             )
     n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
-    times = experiment.sample_times()
-    volts = experiment.commanded.volts(times) if path.volts is None else path.volts[: n * factor : factor]
-    recorded = record(experiment.rig, path, volts, factor, experiment.seed, experiment.readings())
-    solver = {"method": path.method, "step_s": path.step, "allow_unresolved": experiment.allow_unresolved}
+    at_samples, times = slice(0, n * factor, factor), experiment.sample_times()
+    volts = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
+    recorded = record(experiment.rig, run, volts, factor, experiment.seed, experiment.readings())
+    solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed
     provenance: dict[str, Any] = {
         "origin": "simulation",
         "experiment": experiment.describe(),
         "experiment_key": experiment.key(),
-        "solver": solver | {"error_found_pa": path.error},
+        "solver": solver | {"error_found_pa": run.error},
     }
-    history = (f"simulated with {path.method}, h = {path.step:.4g} s; sampled at {experiment.rate:g} Hz",)
+    history = (f"simulated with {run.method}, h = {run.step:.4g} s; sampled at {experiment.rate:g} Hz",)
     channels = dict(recorded.channels)
-    if path.compensated is not None:
-        channels["q_comp"] = path.compensated[: n * factor : factor]
+    if run.compensated is not None:
+        channels["q_comp"] = run.compensated[at_samples]
     units = {name: CHANNEL_UNITS[name] for name in channels}
     recording = replace(recorded, channels=channels, units=units, provenance=provenance, history=history)
-    outputs = {name: path[name][: n * factor : factor] for name in TRUE_OUTPUTS}
+    outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
-        outputs |= {
-            f"passed_{side}": path[place][: n * factor : factor] for side, place in (("A", "x_s"), ("B", "v_s"))
-        }
-        outputs["x_s"] = np.zeros(n)
+        # a rig with clogging filters has no servo valve: the spool's states are the oil that passed the filters
+        outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(n)}
     outputs |= powers(outputs, experiment.rig)
-    dp, dp_0 = path["p_A"] - path["p_B"], experiment.rig.line.dp_0
-    flows = (leak_flow(leak, path.t, dp, dp_0) for leak in experiment.flowing(leaks))
-    mean = sum(mean_while_open(leak, path.t, flow) for leak, flow in zip(leaks, flows, strict=True)) / LITRE_PER_MINUTE
-    truth = Truth(leaks, experiment.onset(), mean, times, outputs, experiment.faults, experiment.drifts)
+    dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
+    flows = (leak_flow(leak, run.t, dp, dp_0) for leak in experiment.scale_with_viscosity(leaks))
+    mean_leak = sum(mean_while_open(leak, run.t, flow) for leak, flow in zip(leaks, flows, strict=True))
+    mean_leak_lpm = mean_leak / LITRE_PER_MINUTE
+    truth = Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
     return Run(recording, truth, proof)
 
 
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
-    """Compute the powers [W] of a run: into the motor, from the pump into the oil, from the pressures to the piston.
+    """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
-    A servo valve's pump feeds the supply: its power is that of the supply.
+    With a servo valve the first two are those of the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
     from sealscope.physics.pump import hydraulic_power
 
-    o, c = outputs, rig.cylinder
+    A_A, A_B = rig.cylinder.A_A, rig.cylinder.A_B
     return {
-        "P_electric": np.asarray(electric_power(o["V"], o["i"])),
-        "P_hydraulic": np.asarray(hydraulic_power(o["Q_1"], o["p_1"] - o["p_2"])),
-        "P_mechanical": np.asarray(mechanical_power(o["p_A"], o["p_B"], o["v"], c.A_A, c.A_B)),
+        "P_electric": np.asarray(electric_power(outputs["V"], outputs["i"])),
+        "P_hydraulic": np.asarray(hydraulic_power(outputs["Q_1"], outputs["p_1"] - outputs["p_2"])),
+        "P_mechanical": np.asarray(mechanical_power(outputs["p_A"], outputs["p_B"], outputs["v"], A_A, A_B)),
     }
 
 
-def compare(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Compare two trajectories: rms of each channel, and change of each detail's RMS."""
+def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
+    """Compare two trajectories of an experiment: rms difference of each channel, and change of each detail's RMS."""
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms
 
     n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
     units = _STATES | dict.fromkeys(PRESSURES, "Pa")
-    differences = [
-        Difference(
-            name,
-            rms(coarse[name][: n * factor] - fine[name][: n * factor]),
-            unit,
-            PRESSURE_TOLERANCE if unit == "Pa" else None,
-        )
-        for name, unit in units.items()
-    ]
+    differences = []
+    for name, unit in units.items():
+        difference = rms(coarse[name][: n * factor] - fine[name][: n * factor])
+        differences.append(Difference(name, difference, unit, PRESSURE_TOLERANCE if unit == "Pa" else None))
     for name in CHAMBERS:
         noise = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
-        transformed = [details(decimate(run[name], factor, n)) for run in (coarse, fine)]
-        inside = transformed[0].inside()
-        ours, theirs = (np.sqrt(mean_squares(levels, [inside.start, inside.stop])[0] + noise) for levels in transformed)
-        for quantity, a, b in zip(QUANTITIES[:4], ours, theirs, strict=False):
-            differences.append(
-                Difference(f"RMS of {quantity} of {name}", float(abs(a - b)), "Pa", float(DETAIL_TOLERANCE * b))
-            )
+        both_details = [details(decimate(run[name], factor, n)) for run in (coarse, fine)]
+        inside = both_details[0].inside()
+        both_rms = [np.sqrt(mean_squares(levels, [inside.start, inside.stop])[0] + noise) for levels in both_details]
+        for quantity, coarse_rms, fine_rms in zip(QUANTITIES[:4], *both_rms, strict=False):  # d1 to d4, not d3d4
+            change, tolerance = float(abs(coarse_rms - fine_rms)), float(DETAIL_TOLERANCE * fine_rms)
+            differences.append(Difference(f"RMS of {quantity} of {name}", change, "Pa", tolerance))
     return tuple(differences)
 
 
 @checked_call
 def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
-    """Integrate an experiment at its step and at half of it, and compare.
+    """Check the solver's step: integrate an experiment at its step and at half of it, and compare.
 
     Parameters
     ----------
     experiment : Experiment
-        What is simulated.
+        The experiment.
     progress : callable, optional
-        Called with what is being done (str) and how far it is (0 to 1).
+        Called with the name of the current task (str) and its completed fraction (0 to 1).
 
     Returns
     -------
     Proof
-        How far each channel and each detail's RMS moved, and how far it may.
+        The difference and the tolerance of each channel and of each detail's RMS.
 
     Raises
     ------
     SimulationFailed
-        The run is under-resolved, which the message explains with the worst difference, unless the experiment allows
-        it.
+        The run is under-resolved, unless the experiment allows it; the message states the largest difference.
 
     Examples
     --------
@@ -283,10 +282,10 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write the truth of a run as JSON.
+    """Write the truth of a run as JSON, without its outputs.
 
-    Leaks with their coefficients, onset [s], mean leak while open [L/min], other faults with their onsets [s], and what
-    drifted from the start to the end, in per cent (or in the SI unit).
+    It contains leaks with their coefficients, onset [s], mean leak while open [L/min], other faults with their onsets
+    [s], and for each drift its range and its change from start to end, in per cent or in the SI unit.
     """
     tree: dict[str, Any] = {
         "onset_s": truth.onset_s,
@@ -296,39 +295,37 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
         ],
     }
     if truth.faults:
+        onsets = [onset if math.isfinite(onset := fault.onset()) else None for fault in truth.faults]
         tree["faults"] = [
-            {
-                "kind": fault.kind,
-                "words": str(fault),
-                "onset_s": onset if math.isfinite(onset := fault.onset()) else None,
-            }
-            for fault in truth.faults
+            {"kind": fault.kind, "words": str(fault), "onset_s": onset}
+            for fault, onset in zip(truth.faults, onsets, strict=True)
         ]
     if truth.drifts:
-        tree["drifts"] = [_drift_of(drift, truth.t) for drift in truth.drifts]
+        tree["drifts"] = [_describe_drift(drift, truth.t) for drift in truth.drifts]
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
-def _drift_of(drift: ParameterDrift, t: Array) -> dict[str, Any]:
+def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
+    """Compute a drift's range, and its change from start to end, over the times t [s]."""
     change = drift.shape.value_at(t)
-    span, end = float(np.ptp(change)), float(change[-1] - change[0])
+    span, net_change = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:
-        return {"parameter": drift.parameter, "span": span, "start_to_end": end}
-    return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * end}
+        return {"parameter": drift.parameter, "span": span, "start_to_end": net_change}
+    return {"parameter": drift.parameter, "span_pct": 100.0 * span, "start_to_end_pct": 100.0 * net_change}
 
 
-@with_arguments_of(Arguments)
+@take_fields_of(Arguments)
 def simulate(arguments: Arguments) -> Recording:
-    """Simulate a rig under a command and record it as its instruments would.
+    """Simulate a rig under a command, and record it with its instruments.
 
-    A quantity is a number in the SI unit stated below, or a text with a unit of its own ("3 min", "20[Pa]"), as on the
-    command line.
+    A quantity is a number in the SI unit stated below, or a text with a unit ("3 min", "20[Pa]"), as on the command
+    line.
 
     Returns
     -------
     Recording
-        What the instruments recorded. `simulate_with_truth` returns the truth, too.
+        The readings of the instruments. `simulate_with_truth` returns the truth, too.
 
     Raises
     ------
@@ -347,9 +344,9 @@ def simulate(arguments: Arguments) -> Recording:
     return simulate_experiment(Experiment.of(**vars(arguments))).recording
 
 
-@with_arguments_of(Arguments)
+@take_fields_of(Arguments)
 def simulate_with_truth(arguments: Arguments) -> Run:
-    """Simulate a rig as `simulate` does, and return its truth with the recording.
+    """Simulate a rig as `simulate` does; return the recording and the truth.
 
     Returns
     -------

@@ -1,1 +1,1 @@
-"""Files from outside and files of our own: opened safely, written whole, in folders that links do not leave."""
+"""Files and folders of results: opened safely, written atomically, without links out of a folder."""

@@ -1,4 +1,4 @@
-"""Write files whole or not at all."""
+"""Write files atomically: a file has its old or its new content, never a part of it."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from pathlib import Path
 
 from sealscope.errors import InputError
 
-#: Names of temporary files: that of the target, the machine and the process that wrote, a random word.
+#: Name of a temporary file: .TARGET.MACHINE-PROCESS.RANDOM.part.
 _TEMPORARY = re.compile(r"\.(.{1,60})\.([0-9a-f]{6})-(\d{1,9})\.[a-z0-9_]{8}\.part", re.DOTALL)
-#: Age [s] from which a temporary file of another machine's process is given up.
-_GIVEN_UP = 86_400.0
+#: Age [s] from which a temporary file of another machine is removed.
+_MAX_AGE = 86_400.0
 
 
-def _machine() -> str:
+def _machine_hash() -> str:
+    """Return a short hash of this machine's name."""
     return sha256(platform.node().encode()).hexdigest()[:6]
 
 
 def check_folder(file: Path) -> None:
-    """Raise InputError where the folder of a file to write is not there."""
+    """Raise InputError if the folder of a file to write does not exist."""
     if not file.parent.is_dir():
         raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary file in the folder of `path`: renamed to `path` when the block ends well, else removed.
+    """Yield a temporary file in the folder of `path`; rename it to `path` if the block succeeds, else remove it.
 
-    The file is on the disk before it is renamed, and its new name when the block has ended: a loss of power leaves the
-    old file or the new one. A file that is replaced keeps its mode. Raises InputError where the folder does not exist
-    or cannot be written.
+    File and folder are synced to the disk, so that a power loss leaves the old file or the new one. A replaced file
+    keeps its mode. Raises InputError if the folder does not exist or cannot be written.
     """
     target = Path(path)
     try:
@@ -44,7 +44,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
         handle, name = tempfile.mkstemp(
-            prefix=f".{target.name[:60]}.{_machine()}-{os.getpid()}.", suffix=".part", dir=target.parent
+            prefix=f".{target.name[:60]}.{_machine_hash()}-{os.getpid()}.", suffix=".part", dir=target.parent
         )
         os.close(handle)
     except OSError as error:
@@ -53,9 +53,9 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         _sync(temporary, os.O_RDWR)
-        temporary.chmod(_mode_of(target))
+        temporary.chmod(_file_mode(target))
         temporary.replace(target)
-        with suppress(OSError):  # Windows opens no folder, and some file systems sync none
+        with suppress(OSError):  # Windows cannot open folders, and some file systems cannot sync them
             _sync(target.parent, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
@@ -63,8 +63,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _mode_of(target: Path) -> int:
-    """Return the mode of the file, or else the mode of any new file of this user."""
+def _file_mode(target: Path) -> int:
+    """Return the mode of the file, or the default mode of a new file."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -73,32 +73,33 @@ def _mode_of(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Have the system write a file, or the names in a folder, to the disk."""
-    number = os.open(path, flags)
+    """Sync a file, or the names in a folder, to the disk."""
+    descriptor = os.open(path, flags)
     try:
-        os.fsync(number)
+        os.fsync(descriptor)
     finally:
-        os.close(number)
+        os.close(descriptor)
 
 
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
-    """Remove the temporary files of killed processes in `folder`, those of the file `target` or of all.
+    """Remove temporary files that killed processes left in `folder`, of the file `target` or of all files.
 
-    A process of this machine that is gone has left its files for good; those of another machine are given up after a
-    day. Links to folders are not resolved.
+    Files of this machine are removed if their process has ended, those of another machine after a day. Links to folders
+    are not followed.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
-        name = _TEMPORARY.fullmatch(path.name)
-        if name is None or (target is not None and name[1] != target[:60]):
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None or (target is not None and match[1] != target[:60]):
             continue
         with suppress(OSError):
-            gone = name[2] == _machine() and not _is_alive(int(name[3]))
-            if gone or path.lstat().st_mtime < time.time() - _GIVEN_UP:
+            is_abandoned = match[2] == _machine_hash() and not _is_alive(int(match[3]))
+            if is_abandoned or path.lstat().st_mtime < time.time() - _MAX_AGE:
                 path.unlink()
 
 
 def _is_alive(process: int) -> bool:
-    if os.name == "nt":  # where signal 0 would end the process
+    """Test whether a process of this machine runs; True if unknown."""
+    if os.name == "nt":  # signal 0 would end the process
         return True
     try:
         os.kill(process, 0)

@@ -1,4 +1,4 @@
-"""Tables as files of CSV, written whole or not at all."""
+"""Write tables as CSV files, atomically and safe for spreadsheets."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from typing import Any
 
 from sealscope.storage.atomic import atomic_write
 
-#: What a cell begins with that a spreadsheet takes for a formula.
-_SIGNS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
+#: Beginnings of a cell that spreadsheets read as a formula, and numbers, which are none.
+_FORMULA_BEGINNINGS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
 
 
 def guard_cell(value: Any) -> Any:
-    """Return a cell that a spreadsheet takes for no formula and a terminal obeys nothing of; numbers stay.
+    """Escape a text so that a spreadsheet reads no formula and a terminal obeys no control character; numbers stay.
 
-    Names and comments come from outside. A text that begins like a formula gets an apostrophe; what cannot be printed
-    becomes its escape.
+    Names and comments may come from outside. A text that begins like a formula gets an apostrophe; unprintable
+    characters are escaped.
     """
     if not isinstance(value, str):
         return value
-    text = "".join(sign if sign.isprintable() or sign == "\n" else repr(sign)[1:-1] for sign in value)
-    return f"'{text}" if value.startswith(_SIGNS) and not _NUMBER.fullmatch(value) else text
+    text = "".join(
+        character if character.isprintable() or character == "\n" else repr(character)[1:-1] for character in value
+    )
+    return f"'{text}" if value.startswith(_FORMULA_BEGINNINGS) and not _NUMBER.fullmatch(value) else text
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows, numbers in full, texts guarded (`guard_cell`); ValueError for a row with a value of no column."""
+    """Write rows with all digits, texts safe for spreadsheets (`guard_cell`); raise ValueError for an unknown key."""
     with (
         atomic_write(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,

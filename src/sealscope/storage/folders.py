@@ -1,4 +1,4 @@
-"""Folders of results: made, entered and held by one process; links out of them are refused."""
+"""Folders of results: create, list and lock them; links out of them are refused."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _log = logging.getLogger(__name__)
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder with its parents where there is none; raise InputError where it cannot be created."""
+    """Create a folder and its parents unless they exist; raise InputError if it cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot create folder: {error.strerror} ({folder})") from None
 
 
-def inner_folder(folder: Path, *names: str) -> Path:
-    """Create the folders `names`, each in the one before it, within `folder`, which may come from outside.
+def make_inner_folder(folder: Path, *names: str) -> Path:
+    """Create the nested folders `names` within `folder`, which may come from outside; return the innermost.
 
-    Returns the last of them. Raises InputError where one cannot be created, or is a link to a folder elsewhere.
+    Raises InputError if one cannot be created, or is a link.
     """
     make_folder(folder)
     for name in names:
@@ -36,35 +36,34 @@ def inner_folder(folder: Path, *names: str) -> Path:
     return folder
 
 
-def inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield the files among the paths in a folder, which may come from outside; a link out of it is logged, not read.
+def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files among `paths` that are in `folder`; log links out of it and skip them.
 
-    Links within the folder are followed; the folder itself may be a link.
+    The folder may come from outside. Links within it are followed, and it may itself be a link.
     """
     root = folder.resolve()
     for path in paths:
         try:
-            is_file, within = path.is_file(), path.resolve().is_relative_to(root)
-        except (OSError, RuntimeError):  # gone meanwhile, or links in a circle
+            is_file, is_inside = path.is_file(), path.resolve().is_relative_to(root)
+        except (OSError, RuntimeError):  # removed meanwhile, or circular links
             continue
-        if is_file and not within:
+        if is_file and not is_inside:
             _log.warning("%s", printable(f"a file of a folder must lie in it, got a link out of it, left out ({path})"))
         elif is_file:
             yield path
 
 
-def by_numbers(name: str) -> list[str | int]:
-    """Compute a key that orders names as people count: day_2 before day_10."""
+def numeric_sort_key(name: str) -> list[str | int]:
+    """Split a name into its numbers and the texts between, a sort key by which day_2 comes before day_10."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 
 @contextmanager
-def locked(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock `file` of a folder of results while the block runs; the process's end releases it, too.
+def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
+    """Lock the lock file of a folder of results while the block runs; the end of the process releases it, too.
 
-    `busy`: message of the InputError that is raised where another holds it for longer than `wait` [s]; None to wait for
-    its end. The file is created where it is absent, and never emptied. Raises InputError for a link in its place, and
-    where it cannot be created.
+    `busy`: message of the InputError if another process has the lock for longer than `wait` [s]; None: wait without
+    limit. The file is created if necessary, and never emptied. Raises InputError if it is a link or cannot be created.
     """
     from filelock import FileLock, Timeout
 

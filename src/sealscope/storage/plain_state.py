@@ -1,4 +1,4 @@
-"""Arrays and dataclasses as plain values that JSON holds to the bit, and back."""
+"""Convert arrays and dataclasses to plain values that JSON stores without loss, and back."""
 
 from __future__ import annotations
 
@@ -12,49 +12,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
-from sealscope.storage.plain_values import as_type
+from sealscope.storage.plain_values import convert_type
 
 _T = TypeVar("_T")
-#: Most numbers of one array: what is larger is no state of a stream.
-_LARGEST = 50_000_000
+#: Most numbers in an array of a stream's state.
+_MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to a mapping of its shape and its bytes (little endian, base64).
+    """Convert an array of numbers to its shape and bytes (little endian, base64).
 
-    Named columns are the last axis, without their names.
+    The columns of a structured array become the last axis, without names.
     """
-    values = np.ascontiguousarray(_unnamed(values), dtype="<f8")
+    values = np.ascontiguousarray(_as_plain_array(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
 
 
-def _unnamed(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert an array of named columns, all floats, to one with the columns as last axis."""
+def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
+    """Convert a structured array of floats to an array with the columns as last axis."""
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass of plain values; lists are copied, for they may grow."""
+    """Convert a dataclass of plain values to a mapping; lists are copied, as they may grow."""
     return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
 
 
-def restored(kind: type[_T], state: Any, name: str) -> _T:
-    """Restore a part of a saved state as the dataclass `kind`; raise InputError where it does not fit."""
+def restore(kind: type[_T], state: Any, name: str) -> _T:
+    """Restore a part of a saved state as the dataclass `kind`; raise InputError if it does not fit."""
     try:
-        return as_type(kind, state)
+        return convert_type(kind, state)
     except ValueError as error:
         raise InputError(f"saved state's {name} does not fit: {error}") from None
 
 
-def array_of(value: Any, name: str) -> NDArray[np.float64]:
-    """Restore the array of a mapping by `plain_array`; `name` stands in the error.
-
-    Raises InputError where it is none.
-    """
+def restore_array(value: Any, name: str) -> NDArray[np.float64]:
+    """Restore an array from a mapping by `plain_array`; raise InputError, with `name`, if it is none."""
     try:
         shape = tuple(int(size) for size in value["shape"])
-        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _LARGEST:
+        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:
             raise ValueError(f"got shape {shape}")
         data = b64decode(value["f8"], validate=True)
         return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)
@@ -62,8 +59,8 @@ def array_of(value: Any, name: str) -> NDArray[np.float64]:
         raise InputError(f"saved state's {name} must be an array with its shape: {error}") from None
 
 
-def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the part `name` of a saved state; raise InputError where it is missing or of a wrong kind."""
+def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
+    """Return the part `name` of a saved state; raise InputError if it is missing or has the wrong type."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -72,18 +69,18 @@ def part_of(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     return value
 
 
-def count_of(state: Any, name: str) -> int:
-    """Return a whole number >= 0 of a saved state; raise InputError for anything else."""
-    value = part_of(state, name, object)
+def require_count(state: Any, name: str) -> int:
+    """Return a whole number >= 0 of a saved state; raise InputError otherwise."""
+    value = require_part(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
     return int(value)
 
 
-def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return numbers of this shape from a saved state; raise InputError for anything else."""
+def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return an array of numbers with this shape from a saved state; raise InputError otherwise."""
     try:
-        values = np.asarray(part_of(state, name, object))
+        values = np.asarray(require_part(state, name, object))
         if values.size and values.dtype.kind not in "fi":
             raise TypeError(f"got {values.dtype}")
     except (TypeError, ValueError) as error:
@@ -93,15 +90,16 @@ def numbers_of(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.floa
     return values.astype(np.float64)
 
 
-def saved(owner: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Convert attributes to plain values, for `recall`: numbers, texts, lists, arrays, dataclasses, states.
+def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Convert attributes to plain values for `restore_attributes`; numbers that are not finite become null.
 
-    A number that is not finite is null.
+    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a `state`.
     """
-    return {name.lstrip("_"): _plain(getattr(owner, name)) for name in names}
+    return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
 
 
-def _plain(value: Any) -> Any:
+def _to_plain_value(value: Any) -> Any:
+    """Convert one attribute to a plain value."""
     if callable(getattr(value, "state", None)):
         return value.state()
     if is_dataclass(value):
@@ -113,29 +111,31 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple | list) else dict(value) if isinstance(value, dict) else value
 
 
-def recall(owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Set the attributes that `saved` returned; null stands for a number left unchanged, or None.
+def restore_attributes(
+    owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})
+) -> None:
+    """Set attributes to the values from `save_attributes`; null leaves a number unchanged, or means None.
 
-    `kinds`: types of attributes that may be None, or hold others. Raises InputError where one is missing or unlike what
-    is there: in its type, or in the shape of an array but for axes that are empty.
+    `kinds`: types of attributes that may be None or of another type. Raises InputError if one is missing or differs
+    from the present one in type, or in the shape of an array except for empty axes.
     """
     for name in names:
-        plain, present = name.lstrip("_"), getattr(owner, name)
-        value = part_of(state, plain, object)
+        key, present = name.lstrip("_"), getattr(owner, name)
+        value = require_part(state, key, object)
         if isinstance(present, np.ndarray):
-            value, kind, present = array_of(value, plain), present.dtype, _unnamed(present)
+            value, dtype, present = restore_array(value, key), present.dtype, _as_plain_array(present)
             if value.ndim != present.ndim or any(
-                b not in (a, 0) for a, b in zip(value.shape, present.shape, strict=True)
+                length not in (saved_length, 0) for saved_length, length in zip(value.shape, present.shape, strict=True)
             ):
-                raise InputError(f"saved state's {plain} must have the shape {present.shape}, got {value.shape}")
-            if kind.names:
-                value = value.view(kind)[:, 0]
-        elif hasattr(present, "recall"):
-            present.recall(value)
+                raise InputError(f"saved state's {key} must have the shape {present.shape}, got {value.shape}")
+            if dtype.names:  # a structured array: its columns are the last axis
+                value = value.view(dtype)[:, 0]
+        elif hasattr(present, "load_state"):  # an object with a state restores itself
+            present.load_state(value)
             continue
         elif value is not None or not isinstance(present, float | None):
-            value = restored(kinds.get(name, type(present)), value, plain)
-        if isinstance(owner, tuple):
+            value = restore(kinds.get(name, type(present)), value, key)
+        if isinstance(owner, tuple):  # the arrays of a named tuple are filled in place
             present[:] = value
         elif value is not None:
             setattr(owner, name, value)

@@ -1,4 +1,4 @@
-"""Plain values of files from outside: JSON of finite numbers, and values of expected types."""
+"""Plain values from outside: JSON with finite numbers, and conversion to expected types."""
 
 from __future__ import annotations
 
@@ -14,91 +14,94 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _T = TypeVar("_T")
-#: Largest whole number: beyond it, doubles are no longer exact.
-LARGEST_WHOLE = 2**53
+#: Largest whole number that doubles represent exactly, like all smaller ones.
+MAX_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a JSON text; raise ValueError for any other, and for numbers that are not finite or too large.
+    """Parse a JSON text; raise ValueError for other texts and for numbers out of range.
 
-    Whole numbers are at most 2^53 in size.
+    Numbers must be finite, and whole numbers at most 2^53.
     """
     try:
-        return json.loads(text, parse_float=_finite, parse_int=_whole_number, parse_constant=_finite)
+        return json.loads(text, parse_float=_parse_finite, parse_int=_parse_whole, parse_constant=_parse_finite)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
+    """Parse a finite number; raise ValueError otherwise."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"a number must be finite, got {text[:40]}")
     return number
 
 
-def _whole_number(text: str) -> int:
-    if len(text) > 17 or abs(int(text)) > LARGEST_WHOLE:
+def _parse_whole(text: str) -> int:
+    """Parse a whole number of at most 2^53; raise ValueError otherwise."""
+    if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # the time of int grows with the square
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
 
 
 @cache
-def _adapter(kind: Any) -> Any:
+def _type_adapter(kind: Any) -> Any:
+    """Make pydantic's validator of a type; it is cached, as this takes long."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
 
 
-def as_type(kind: type[_T], value: Any, named: Callable[[str], str] = str, context: Any = None) -> _T:
-    """Convert plain values to the dataclass or model `kind`; ValueError of one line names a value without a place.
+def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
+    """Convert plain values to the dataclass or model `kind`; raise ValueError if they do not fit.
 
-    `named`: name in the error of an entry of `value`; `context` is for the validators of `kind`.
+    The error is one line without a place. `entry_name`: entry of `value` -> its name in the error; `context`: passed
+    to the validators of `kind`.
     """
     from pydantic import ValidationError
 
     try:
-        return _adapter(kind).validate_python(value, context=context)  # type: ignore[no-any-return, arg-type]
+        return _type_adapter(kind).validate_python(value, context=context)  # type: ignore[no-any-return, arg-type]
     except ValidationError as error:
-        raise ValueError(one_line(error, named)) from None
+        raise ValueError(format_error(error, entry_name)) from None
 
 
-#: Rules in plainer words than those of pydantic, by the type of its error.
+#: Plainer texts for pydantic's types of error.
 _PLAIN_RULES = {
-    "missing": "is missing",
-    "missing_argument": "is missing",
-    "extra_forbidden": "is not known",
-    "unexpected_keyword_argument": "is not known",
+    **dict.fromkeys(("missing", "missing_argument"), "is missing"),
+    **dict.fromkeys(("extra_forbidden", "unexpected_keyword_argument"), "is not known"),
 }
 
 
-def one_line(error: ValidationError, named: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format pydantic's first error: entry, rule and value, as "ENTRY must be ..., got ...".
+def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
+    """Format pydantic's first error as "ENTRY must be ..., got ...".
 
-    An entry that is not known comes before others. `named`: name of an entry of the whole ("" for this); `unit`: of the
-    rule.
+    Unknown entries come before other errors. `entry_name`: entry ("" for the whole value) -> its name; `unit`: appended
+    to the rule.
     """
     errors = error.errors(include_url=False)
     first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
-    entry, *inner = (str(part) for part in first["loc"] or ("",) if part != "[key]")
-    place = "".join([named(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in inner)])
+    entry, *path = (str(part) for part in first["loc"] or ("",) if part != "[key]")  # pydantic's mark of a wrong key
+    place = "".join([entry_name(entry), *(f"[{int(part) + 1}]" if part.isdigit() else f".{part}" for part in path)])
     if plain_rule := _PLAIN_RULES.get(first["type"]):
         return f"{place} {plain_rule}"
     rule = re.sub(r"^\w+ should", "must", first["msg"].removeprefix("Value error, ")).replace("tuple", "list") + unit
+    # the text of a ValueError of a validator of this project states the value itself
     value = "" if first["type"] == "value_error" else f", got {repr(first['input'])[:60]}"
     separator = "" if not place else " " if rule.startswith("must ") else ": "
     return f"{place}{separator}{rule}{value}"
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Convert a value for JSON: records to objects, tuples to lists, numbers that are not finite to null."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {name: plain(item) for name, item in value.items()}
+        return {name: to_plain(item) for name, item in value.items()}
     if hasattr(value, "_asdict"):
-        return plain(value._asdict())
+        return to_plain(value._asdict())
     if is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple | list):
-        return [plain(item) for item in value]
+        return [to_plain(item) for item in value]
     return value

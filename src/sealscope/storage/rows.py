@@ -1,4 +1,4 @@
-"""Rows of finished jobs in a file of a folder: each is on the disk before the next job's, so that a run can go on."""
+"""Store the rows of finished jobs in a folder: each is on the disk before the next, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from sealscope.storage.plain_values import parse_json
 
 ROWS, LOCK = "rows.jsonl", ".lock"
 #: Longest line of a row [bytes].
-_LONGEST = 10_000_000
+_MAX_LINE = 10_000_000
 
 
 class StoredRow(Protocol):
-    """A row that can be stored: an `id` and plain JSON values."""
+    """A row that can be stored, with an `id` and plain JSON values."""
 
     @property
     def id(self) -> str:
-        """Name of the job whose row it is."""
+        """Name of the job."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
@@ -37,17 +37,17 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Read the rows of a folder by id, the last of each; a torn last line is ignored.
+    """Read the rows of a folder by id, the last one for each id; a truncated last line is ignored.
 
-    `row_of` makes a row of a line's JSON value, None where it does not count; `what` the rows are of stands in errors.
+    `row_of`: makes a row of a line's JSON value, or None for a row to be ignored; `what`: the folder's name in errors.
     Raises UnreadableFile for a line that is no row, with its place.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
     try:
         with open_inner(path, f"{what}'s file of rows") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST), b""), 1):
-                if not line.endswith(b"\n") and len(line) < _LONGEST:
+            for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), 1):
+                if not line.endswith(b"\n") and len(line) < _MAX_LINE:  # cut by a power loss
                     break
                 try:
                     row = row_of(parse(line))
@@ -65,20 +65,20 @@ def read_rows(
     return rows
 
 
-def stored(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
-    """Yield rows as their jobs end, each appended to the folder's file before; `rows` is closed at the end.
+def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
+    """Yield rows as their jobs end, after appending each to the folder's file; `rows` is closed at the end.
 
-    Raises ValueError for a row with a number that is not finite, unless they are allowed (`allow_nan`).
+    Raises ValueError for a row with a number that is not finite, unless `allow_nan`.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _LONGEST))
-        torn = file.read().rpartition(b"\n")[2]  # a line that was being written when the power went
-        file.truncate(size - len(torn))
+        file.seek(max(0, size - _MAX_LINE))
+        truncated = file.read().rpartition(b"\n")[2]  # a line that was interrupted by a power loss
+        file.truncate(size - len(truncated))
         for row in rows:
             line = json.dumps(row.as_dict(), allow_nan=allow_nan, sort_keys=True).encode() + b"\n"
             try:
-                while line:  # past the buffer of `file`, which would be written again at its end
+                while line:  # unbuffered: after an error `file` would write its buffer again when it is closed
                     line = line[os.write(file.fileno(), line) :]
                 os.fsync(file.fileno())
             except OSError as error:
@@ -87,12 +87,9 @@ def stored(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan:
 
 
 @contextmanager
-def locked(folder: Path, what: str) -> Iterator[None]:
-    """Hold the folder's lock; raise InputError where another process holds it.
-
-    The lock ends with the process, however that ends.
-    """
+def lock_rows(folder: Path, what: str) -> Iterator[None]:
+    """Lock a folder's rows while the block runs, or until the process ends; raise InputError if they are locked."""
     busy = f"{what} must be run by one process at a time, got another at work ({folder})"
-    with folders.locked(folder / LOCK, busy):
+    with folders.lock_file(folder / LOCK, busy):
         remove_temporaries(folder)
         yield

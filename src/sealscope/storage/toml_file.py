@@ -1,110 +1,169 @@
-"""Read TOML: a file from outside, bounded and with errors of one line, or a package's priors."""
+"""Read TOML: files from outside, with limits and errors of one line, and a package's priors."""
 
 from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable, Collection, Mapping
 from importlib.resources import files
 from io import StringIO
 from pathlib import Path
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
 
 from sealscope.errors import InputError
 from sealscope.storage.opening import open_regular
-from sealscope.storage.plain_values import LARGEST_WHOLE, as_type
+from sealscope.storage.plain_values import MAX_WHOLE, convert_type
 
 _T = TypeVar("_T")
-#: Largest file read [bytes]; what is larger is no file of settings.
-LARGEST = 1_000_000
-#: Most dots in a key: tomllib takes a time that goes with their square. What keys consist of.
-_MOST_DOTS = 30
+#: Largest file that is read [bytes].
+MAX_SIZE = 1_000_000
+#: Most dots in a key, as tomllib's time grows with their square; characters of keys.
+_MAX_DOTS = 30
 _KEYS = re.compile(r"[\w.\"' \t\r-]+")
-#: Bytes that tomllib and the checks take for a table, for an element of an array of tables, for a key's value, and for
-#: a value in an array; how many may be taken in all, and how many times those of the text.
-_TABLE, _ROW, _ENTRY, _VALUE, _MEMORY, _SHARE = 900, 60, 110, 70, 2_000_000, 6
+#: Memory [bytes] for a table, an element of an array of tables, a key's value, and a value in an array; most memory in
+#: all: the larger of _MAX_MEMORY and _MEMORY_RATIO times the file.
+_TABLE, _ROW, _ENTRY, _VALUE, _MAX_MEMORY, _MEMORY_RATIO = 900, 60, 110, 70, 2_000_000, 6
 _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(r"[{,]([^{},=]*)=")
 
 
-def read_toml(path: Path, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
-    """Read the tables of the TOML file `path`; its kind `what` ("a rig file") and its `place` stand in the errors.
+def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
+    """Read the tables of the TOML file `path`; `what` ("a rig file") and `place` name it in errors.
 
-    Raises InputError where it cannot be read, has more than `largest` bytes, is not UTF-8 or not TOML, or holds a whole
-    number beyond 2^53, which doubles do not hold, or a key of more than 30 dots.
+    Raises InputError if it cannot be read, is larger than `max_size` [bytes], is not UTF-8 or not TOML, or has a whole
+    number over 2^53 or a key with more than 30 dots.
     """
     try:
         with open_regular(path, what) as file:
-            data = file.read(largest + 1)
+            data = file.read(max_size + 1)
     except InputError:
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
-    return parse_toml(data, what, place, largest)
+    return parse_toml(data, what, place, max_size)
 
 
-def parse_toml(data: bytes, what: str, place: str, largest: int = LARGEST) -> dict[str, Any]:
-    """Return the tables of the bytes of a TOML file; errors and limits as `read_toml` has them."""
-    if len(data) > largest:
-        raise InputError(f"{what} must be at most {largest} bytes, got more ({place})")
+def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
+    """Parse the bytes of a TOML file; errors and limits as in `read_toml`."""
+    if len(data) > max_size:
+        raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
         text = data.decode("utf-8-sig")
-        if any(part[0].count(".") > _MOST_DOTS for part in _KEYS.finditer(text)):
-            raise ValueError(f"a dotted key must have at most {_MOST_DOTS} dots")
-        if (memory := _count_memory(text)) > max(_MEMORY, _SHARE * len(data)):
+        if any(part[0].count(".") > _MAX_DOTS for part in _KEYS.finditer(text)):
+            raise ValueError(f"a dotted key must have at most {_MAX_DOTS} dots")
+        if (memory := _estimate_memory(text)) > max(_MAX_MEMORY, _MEMORY_RATIO * len(data)):
             raise ValueError(f"{len(data)} bytes of text must hold fewer tables and values, got some {memory} bytes")
         tree = tomllib.loads(text)
         _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
         raise InputError(f"{what} must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
-    except (ValueError, RecursionError) as error:  # tomllib lets errors of dates and of very long numbers through
+    except (ValueError, RecursionError) as error:  # tomllib passes errors of dates and of very long numbers on
         raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
     return tree
 
 
 def read_model(
-    tree: Mapping[str, Any], kind: type[_T], place: str, named: Callable[[str], str] = str, context: Any = None
+    tree: Mapping[str, Any], kind: type[_T], place: str, entry_name: Callable[[str], str] = str, context: Any = None
 ) -> _T:
-    """Read the tables of a TOML file as the model or dataclass `kind` (`plain_values.as_type`).
+    """Convert the tables of a TOML file to the model or dataclass `kind` (`plain_values.convert_type`).
 
     Raises InputError that names the entry, the rule, the value and the `place`.
     """
     try:
-        return as_type(kind, tree, named, context)
+        return convert_type(kind, tree, entry_name, context)
     except ValueError as error:
         raise InputError(f"{error} ({place})") from None
 
 
-@cache
-def priors_of(package: str) -> Mapping[str, Mapping[str, Any]]:
-    """Read the values of a package's `priors.toml` by table and name; each states its unit and source.
+@dataclass_transform(kw_only_default=True, frozen_default=True)
+class PriorTable:
+    """A frozen table: a subclass annotates its keys, with a default where one may be absent.
 
-    Raises KeyError where a row lacks unit or source.
+    Type checkers take it for a frozen dataclass, whose creation at import would take ten times as long.
     """
+
+    def __init__(self, **values: Any) -> None:
+        vars(self).update(values)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"a table of priors is frozen, got {name} = {value!r}")
+
+
+def read_priors(package: str, kind: type[_T]) -> _T:
+    """Read a package's `priors.toml` as the `PriorTable` of its tables.
+
+    A field of `kind` is a `PriorTable` of numbers and tuples, or a mapping to them. Each row of the file has value,
+    unit and source. Raises InputError that names file, table, key and rule.
+    """
+    place = f"{package.replace('.', '/')}/priors.toml"
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
-    return {
-        table: {name: (row["value"], row["unit"], row["source"])[0] for name, row in rows.items()}
-        for table, rows in tables.items()
-    }
+    kinds = get_type_hints(kind)
+    _check_keys(tables, kinds, (), f"tables of {place}")
+    return kind(**{name: _parse_table(rows, kinds[name], f"{place} [{name}]") for name, rows in tables.items()})
 
 
-def _count_memory(text: str) -> int:
-    """Return about how many bytes the tables and values of a text take, at most, without parsing it."""
-    tables = rows = 0
+def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
+    """Convert the rows of a table to a `PriorTable` or a mapping, whichever `kind` is."""
+    is_mapping, optional = get_origin(kind) is not None, tuple[str, ...]()
+    if is_mapping:
+        names, value_kind = get_args(kind)
+        kinds = dict.fromkeys(get_args(names) if get_origin(names) is Literal else rows, value_kind)
+    else:
+        kinds = get_type_hints(kind)
+        optional = tuple(name for name in kinds if hasattr(kind, name))  # keys with a default
+    _check_keys(rows, kinds, optional, f"keys of {place}")
+    values = {name: _parse_value(row, kinds[name], f"{place} {name}") for name, row in rows.items()}
+    return MappingProxyType(values) if is_mapping else kind(**values)
+
+
+def _parse_value(row: Any, kind: Any, place: str) -> Any:
+    """Parse the value of a row {value, unit, source} to `kind`: an int, a tuple of numbers, or else a float."""
+    if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
+        raise InputError(f"{place} must have value, unit and source, got {row!r}")
+    if get_origin(kind) is tuple:
+        item_kind, *rest = get_args(kind)
+        has_any_length = Ellipsis in rest  # tuple[float, ...]
+        if not isinstance(row["value"], list) or not (has_any_length or len(row["value"]) == 1 + len(rest)):
+            raise InputError(f"{place} must be a list as {kind}, got {row['value']!r}")
+        return tuple(_parse_number(value, item_kind, place) for value in row["value"])
+    return _parse_number(row["value"], int if kind is int else float, place)
+
+
+def _parse_number(value: Any, kind: type, place: str) -> Any:
+    """Convert a number of the file to `kind`, int or float; raise InputError for any other value."""
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        raise InputError(f"{place} must be {'a whole number' if kind is int else 'a number'}, got {value!r}")
+    return kind(value)
+
+
+def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
+    """Raise InputError unless the keys of a table are `names`; `optional` ones may be absent."""
+    for name in rows:
+        if name not in names:
+            raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")
+    for name in names:
+        if name not in rows and name not in optional:
+            raise InputError(f"{place} must be {', '.join(names)}, got none called {name!r}")
+
+
+def _estimate_memory(text: str) -> int:
+    """Estimate an upper limit of the memory [bytes] of the tables and values in a text, without parsing it."""
+    n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
-        if line.lstrip().startswith("[["):
-            rows, tables = rows + 1, tables + line.count(".")
-        elif _HEADER.fullmatch(line):
-            tables += 1 + line.count(".")
-        else:
-            tables += line.partition("=")[0].count(".") + line.count("{")
-            tables += sum(key[1].count(".") for key in _INNER_KEY.finditer(line))
-    return _TABLE * tables + _ROW * rows + _ENTRY * text.count("=") + _VALUE * (text.count(",") + text.count("["))
+        if line.lstrip().startswith("[["):  # an element of an array of tables
+            n_rows, n_tables = n_rows + 1, n_tables + line.count(".")
+        elif _HEADER.fullmatch(line):  # the header of a table
+            n_tables += 1 + line.count(".")
+        else:  # a key and its value
+            n_tables += line.partition("=")[0].count(".") + line.count("{")
+            n_tables += sum(key[1].count(".") for key in _INNER_KEY.finditer(line))
+    return _TABLE * n_tables + _ROW * n_rows + _ENTRY * text.count("=") + _VALUE * (text.count(",") + text.count("["))
 
 
 def _check_whole_numbers(value: Any) -> None:
-    if isinstance(value, int) and abs(value) > LARGEST_WHOLE:
+    """Raise ValueError for a whole number over 2^53 in a value, or in its tables and arrays."""
+    if isinstance(value, int) and abs(value) > MAX_WHOLE:
         raise ValueError("a whole number must be at most 2^53 in size")
     for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _check_whole_numbers(inner)

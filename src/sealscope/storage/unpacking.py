@@ -1,4 +1,4 @@
-"""Limits on the unpacked size of a packed file, checked before memory or disk is spent."""
+"""Limits on the unpacked size of a packed file, checked before memory or disk is used."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ from pathlib import Path
 
 from sealscope.errors import UnreadableFile
 
-#: Most bytes that any file may unpack to.
-LARGEST = 8 * 2**30
-#: Up to this many bytes any file may; beyond, so many times the bytes that it has on the disk.
-_SMALL, _EXPANSION = 2**26, 200
+#: Largest unpacked size of any file [bytes].
+MAX_UNPACKED = 8 * 2**30
+#: Unpacked size allowed for any file [bytes], and for larger ones relative to the size on the disk.
+_MIN_LIMIT, _MAX_EXPANSION = 2**26, 200
 
 
-def most_unpacked(path: Path) -> int:
-    """Compute the most bytes that a packed file may unpack to.
+def max_unpacked_size(path: Path) -> int:
+    """Compute the largest size [bytes] that a packed file may unpack to.
 
-    Logs shrink to a tenth, those of standing channels to a hundredth. What a sparse file does not have on the disk does
-    not count.
+    Logs shrink to a tenth, those of constant channels to a hundredth. The holes of a sparse file do not count.
     """
     status = path.stat()
-    blocks = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say
-    return min(LARGEST, max(_SMALL, _EXPANSION * min(status.st_size, blocks or status.st_size)))
+    disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say
+    return min(MAX_UNPACKED, max(_MIN_LIMIT, _MAX_EXPANSION * min(status.st_size, disk_bytes or status.st_size)))
 
 
-def check_unpacked(size: int, most: int, place: str | Path) -> None:
-    """Raise UnreadableFile where a file unpacks to more than `most` bytes, as `most_unpacked` has it."""
-    if size > most:
+def check_unpacked(size: int, max_bytes: int, place: str | Path) -> None:
+    """Raise UnreadableFile if a file unpacks to more than `max_bytes` bytes (`max_unpacked_size`)."""
+    if size > max_bytes:
         raise UnreadableFile(
-            f"a packed file must unpack to at most {most} bytes, got {size} or more: unpack it, or export it as CSV, "
-            f"where you know it ({place})"
+            f"a packed file must unpack to at most {max_bytes} bytes, got {size} or more: unpack it, or export it as "
+            f"CSV, where you know it ({place})"
         )

@@ -1,10 +1,10 @@
-"""The rig `thesis-calibrated`: its fit to the leak-free tests of Appendix C, the residuals, and its predictions.
+"""Evaluate the rig `thesis-calibrated`, which was fitted to the leak-free tests of Appendix C.
 
-The package holds the result of the fit, the rig's file, and what judges it: `docs/decisions/0006-calibration.md` gives
-the method, the figures and the limits. The simulated trajectory carries no noise. White noise of standard deviation
-sigma is independent of it and has the RMS sigma in each detail d_j, so the RMS with noise needs no draw:
-``sqrt(m_j + sigma^2)`` with m_j the noise-free mean square. For the product, with d_3 and d_4 of the noise uncorrelated
-(disjoint bands): ``sqrt(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4)``.
+The package contains the fitted rig and its evaluation; `docs/explanation/calibrated-rig.md` gives the method, the
+results and their limits. Simulated pressures are noise-free, and the RMS with noise follows without random numbers:
+white noise of standard deviation sigma has the RMS sigma in each detail d_j and is independent of the pressure, so that
+the RMS is ``sqrt(m_j + sigma^2)`` with m_j the noise-free mean square. For the product d_3 d_4, whose bands are
+disjoint so that their noise is uncorrelated, it is ``sqrt(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4)``.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import decimate
-from sealscope.simulation.integrate import oversampling, sized_run
+from sealscope.simulation.integrate import oversampling, run_with_sized_leaks
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.engine.texts import note, texts_of
+from sealscope.thesis.engine.texts import format_note, load_texts
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, Condition, DataSheet, experiment_values, groups
 from sealscope.units import PSI
 
-#: Part of a run that is used [s]: after the start-up, two of the slowest command's cycles (2 pi seconds each).
-SETTLING, USED = 7.2, 4.0 * np.pi
+#: Start-up that is left out, and length of the analysed part [s]: two cycles of the slowest command (2 pi s each).
+SETTLING, ANALYSED = 7.2, 4.0 * np.pi
+#: Largest relative error of a mean RMS that counts as agreement.
+_MAX_ERROR = 0.25
 
 
-def noise_free_squares(
+def noise_free_mean_squares(
     rig: Rig,
     condition: Condition,
     *,
@@ -42,32 +44,38 @@ def noise_free_squares(
     x_0: float = 0.0,
     values: Mapping[str, float | str] | None = None,
 ) -> Array:
-    """Simulate a condition; return the noise-free mean squares of d1..d4 [psi^2] and d3d4 [psi^4], (chambers, 5).
+    """Simulate a condition and compute the noise-free mean squares of d1..d4 [psi^2] and d3d4 [psi^4], (chambers, 5).
 
-    Sampled as the instruments do (the rig's rate, its anti-alias filter), over `USED` seconds after the start-up. The
-    rig itself sizes `leak`; `values` are set after those of the condition. Raises what simulating raises.
+    The pressures are sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after the start.
+    `leak`: leak as text, sized on the rig; `values`: parameters that override those of the condition; `x_0` [m]: start
+    of the piston. Raises the errors of the simulation.
     """
-    padded = USED + SETTLING + 128.0 / rig.daq.sample_rate  # the deepest detail looks 120 samples ahead
+    duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
-    experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=padded, x_0=x_0)
-    _, path = sized_run(experiment)
+    experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=duration, x_0=x_0)
+    _, trajectory = run_with_sized_leaks(experiment)
     factor, rate = oversampling(experiment), experiment.rate
-    bounds = [round(SETTLING * rate), round((SETTLING + USED) * rate)]
-    sampled = (decimate(path[chamber], factor, round(padded * rate)) / PSI for chamber in CHAMBERS)
+    bounds = [round(SETTLING * rate), round((SETTLING + ANALYSED) * rate)]
+    sampled = (decimate(trajectory[chamber], factor, round(duration * rate)) / PSI for chamber in CHAMBERS)
     return np.concatenate([mean_squares(details(pressure), bounds) for pressure in sampled])
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute log RMS of d1..d4, d3d4 with white noise of deviation `sigma` [psi], (..., 5), from their squares."""
-    s = np.square(sigma)
-    product = squares[..., 4] + s * squares[..., 2] + s * squares[..., 3] + s * s
-    return np.asarray(0.5 * np.log(np.concatenate([squares[..., :4] + s, product[..., None]], axis=-1)))
+    """Compute the log RMS of d1..d4, d3d4, (..., 5), with noise of standard deviation `sigma` [psi].
+
+    `squares`: noise-free mean squares, (..., 5).
+    """
+    variance = np.square(sigma)
+    d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
+    product = d3d4 + variance * d3 + variance * d4 + variance**2
+    noisy = np.stack([d1 + variance, d2 + variance, d3 + variance, d4 + variance, product], axis=-1)
+    return np.asarray(0.5 * np.log(noisy))
 
 
-def noise_of(rig: Rig, chamber: str) -> float:
-    """Compute the standard deviation [psi] of one sample of a chamber's pressure.
+def pressure_noise(rig: Rig, chamber: str) -> float:
+    """Compute the standard deviation [psi] of the noise in a sample of a chamber's pressure.
 
-    Own noise, common noise and the conversion's step, white with variance step^2/12, add up in squares.
+    The variances of the sensor's noise, of the common noise and of the quantisation, step^2/12, add up.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -76,116 +84,126 @@ def noise_of(rig: Rig, chamber: str) -> float:
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     """Compute log(simulated/measured) of the leak-free RMS of every test, (tests, 2, 5), at the rig's rate."""
-    of_group = {group: noise_free_squares(rig, Condition(0, *group, 0.0, "extra-small")) for group in groups()}
-    squares = np.array([of_group[condition.group] for condition in APPENDIX_C])
-    simulated = [log_rms(squares[:, k], noise_of(rig, chamber)) for k, chamber in enumerate(CHAMBERS)]
+    group_squares = {}
+    for command, closed_pct in groups():  # the number and the level have no effect
+        condition = Condition(0, command, closed_pct, mean_leak_lpm=0.0, level="")
+        group_squares[condition.group] = noise_free_mean_squares(rig, condition)
+    squares = np.array([group_squares[condition.group] for condition in APPENDIX_C])
+    simulated = [log_rms(squares[:, k], pressure_noise(rig, chamber)) for k, chamber in enumerate(CHAMBERS)]
     measured = [[sheet.rms[chamber][name][:, 0] for name in QUANTITIES] for chamber in CHAMBERS]
     return np.asarray(np.stack(simulated, axis=1) - np.log(np.moveaxis(np.array(measured), -1, 0)))
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A difference between the real rig and the identified one.
+    """A possible difference between the real rig and the identified one.
 
-    The identified model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C d3 of p_A falls
-    with the leak and d4 of p_B rises. `always`: parameters in both halves of a test; `factors`: parameters multiplied
-    in both, `then`: in the leaking half only; `x_0`, `x_0_then` [m]: where the piston starts in the two halves;
-    `more_closed_B`: share of its bore by which throttle B stands further closed than A; `gain_B`: what sensor B reads
-    of a true change; `law` of the leak.
+    The identified model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C, however, d3 of
+    p_A falls with the leak while d4 of p_B rises. `overrides`: parameters in both halves of a test; `factors`: factors
+    of parameters in both halves; `leaking_factors`: in the half with the leak only; `x_0`, `x_0_leaking` [m]: start of
+    the piston in the two halves; `extra_closing_B`: fraction by which throttle B is closed further than A; `gain_B`:
+    gain of sensor B for changes; `law`: law of the leak.
     """
 
     name: str
-    always: Mapping[str, float | str] = field(default_factory=dict)
+    overrides: Mapping[str, float | str] = field(default_factory=dict)
     factors: Mapping[str, float] = field(default_factory=dict)
-    then: Mapping[str, float] = field(default_factory=dict)
+    leaking_factors: Mapping[str, float] = field(default_factory=dict)
     x_0: float = 0.0
-    x_0_then: float = 0.0
-    more_closed_B: float = 0.0
+    x_0_leaking: float = 0.0
+    extra_closing_B: float = 0.0
     gain_B: float = 1.0
     law: Literal["laminar", "orifice"] = "laminar"
 
 
-#: The hypotheses on what the symmetric rig leaves unexplained; the first is that rig itself.
-HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in texts_of("hypotheses.toml").items())
+#: The hypotheses on columns that the symmetric rig does not explain; the first is the rig itself.
+HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hypotheses.toml").items())
 
 
 def predicted_sheet(
     rig: Rig, hypothesis: Hypothesis = HYPOTHESES[0], conditions: tuple[Condition, ...] = APPENDIX_C
 ) -> DataSheet:
-    """Simulate the tests without and with their leaks on the rig under a hypothesis; return the sheet [psi]."""
+    """Simulate the tests without and with their leaks on the rig under a hypothesis; return the data sheet [psi]."""
     h = hypothesis
-    before = _multiplied(rig.with_overrides(h.always) if h.always else rig, h.factors)
-    after = _multiplied(before, h.then)
-    leak_free: dict[tuple[str, float], Array] = {}
+    healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
+    leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
+    leak_free: dict[tuple[str, float], Array] = {}  # the mean squares of a condition, which several tests repeat
     rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))
     for row, condition in enumerate(conditions):
-        closed = {"line.closed_B": min(0.99, condition.closed_pct / 100.0 + h.more_closed_B)}
+        # less than 1, as a closed throttle would stop the flow
+        closed = {"line.closed_B": min(0.99, condition.closed_pct / 100.0 + h.extra_closing_B)}
         if condition.group not in leak_free:
-            leak_free[condition.group] = noise_free_squares(before, condition, x_0=h.x_0, values=closed)
+            leak_free[condition.group] = noise_free_mean_squares(healthy_rig, condition, x_0=h.x_0, values=closed)
         leak = f"{condition.mean_leak_lpm} L/min {h.law}"
-        leaking = noise_free_squares(after, condition, leak=leak, x_0=h.x_0_then, values=closed)
+        leaking = noise_free_mean_squares(leaking_rig, condition, leak=leak, x_0=h.x_0_leaking, values=closed)
         for half, squares in enumerate((leak_free[condition.group], leaking)):
             for k, chamber in enumerate(CHAMBERS):
-                read = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4]) if k else squares[k]
-                rms[row, half, k] = np.exp(log_rms(read, noise_of(rig, chamber)))
+                # mean squares scale with the gain squared, those of the product d3d4 with its fourth power
+                scaled = squares[k] * np.array([h.gain_B**2] * 4 + [h.gain_B**4]) if chamber == "p_B" else squares[k]
+                rms[row, half, k] = np.exp(log_rms(scaled, pressure_noise(rig, chamber)))
     return DataSheet({c: {q: rms[:, :, k, j] for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
-def _multiplied(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    return rig.with_overrides({name: float(rig[name]) * by for name, by in factors.items()}) if factors else rig
+def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
+    """Multiply parameters of a rig by factors."""
+    return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate every parameter in which the identified rig differs from the thesis's."""
-    fitted, printed = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
+    """Tabulate the parameters in which the identified rig differs from the thesis's."""
+    fitted, thesis_rows = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
     rows = [
-        (row.name, row.meaning, printed[row.name].given, row.given, row.source)
+        (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
         for row in fitted.table()
-        if row.given != printed[row.name].given
+        if row.given != thesis_rows[row.name].given
     ]
-    sigma = ", ".join(f"{noise_of(fitted, chamber):.2f} psi in {chamber}" for chamber in CHAMBERS)
+    sigma = ", ".join(f"{pressure_noise(fitted, chamber):.2f} psi in {chamber}" for chamber in CHAMBERS)
     return (item.table(rows, f"Noise of a sample, all sources together: {sigma}."),)
 
 
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate simulated over measured leak-free RMS: geometric means over all tests, and by operating condition."""
+    """Tabulate the ratio of simulated to measured leak-free RMS: geometric means over all tests and by condition."""
     assert context.sheet is not None
-    log = log_residuals(load_rig(BENCH_RIG), context.sheet)
-    columns = [(c, q, log[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
+    residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
+    columns = [(c, q, residuals[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
     rows: list[tuple[Cell, ...]] = []
-    for chamber, name, logs in columns:
-        mean, scatter = float(np.exp(logs.mean())), float(np.exp(logs.std(ddof=1)))
-        rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= 0.25 else "no", scatter))
+    for chamber, name, log_ratios in columns:
+        mean, scatter = float(np.exp(log_ratios.mean())), float(np.exp(log_ratios.std(ddof=1)))
+        rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= _MAX_ERROR else "no", scatter))
     by_condition: list[tuple[Cell, ...]] = []
     for group in groups():
-        members = np.array([condition.group == group for condition in APPENDIX_C])
-        by_condition.append((*group, int(members.sum()), *np.exp(log[members].mean(axis=0)).ravel().tolist()))
+        is_member = np.array([condition.group == group for condition in APPENDIX_C])
+        ratios = np.exp(residuals[is_member].mean(axis=0)).ravel().tolist()
+        by_condition.append((*group, int(is_member.sum()), *ratios))
     heads = ("input", "closed [%]", "tests", *(f"{c} {q} simulated / measured" for c, q, _ in columns))
     title = f"{item.title}, by operating condition"
-    return item.table(rows, note("fit")), item.table(by_condition, "", heads, tail="-conditions", title=title)
+    return item.table(rows, format_note("fit")), item.table(by_condition, "", heads, tail="-conditions", title=title)
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate each hypothesis's leak-free level and its change with the leak, with those of the sheet."""
+    """Tabulate for each hypothesis the leak-free RMS relative to the sheet's, the leak's changes, and the right signs.
+
+    A sign is right if the change with the leak has the sign of the sheet's change in the same test.
+    """
     assert context.sheet is not None
     sheet = context.sheet
-    # d2 is shown in the changes only
-    changed = [(c, q) for c in CHAMBERS for q in ("d2", "d3", "d4")]
-    columns_shown = [(c, q) for c, q in changed if q != "d2"]
-    heads = ["hypothesis", *(f"{c} {q} simulated / measured, leak-free" for c, q in columns_shown)]
-    heads += [f"{c} {q} change with leak [%]" for c, q in changed]
-    heads += [f"{c} {q} sign right [of 41]" for c, q in columns_shown]
+    change_columns = [(c, q) for c in CHAMBERS for q in ("d2", "d3", "d4")]  # chamber and quantity
+    level_columns = [(c, q) for c, q in change_columns if q != "d2"]
+    heads = ["hypothesis", *(f"{c} {q} simulated / measured, leak-free" for c, q in level_columns)]
+    heads += [f"{c} {q} change with leak [%]" for c, q in change_columns]
+    heads += [f"{c} {q} sign right [of 41]" for c, q in level_columns]
 
     def signs(sheet: DataSheet, c: str, q: str) -> Array:
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
-    measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in changed]
-    rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * 4, *measured, *[41] * 4)]
+    measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in change_columns]
+    n = len(level_columns)  # the sheet agrees with itself in all of its tests
+    rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * n, *measured, *[sheet.tests] * n)]
     rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
-        levels = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in columns_shown]
-        changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in changed]
-        same_sign = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in columns_shown]
-        rows.append((hypothesis.name, *(float(np.exp(level)) for level in levels), *changes, *same_sign))
-    return (item.table(rows, note("hypotheses"), heads),)
+        log_ratios = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in level_columns]
+        changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in change_columns]
+        same_sign = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in level_columns]
+        rows.append((hypothesis.name, *(float(np.exp(log_ratio)) for log_ratio in log_ratios), *changes, *same_sign))
+    return (item.table(rows, format_note("hypotheses"), heads),)

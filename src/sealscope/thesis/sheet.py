@@ -1,6 +1,6 @@
 """Appendix C of the thesis: the 41 leakage tests, and the data sheet of their measurements.
 
-Only the inputs of the tests are part of the package. The measured values are read from two files where a user has them.
+The package contains only the inputs of the tests. The measured values are read from two files that a user may have.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from sealscope.signals.details import QUANTITIES
 
 #: Chamber and quantity of each column.
 COLUMNS = tuple(product(CHAMBERS, QUANTITIES))
-#: Units of the columns. The sheet names none; it is taken to be in psi.
+#: Units of the columns. The sheet states none; psi is assumed.
 UNITS = {name: "psi^2" if name == "d3d4" else "psi" for name in QUANTITIES}
-#: The packaged rig that stands for the bench of Appendix C: fitted to its leak-free columns.
+#: Name of the rig that was fitted to the leak-free columns of Appendix C.
 BENCH_RIG = "thesis-calibrated"
-#: File of each chamber, the environment variable that names their folder, and the note on an item left out.
+#: File of each chamber, the environment variable that names their folder, and the reason why an item is left out.
 FILES = {"p_A": "appendix_c_pa.csv", "p_B": "appendix_c_pb.csv"}
 VARIABLE = "SEALSCOPE_SHEET"
 MISSING = "needs the data sheet: give --sheet"
 _HALVES = ("no_leak", "leak")
-_CONDITION = ("mean_leak_lpm", "input_amplitude_v", "input_omega_rad_s", "orifice_closed_pct", "leakage_level")
+_POSITIVE_COLUMNS = ("mean_leak_lpm", "input_amplitude_v", "input_omega_rad_s")
+_CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 
 
 @dataclass(frozen=True)
 class Condition:
     """One test of Appendix C; `number` counts the rows from 1, in the order printed.
 
-    `command` in the words of `parse_command`; `closed_pct` [%] of both throttles; `mean_leak_lpm` [L/min] after the
-    bypass valve was opened; `level` the needle's position, which is not a measure of the leak (a "large" needle leaks
-    10 to 16 mL/min, an "extra-small" one 4 to 14).
+    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak [L/min]
+    after the bypass valve was opened; `level`: position of the needle, which does not determine the leak (10 to
+    16 mL/min for "large", 4 to 14 for "extra-small").
     """
 
     number: int
@@ -53,15 +54,15 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Command and throttle: tests that share them repeat one operating condition."""
+        """Operating condition (command, closing [%]), which several tests repeat."""
         return self.command, self.closed_pct
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Build the rig's parameters of a test, by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+    """Return the rig's parameters for a test, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
-    Both throttles are closed alike. A test with the throttles fully open leaves `line.orifices` as the rig has it:
-    absent in the thesis's model (section 4.2.1), present in a rig whose open valve bodies stay in the line.
+    Both throttles are closed equally. If they are fully open, `line.orifices` is left as the rig has it: absent in the
+    thesis's model (section 4.2.1), present in a rig that includes the open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
@@ -70,7 +71,8 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
     return values
 
 
-def _conditions() -> Iterator[Condition]:
+def _read_conditions() -> Iterator[Condition]:
+    """Yield the tests of `appendix_c.csv`."""
     _, *lines = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
     for number, (command, closed_pct, leak, level) in enumerate(csv.reader(lines), 1):
         yield Condition(number, command, float(closed_pct), float(leak), level)
@@ -78,11 +80,11 @@ def _conditions() -> Iterator[Condition]:
 
 #: The tests of Appendix C of "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation
 #: Systems", in its order.
-APPENDIX_C: tuple[Condition, ...] = tuple(_conditions())
+APPENDIX_C: tuple[Condition, ...] = tuple(_read_conditions())
 
 
 def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
-    """List the different operating conditions (command, closed [%]) in order of first appearance."""
+    """List the distinct operating conditions (command, closing [%]) in order of first appearance."""
     return tuple(dict.fromkeys(condition.group for condition in conditions))
 
 
@@ -95,8 +97,8 @@ def mean_leaks() -> Array:
 class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
-    `rms[chamber][quantity]`: RMS without and with the leak, (tests, 2), of the chambers "p_A" and "p_B" and of
-    `QUANTITIES`; rows in the order of `APPENDIX_C`.
+    `rms[chamber][quantity]`: RMS without and with the leak, (tests, 2), for the chambers "p_A" and "p_B" and the
+    details `QUANTITIES`; the rows are in the order of `APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
@@ -113,25 +115,25 @@ class DataSheet:
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find the folder of the sheet: `folder`, else the environment's SEALSCOPE_SHEET, else `./data` if it exists.
+    """Find the folder of the sheet: `folder`, else the environment variable SEALSCOPE_SHEET, else `./data`.
 
-    Raises InputError where a named folder does not hold both files.
+    Returns None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
     """
-    chosen_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
-    candidate = Path(chosen_folder if chosen_folder is not None else "data")
+    named_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
+    candidate = Path(named_folder if named_folder is not None else "data")
     if all((candidate / name).is_file() for name in FILES.values()):
         return candidate
-    if chosen_folder is None:
+    if named_folder is None:
         return None
     source = "--sheet" if folder is not None else VARIABLE
     raise InputError(f"{source} must name a folder with {' and '.join(FILES.values())}, got {candidate}")
 
 
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
-    """Read the sheet in `folder`; return it with a hash of its bytes.
+    """Read the sheet in `folder`; return it with a SHA-256 of its bytes.
 
-    Raises UnreadableFile where a file cannot be read, InputError where a column or a row is missing, a value is not a
-    positive number, or a row is another test than `APPENDIX_C` has at its place.
+    Raises UnreadableFile if a file cannot be read, and InputError if a column or a row is missing, a value is not a
+    positive number, or a row is not the test of `APPENDIX_C` with its number.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -143,7 +145,8 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise UnreadableFile(f"a sheet must be a CSV file in UTF-8, got: {error} ({path})") from None
         digest.update(raw)
-        for column in (*_CONDITION, *(f"{quantity}_{half}" for quantity in QUANTITIES for half in _HALVES)):
+        rms_columns = (f"{quantity}_{half}" for quantity in QUANTITIES for half in _HALVES)
+        for column in (*_POSITIVE_COLUMNS, _CLOSED_COLUMN, _LEVEL_COLUMN, *rms_columns):
             if not rows or column not in rows[0]:
                 raise InputError(f"the sheet must have the column {column} ({path})")
         if len(rows) != len(APPENDIX_C):
@@ -152,32 +155,33 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
             _check_condition(row, condition, path)
         numbered = list(enumerate(rows, 1))
         rms[chamber] = {
-            name: np.array([[_number(row, f"{name}_{half}", n, path) for half in _HALVES] for n, row in numbered])
+            name: np.array([[_parse_number(row, f"{name}_{half}", n, path) for half in _HALVES] for n, row in numbered])
             for name in QUANTITIES
         }
     return DataSheet(rms), digest.hexdigest()
 
 
-def _number(row: dict[str, str], column: str, number: int, path: Path, zero: bool = False) -> float:
-    """Read a number of a row: > 0, or where `zero` is allowed >= 0."""
+def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
+    """Parse a column of row `number` as a number; raise InputError unless it is > 0, or 0 if `allow_zero`."""
     try:
         value = float(row[column] or "nan")
     except ValueError:
         value = math.nan
-    if not (0.0 < value < math.inf or (zero and value == 0.0)):
-        rule = f"a number {'>=' if zero else '>'} 0"
+    if not (0.0 < value < math.inf or (allow_zero and value == 0.0)):
+        rule = f"a number {'>=' if allow_zero else '>'} 0"
         raise InputError(f"{column} must be {rule}, got {row[column]!r} ({path}, row {number})")
     return value
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    leak, amplitude, omega = (_number(row, column, condition.number, path) for column in _CONDITION[:3])
-    closed = _number(row, _CONDITION[3], condition.number, path, zero=True)
+    """Check that a row is the test `condition`; raise InputError otherwise."""
+    leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
+    closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"
-    found = Condition(condition.number, command, closed, leak, (row["leakage_level"] or "").strip())
-    if found != condition:
+    row_condition = Condition(condition.number, command, closed, leak, (row[_LEVEL_COLUMN] or "").strip())
+    if row_condition != condition:
         expected, actual = (
             f"{test.command!r}, {test.closed_pct:g} % closed, {test.mean_leak_lpm:g} L/min, {test.level}"
-            for test in (condition, found)
+            for test in (condition, row_condition)
         )
         raise InputError(f"row {condition.number} must be the test {expected}, got {actual} ({path})")

@@ -1,4 +1,4 @@
-"""Sines of known frequencies in a signal, by least squares."""
+"""Fit sines of known frequencies to a signal by least squares."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from sealscope.recordings.recording import Array
 
 
 class SineFit(NamedTuple):
-    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s], and the residual `left` of the signal (n,)."""
+    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s] and the `residual` of the signal (n,)."""
 
     amplitudes: NDArray[np.complex128]
     slope: float
-    left: Array
+    residual: Array
 
 
 def sine_fit(t: Array, values: Array, *omegas: float) -> SineFit:
-    """Fit ``values = c + slope t + sum Re(a_k exp(i omega_k t)) + left`` by least squares; omega_k [rad/s]."""
+    """Fit ``values = c + slope t + sum Re(a_k exp(i omega_k t)) + residual`` by least squares; omega_k [rad/s]."""
     phases = np.outer(t, omegas)
     basis = np.column_stack([np.ones(t.size), t - t.mean(), np.cos(phases), np.sin(phases)])
     fitted = np.linalg.lstsq(basis, values, rcond=None)[0]

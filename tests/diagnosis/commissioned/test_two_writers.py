@@ -12,9 +12,10 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import update_machine
-from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
-from sealscope.monitor.database.machine_files import pass_on
+from sealscope.monitor.database.machine_files import record_mark
+
+from ...refusals import refusal
 
 
 def run(seed: int) -> ss.Recording:
@@ -29,7 +30,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     for seed in (1, 2):
         ss.write(run(seed), folder / f"run{seed}.nc")
     file = ss.write_machine(ss.commission(folder), folder / "press.toml")
-    return {each.name: each.read_bytes() for each in (file, file.with_suffix(".lessons"))}
+    return {each.name: each.read_bytes() for each in (file, file.with_suffix(".healthy"))}
 
 
 def place(pair: dict[str, bytes], folder: Path) -> Path:
@@ -46,7 +47,7 @@ def add(path: Path, seed: int) -> None:
 def mark(path: Path, number: int) -> None:
     span, words = (1.68e9, 1.695e9), ("piston leak", "the balance", "the seal")
     alarm = Alarm(f"press-{number}", "press", "error", "new", 1.7e9, 1.7e9, 1.69e9, span, 0.01, None, *words, 1)
-    done = pass_on(str(path), alarm, "valid", [])
+    done = record_mark(str(path), alarm, "valid", [])
     assert done == "press.toml: written down", done
 
 
@@ -97,7 +98,7 @@ def test_what_another_wrote_since_is_not_undone(pair, tmp_path):
     machine = ss.read_machine(path)
     mark(path, 1)
     before = path.read_bytes()
-    with pytest.raises(InputError, match="must be as it was read, got another mark of press-1: load it again"):
+    with refusal("press-1"):
         ss.write_machine(replace(machine, limit="5 mL/min"), path)
     assert path.read_bytes() == before
 
@@ -106,7 +107,7 @@ def test_a_recording_that_was_taken_out_since_does_not_come_back(pair, tmp_path)
     path = place(pair, tmp_path)
     machine = ss.read_machine(path)
     update_machine(path, lambda known: replace(known, healthy=known.healthy[1:]))
-    with pytest.raises(InputError, match=r"got another recording, run1\.nc"):
+    with refusal("run1.nc"):
         ss.write_machine(machine, path)
 
 
@@ -114,7 +115,7 @@ def test_an_edited_text_is_not_undone(pair, tmp_path):
     path = place(pair, tmp_path)
     machine = ss.read_machine(path)
     path.write_text(path.read_text().replace('name = "machine"', 'name = "press 7"'))
-    with pytest.raises(InputError, match="got another statement of the machine"):
+    with refusal("statement"):
         ss.write_machine(machine, path)
 
 
@@ -132,16 +133,16 @@ def test_a_machine_may_be_written_again_and_again(pair, tmp_path):
 
 def test_a_writer_that_does_not_end_is_waited_for_a_while(pair, tmp_path, monkeypatch):
     from sealscope.diagnosis.commissioned import machine_file
-    from sealscope.storage.folders import locked
+    from sealscope.storage.folders import lock_file
 
     path = place(pair, tmp_path)
     monkeypatch.setattr(machine_file, "_LONGEST_WAIT", 0.05)
-    with locked(tmp_path / ".press.toml.lock", "busy"), pytest.raises(InputError, match="another process that writes"):
+    with lock_file(tmp_path / ".press.toml.lock", "busy"), refusal("process"):
         ss.write_machine(ss.read_machine(path), path)
 
 
 def test_a_change_that_fails_leaves_the_file(pair, tmp_path):
     path = place(pair, tmp_path)
-    with pytest.raises(InputError, match="must be new"):
+    with refusal("new"):
         update_machine(path, lambda machine: machine.with_healthy(run(1), file="run1.nc"))
     assert path.read_bytes() == pair["press.toml"]

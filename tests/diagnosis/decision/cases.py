@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.observable import Flow, Observable
+from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable
 from sealscope.diagnosis.inference.onset import Information, Interval, StepTest, step_test
 from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.verdict.evidence import Cause, TotalLeakage
@@ -42,18 +42,24 @@ class MeasuredLeak:
     bound: float = 2e-7
     provider: str = "volume balance"
     cause: Cause = "piston or pump leak"
-    share_after: float = 0.5
-    litres: float | None = LITRES
+    lpm_per_flow: float | None = LITRES
     size_deviation: float = 0.0
     ratio: None = None
     remarks: tuple[()] = ()
-    step_driving: float = DRIVING
+    rise_onset: Interval | None = None
+    flow_factors: tuple[float, float] = (1.0, 1.0)
+    flow_per_conductance: float = DRIVING
     pump_flow: tuple[float, float] = (PUMP_FLOW, PUMP_FLOW)
 
     @property
     def step_flow(self) -> Flow:
         size, deviation = (0.0, 1.0) if self.step is None else self.step.fitted
         return Flow(size * DRIVING, deviation * DRIVING)
+
+    @property
+    def step_rise(self) -> LeakRise | None:
+        size = 0.0 if self.step is None else 0.5 * self.step.fitted[0]
+        return None if self.rise is None else LeakRise(self.rise, self.rise.log_ratio(size))
 
     @property
     def rise_flow(self) -> Flow | None:
@@ -66,8 +72,8 @@ class MeasuredLeak:
     def relative(self, flow: Flow) -> None:
         return None
 
-    def total(self, findable: float | None) -> TotalLeakage:
+    def total(self, detectable_flow: float | None) -> TotalLeakage:
         return TotalLeakage(lpm=0.01, interval_lpm=(0.009, 0.011), pressure=1e5, healthy_lpm=0.001)
 
-    def course(self, onset_s: float | None) -> None:
+    def history(self, onset_s: float | None) -> None:
         return None

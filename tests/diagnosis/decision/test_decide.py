@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case, DecisionContext
+from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.inference.scatter import Rise
 from sealscope.diagnosis.verdict.evidence import Evidence
 
 from .cases import DRIVING, LITRES, MeasuredLeak, observable, step
 
 ALLOWED = 0.01
-CONTEXT = DecisionContext(false_alarm_probability=ALLOWED)
 SOURCE = Path(__file__).resolve().parents[3] / "src" / "sealscope" / "diagnosis"
 
 
 def report_of(leak: MeasuredLeak, *rivals: Observable) -> Observed:
     """Report a leak's step as an observable, and others of the same balance beside it."""
-    tests = [] if leak.step is None else [Observable.of_test("leak", "volumes", leak.step)]
+    tests = [] if leak.step is None else [Observable.from_test("leak", "volumes", leak.step)]
     return Observed("volume balance", (*tests, *rivals), leak)
 
 
@@ -33,12 +33,12 @@ def judge_leak(
     leak: MeasuredLeak, *rivals: Observable, null: HealthyNull | None = None, also: Sequence[Observable] = ()
 ) -> Evidence:
     report = report_of(leak, *rivals)
-    return decide(report, [Observed("signals", tuple(also))], null or HealthyNull(), CONTEXT)
+    return decide(report, [Observed("signals", tuple(also))], null or HealthyNull(), ALLOWED)
 
 
 def case_of(leak: MeasuredLeak, *rivals: Observable) -> Case:
     report = report_of(leak, *rivals)
-    return Case(report, report.observables, HealthyNull(), CONTEXT)
+    return Case(report, report.observables, HealthyNull(), ALLOWED)
 
 
 @pytest.mark.parametrize(
@@ -55,14 +55,22 @@ def test_a_larger_step_is_never_less_of_a_leak(rivals: tuple[str, ...]) -> None:
     assert leaks[-1] and not leaks[0]
 
 
-@pytest.mark.parametrize("rarities", [(), (1.0, 0.5), (3.0, 4.0, 2.0)])
-def test_a_rarer_healthy_machine_asks_for_more(rarities: tuple[float, ...]) -> None:
-    null = HealthyNull({"volume balance: step": rarities, "volumes: leak": rarities})
+@pytest.mark.parametrize("surprisals", [(), (1.0, 0.5), (3.0, 4.0, 2.0)])
+def test_a_rarer_healthy_machine_asks_for_more(surprisals: tuple[float, ...]) -> None:
+    null = HealthyNull({"volume balance: step": surprisals, "volumes: leak": surprisals})
     leaks = [judge_leak(MeasuredLeak(step(size)), null=null) for size in (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)]
     verdicts = [leak.verdict == "leak" for leak in leaks]
     assert verdicts == sorted(verdicts) and verdicts[-1]
     for leak in leaks:
         assert (leak.score > leak.threshold) == (leak.chance < ALLOWED)
+
+
+def test_the_onset_of_a_rise_is_stated_where_something_dates_it() -> None:
+    for onset in (None, Interval(50.0, 45.0, 55.0)):
+        evidence = judge_leak(MeasuredLeak(rise=Rise(20.0, 1.0, np.inf), rise_onset=onset))
+        assert evidence.verdict == "leak"
+        assert evidence.onset_s == (None if onset is None else onset.value)
+        assert evidence.onset_interval_s == (None if onset is None else (onset.low, onset.high))
 
 
 def test_a_noise_step_changes_neither_verdict_nor_size_nor_onset() -> None:
@@ -113,7 +121,7 @@ def test_a_bound_that_nobody_could_use_is_no_verdict() -> None:
 )
 def test_questions_share_the_probability(values: dict[str, object], names: tuple[str, ...]) -> None:
     given = {**values, "step": step(0.0)} if "step" in values else values
-    questions = case_of(MeasuredLeak(**given)).questions  # type: ignore[arg-type]
+    questions = case_of(MeasuredLeak(**given)).tests  # type: ignore[arg-type]
     assert tuple(question.name for question in questions) == names
     assert sum(question.probability for question in questions) == pytest.approx(ALLOWED)
     for question in questions:
@@ -133,13 +141,14 @@ def test_a_method_judges_by_its_own_rule() -> None:
     friction = observable("levels: friction", 1e-30)
     report, signals = Observed("rms change", (fall,)), Observed("signals", (friction,))
     verdicts = {
-        is_weighed: decide(
+        weigh_rivals: decide(
             report,
             [signals],
             HealthyNull(),
-            DecisionContext(false_alarm_probability=ALLOWED, is_weighed=is_weighed),
+            ALLOWED,
+            weigh_rivals,
         ).verdict
-        for is_weighed in (True, False)
+        for weigh_rivals in (True, False)
     }
     assert verdicts == {True: "cannot tell", False: "leak"}
 
@@ -148,19 +157,18 @@ def test_a_method_judges_by_its_own_rule() -> None:
 def test_healthy_recordings_move_score_and_chance_alike(chance: float) -> None:
     null = HealthyNull({"details: against": [1.0, 0.2, 0.0, 0.4]})
     report = Observed("rms change", (observable("details: fall of d3 of p_A", chance, onset=None),))
-    evidence = decide(report, (), null, DecisionContext(false_alarm_probability=ALLOWED, is_weighed=False))
+    evidence = decide(report, (), null, ALLOWED, weigh_rivals=False)
     assert (evidence.score > evidence.threshold) == (evidence.chance < ALLOWED) == (evidence.verdict == "leak")
 
 
 def test_a_leak_makes_the_ringing_fall() -> None:
-    context = DecisionContext(false_alarm_probability=ALLOWED, is_weighed=False)
     for way, verdict in (("fall", "leak"), ("rise", "cannot tell")):
         report = Observed("rms change", (observable(f"details: {way} of d3 of p_A", 1e-9),))
-        assert decide(report, (), HealthyNull(), context).verdict == verdict
+        assert decide(report, (), HealthyNull(), ALLOWED, weigh_rivals=False).verdict == verdict
 
 
 def test_what_cannot_be_observed_is_said() -> None:
-    evidence = decide(Observed("volume balance", lack="needs x"), (), HealthyNull(), CONTEXT)
+    evidence = decide(Observed("volume balance", lack="needs x"), (), HealthyNull(), ALLOWED)
     assert (evidence.verdict, evidence.reason, evidence.usable) == ("cannot tell", "needs x", False)
 
 
@@ -182,11 +190,11 @@ NAMES = {
     "inference/blocks.py",
     "inference/scatter.py",
     "inference/terms.py",
+    "live/explanation.py",
     "live/watch.py",
 }
-#: Files that make evidence: the decision, what chooses among several, and what still decides by itself.
+#: Files that make evidence: the decision, and what chooses among several.
 MAKERS = {"decision/decide.py", "decision/combination.py"}
-LEGACY_MAKERS = {"live/watch.py"}
 
 
 def constants(path: Path) -> set[str]:
@@ -211,11 +219,10 @@ def test_verdicts_stand_in_one_place() -> None:
 
 def test_evidence_is_made_in_one_place() -> None:
     making = {path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py") if calls(path, "Evidence")}
-    assert making - MAKERS - LEGACY_MAKERS == set()
-    assert LEGACY_MAKERS - making == set(), "take these from the list"
+    assert making == MAKERS
 
 
 def test_scores_are_finite_for_any_chance() -> None:
     for chance in (1.0, 0.5, 1e-300, np.finfo(float).tiny):
-        evidence = decide(Observed("mine", (observable("plug-in: mine", chance),)), (), HealthyNull(), CONTEXT)
+        evidence = decide(Observed("mine", (observable("plug-in: mine", chance),)), (), HealthyNull(), ALLOWED)
         assert np.isfinite([evidence.score, evidence.threshold, evidence.chance]).all()

@@ -11,13 +11,13 @@ from scipy.stats import t as student
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
-    LeakRise,
     explain,
     log_bayes_factor,
     probability_of,
 )
+from sealscope.diagnosis.inference.observable import LeakRise
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.decision import DECISION
 
 from .cases import observable
 
@@ -27,7 +27,7 @@ NOISE = observable("noise: noise of the pressures", 1e-30)
 
 
 def leak_probability(*observables: object) -> float:
-    return probability_of(explain(observables), *LEAK_EVENTS, data="volumes")  # type: ignore[arg-type]
+    return probability_of(explain(observables), *LEAK_EVENTS, data_kind="volumes")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("chance", [1e-2, 1e-6, 1e-40])
@@ -39,7 +39,7 @@ def test_a_chance_is_worth_the_bound_of_sellke(chance: float) -> None:
 
 def test_rivals_are_told_apart_no_better_than_the_terms_are_known() -> None:
     """However long the recording, the odds of two rivals of the same data end at exp(1 / 4 m)."""
-    misfit = priors("decision")["explanation"]["misfit"]
+    misfit = DECISION.explanation.misfit
     probable = {event.name: event.probability for event in EVENTS.values()}
     for chance in (1e-20, 1e-100, 1e-280):
         rivals = [observable("levels: friction", chance), observable("levels: load", math.sqrt(chance))]
@@ -60,9 +60,9 @@ def test_what_is_not_rare_is_worth_nothing() -> None:
 def test_one_observable_by_hand() -> None:
     """Events that move it earn its Bayes factor, all others their probability, and pairs of the former both."""
     bound = log_bayes_factor(LEAK.chance)
-    factor = math.exp(bound / (1.0 + 2.0 * priors("decision")["explanation"]["misfit"] * bound))
-    moving = [event.probability for event in EVENTS.values() if event.does_move(LEAK)]
-    silent = sum(event.probability for event in EVENTS.values() if not event.does_move(LEAK))
+    factor = math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
+    moving = [event.probability for event in EVENTS.values() if event.affects(LEAK)]
+    silent = sum(event.probability for event in EVENTS.values() if not event.affects(LEAK))
     pairs = 0.5 * (sum(moving) ** 2 - sum(p * p for p in moving))
     triples = (sum(moving) ** 3 - 3 * sum(moving) * sum(p * p for p in moving) + 2 * sum(p**3 for p in moving)) / 6
     total = factor * (sum(moving) + pairs + triples) + silent
@@ -121,7 +121,7 @@ def test_the_likelier_of_two_rivals_is_the_more_probable() -> None:
         for chance in (1e-9, 1e-12, 1e-15):
             explained = explain([observable(f"{data}: {first}", chance), observable(f"{data}: {second}", 1e-9)])
             ratios.append(
-                probability_of(explained, *(e for e in EVENTS if EVENTS[e].does_move(explained_by(data, first))))
+                probability_of(explained, *(e for e in EVENTS if EVENTS[e].affects(explained_by(data, first))))
             )
         assert ratios == sorted(ratios)
 
@@ -135,7 +135,10 @@ def test_a_leak_within_and_one_against_healthy_recordings_are_one() -> None:
     rises = [Rise(value, 1.0, 30.0) for value in (6.0, 0.0)]
     rival = observable("volumes: zero of the flow", LEAK.chance)
     with_rise, without = (
-        probability_of(explain([LEAK, rival], rise=LeakRise(rise, 6.0)), *LEAK_EVENTS, data="volumes") for rise in rises
+        probability_of(
+            explain([LEAK, rival], rise=LeakRise(rise, rise.log_ratio(6.0))), *LEAK_EVENTS, data_kind="volumes"
+        )
+        for rise in rises
     )
     assert with_rise > leak_probability(LEAK, rival) > without
     ratio = rises[0].log_ratio(6.0)
@@ -143,5 +146,13 @@ def test_a_leak_within_and_one_against_healthy_recordings_are_one() -> None:
 
 
 def test_a_leak_from_the_start_shows_by_its_rise_alone() -> None:
-    explained = explain([], rise=LeakRise(Rise(12.0, 1.0, 30.0), 0.0))
+    explained = explain([], rise=LeakRise(Rise(12.0, 1.0, 30.0)))
     assert probability_of(explained, *LEAK_EVENTS) > 0.95
+
+
+def test_a_step_that_later_holds_contradict_is_no_leak() -> None:
+    """What moves its data is another event then, and the leak does not borrow them from its other way to happen."""
+    rival = observable("volumes: free air", 0.02)
+    for rise, is_likely in ((Rise(0.0, 1.0, 30.0), False), (Rise(40.0, 1.0, 30.0), True)):
+        explained = explain([LEAK, rival], rise=LeakRise(rise, rise.log_ratio(40.0)))
+        assert (probability_of(explained, *LEAK_EVENTS, data_kind="volumes") > 0.5) == is_likely

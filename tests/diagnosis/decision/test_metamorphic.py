@@ -18,7 +18,7 @@ import sealscope as ss
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.commands import recorded
+from sealscope.simulation.commands import sampled_signal
 
 from ..balance_machine import machine, step
 
@@ -70,7 +70,7 @@ def record(name: str, leaks: bool, seed: int, envelope: Envelope = always) -> Re
         return machine(seed, G=G, speed=lambda t: 12.0 * envelope(t) * np.sin(4.0 * t), duration=SECONDS)
     own = MACHINES[name]
     t = np.arange(0.0, SECONDS + 0.1, 0.002)
-    command = recorded(t, own.amplitude * envelope(t) * np.sin(own.omega * t))
+    command = sampled_signal(t, own.amplitude * envelope(t) * np.sin(own.omega * t))
     leak = f"{own.leak} from {ONSET:g} s" if leaks else ()
     return ss.simulate(rig=own.rig, command=command, leak=leak, duration=SECONDS, seed=seed)
 

@@ -5,33 +5,33 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.null import HealthyNull, key_of
+from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.inference.observable import Observable
 
 from .cases import observable
 
 CHANGE = observable("volumes: leak", 1e-6)
-KEY = key_of(CHANGE)
+KEY = null_key(CHANGE)
 
 
-def chance(*rarities: float, of: Observable = CHANGE) -> float:
-    return HealthyNull({KEY: rarities}).chance(of)
+def chance(*surprisals: float, of: Observable = CHANGE) -> float:
+    return HealthyNull({KEY: surprisals}).chance(of)
 
 
 def test_without_healthy_recordings_the_law_stands() -> None:
     for law in (1e-200, 1e-6, 0.3, 1.0):
         assert HealthyNull().chance(observable("volumes: leak", law)) == pytest.approx(law)
-        assert HealthyNull().inflate("any", law) == pytest.approx(law)
-        assert HealthyNull().law_chance("any", law) == pytest.approx(law)
+        assert HealthyNull().calibrate("any", law) == pytest.approx(law)
+        assert HealthyNull().uncalibrated_chance("any", law) == pytest.approx(law)
 
 
-@pytest.mark.parametrize("rarities", [(1.0, 1.0), (0.2, 1.6)])
-def test_two_ordinary_healthy_recordings_change_next_to_nothing(rarities: tuple[float, float]) -> None:
+@pytest.mark.parametrize("surprisals", [(1.0, 1.0), (0.2, 1.6)])
+def test_two_ordinary_healthy_recordings_change_next_to_nothing(surprisals: tuple[float, float]) -> None:
     """Healthy recordings have -log P = 1 on average: an alarm needs a score larger by 40 % at most."""
-    null = HealthyNull({KEY: rarities})
+    null = HealthyNull({KEY: surprisals})
     for wanted in (0.05, 0.01):
-        assert np.log(null.law_chance(KEY, wanted)) > 1.4 * np.log(wanted)
-    assert null.inflate(KEY, 1e-20) < 1e-5
+        assert np.log(null.uncalibrated_chance(KEY, wanted)) > 1.4 * np.log(wanted)
+    assert null.calibrate(KEY, 1e-20) < 1e-5
 
 
 def test_five_strange_ones_change_everything() -> None:
@@ -41,14 +41,14 @@ def test_five_strange_ones_change_everything() -> None:
 
 
 def test_the_stranger_the_healthy_ones_the_less_strange_the_judged() -> None:
-    chances = [chance(*([rarity] * 5)) for rarity in (0.5, 1.0, 2.0, 5.0, 20.0, 100.0)]
+    chances = [chance(*([surprisal] * 5)) for surprisal in (0.5, 1.0, 2.0, 5.0, 20.0, 100.0)]
     assert chances == sorted(chances)
 
 
 def test_the_rarer_by_the_law_the_rarer() -> None:
     null = HealthyNull({KEY: [3.0, 8.0, 1.0]})
     laws = np.geomspace(1e-250, 1.0, 60)
-    chances = [null.inflate(KEY, law) for law in laws]
+    chances = [null.calibrate(KEY, law) for law in laws]
     assert np.all(np.diff(chances) > 0.0)
     assert all(found >= law * (1.0 - 1e-9) for found, law in zip(chances, laws, strict=True))
 
@@ -62,7 +62,7 @@ def test_more_ordinary_recordings_return_to_the_law() -> None:
 def test_the_law_s_chance_is_the_inverse() -> None:
     null = HealthyNull({KEY: [2.0, 7.0, 4.0]})
     for wanted in (0.2, 0.01, 1e-4):
-        assert null.inflate(KEY, null.law_chance(KEY, wanted)) == pytest.approx(wanted, rel=1e-6)
+        assert null.calibrate(KEY, null.uncalibrated_chance(KEY, wanted)) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_one_observable_s_healthy_values_are_not_another_s() -> None:

@@ -15,12 +15,12 @@ import numpy as np
 
 from sealscope.campaigns.plans.duty import CONTROLLER
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
-from sealscope.control.registry import source_of
+from sealscope.control.registry import find_controller_source
 from sealscope.simulation.bench.profile import load_profile
 
 #: The factor whose levels are families of the plan's profile.
 FAMILY = "family"
-#: Parameters of a rig that a verdict is held against, and no record depends on.
+#: Parameters of a rig that only verdicts use; no simulated record depends on them.
 _PRIORS = frozenset({"pump.G_healthy"})
 _PACKAGE = Path(__file__).resolve().parents[2]
 #: Parts of the package that no row depends on; the sources of all others are in the code key.
@@ -39,8 +39,8 @@ _NOT_IN_ROWS = (
 class CaseInputs:
     """The inputs and the use of a case's record.
 
-    `levels`: factor -> level; `leak_lpm` [L/min] of that `law` and `fault`: what is put in at the plan's onset;
-    `replicate` counts within the cell.
+    `levels`: factor -> level; `leak_lpm`: mean flow [L/min] of the leak that opens at the plan's onset, with its `law`;
+    `fault`: another fault, as text; `replicate`: number of the record within its cell of the factors.
     """
 
     id: str
@@ -61,21 +61,22 @@ class CampaignCase(CaseInputs):
 
 
 def digest(value: Any) -> str:
-    """Compute a SHA-256 of plain values."""
+    """Compute the SHA-256 of a value's JSON text."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def profile_key(name: str) -> str:
-    """Compute a digest of the content of a bench profile, wherever its file lies."""
+    """Compute a digest of a bench profile's content, independent of the path of its file."""
     profile = load_profile(name)
+    # `seeds` names the profile whose draws this one shares
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 
-def world(plan: SimulatedPlan) -> dict[str, Any]:
+def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
     """Collect the inputs that all cases of a plan share: rig, bench, length, onset and base seed."""
     return {
-        "rig": digest({name: repr(value) for name, value in plan.rig.present().items() if name not in _PRIORS}),
+        "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",
         "duration_s": plan.duration_s,
         "onset_s": plan.onset_s,
@@ -83,25 +84,25 @@ def world(plan: SimulatedPlan) -> dict[str, Any]:
     }
 
 
-def _named_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Compute factor -> level -> digest of the family or the user's controller behind the level's name.
+def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
+    """Compute digests of the families and controller files that levels name: factor -> level -> digest.
 
-    Another law gives other cases; a case does not depend on another family.
+    With them in its id, a case changes with its own family or control law, and not with those of other cases.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
         digests[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
     for level in plan.factors.get(CONTROLLER, ()):
-        if path := source_of(str(level)):
+        if path := find_controller_source(str(level)):
             digests[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()
     return digests
 
 
-def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
-    """List all cases of a plan: records of each kind go round the cells in turn, and the last round may be short."""
+def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
+    """List all cases of a plan; the records of each group are dealt to the cells of the factors in turn."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
-    shared = world(plan)
-    digests_by_factor = _named_digests(plan)
+    shared = shared_inputs(plan)
+    digests_by_factor = _level_digests(plan)
     cases = []
     for group in plan.records:
         for number in range(group.count):
@@ -115,32 +116,33 @@ def cases_of(plan: SimulatedPlan) -> list[CampaignCase]:
                 "replicate": replicate,
             }
             levels = {key: str(level) for key, level in cells[k].items()}
-            behind = {
+            level_digests = {
                 key: digests[levels[key]] for key, digests in digests_by_factor.items() if levels.get(key) in digests
             }
-            name = digest({"world": shared, **content, **behind})
-            machine, noise = np.random.SeedSequence(int(name, 16)).generate_state(2, np.uint64)
+            case_digest = digest({"world": shared, **content, **level_digests})
+            machine, noise = np.random.SeedSequence(int(case_digest, 16)).generate_state(2, np.uint64)
+            # 63 bits: the seeds are stored as signed 64-bit integers
             machine_seed, noise_seed = int(machine >> np.uint64(1)), int(noise >> np.uint64(1))
-            cases.append(CampaignCase(id=name[:16], machine_seed=machine_seed, noise_seed=noise_seed, **content))
+            cases.append(CampaignCase(id=case_digest[:16], machine_seed=machine_seed, noise_seed=noise_seed, **content))
     return cases
 
 
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     """Order the cases so that each kind (use, leak, law, fault) is spread evenly.
 
-    A campaign that is ended early then has every kind in its proportion, each with its cells in turn.
+    A campaign that is ended early then has each kind in its planned proportion.
     """
     kinds = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
-    counts, before = Counter(kinds), Counter[Any]()
-    shares = []
+    n_total, n_listed = Counter(kinds), Counter[Any]()
+    positions = []  # of each case within its kind, from 0 to 1
     for kind in kinds:
-        shares.append((before[kind] + 0.5) / counts[kind])
-        before[kind] += 1
-    return [cases[k] for k in sorted(range(len(cases)), key=shares.__getitem__)]
+        positions.append((n_listed[kind] + 0.5) / n_total[kind])
+        n_listed[kind] += 1
+    return [cases[k] for k in sorted(range(len(cases)), key=positions.__getitem__)]
 
 
-def sources() -> Iterator[Path]:
-    """Yield the files of the package that a row may depend on."""
+def iter_sources() -> Iterator[Path]:
+    """Yield the package's files that a row may depend on."""
     for path in sorted(_PACKAGE.rglob("*")):
         name = path.relative_to(_PACKAGE).as_posix()
         if path.suffix in (".py", ".toml") and not f"{name}/".startswith(tuple(f"{part}/" for part in _NOT_IN_ROWS)):
@@ -148,14 +150,14 @@ def sources() -> Iterator[Path]:
 
 
 def code_key() -> str:
-    """Compute a hash of the sources that a row depends on, so that rows of other sources are not mixed in."""
-    return files_digest(sources())[:16]
+    """Compute a hash of the sources that a row depends on; only rows with the same hash are combined."""
+    return files_digest(iter_sources())[:16]
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """Compute a SHA-256 of files of the package, their names and contents."""
-    key = hashlib.sha256()
+    """Compute the SHA-256 of the names and contents of files of the package."""
+    sha = hashlib.sha256()
     for path in paths:
-        key.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
-        key.update(path.read_bytes())
-    return key.hexdigest()
+        sha.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")
+        sha.update(path.read_bytes())
+    return sha.hexdigest()

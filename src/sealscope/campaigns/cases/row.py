@@ -14,20 +14,20 @@ from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
 from sealscope.errors import InputError, SealscopeError
 from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.simulation.faults import parse_fault
-from sealscope.storage.plain_values import as_type
+from sealscope.storage.plain_values import convert_type
 
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
-#: The level that tells strokes in either direction, of recordings.
+#: Factor of recordings: the direction of the piston's stroke.
 STROKE = "stroke"
-#: A cause that a detector names where no channel tells two apart, and those two.
-_EITHER = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
-#: detector -> (score, None where it cannot tell; onset [s], None where it finds none)
+#: Cause that a detector names if its channels cannot distinguish two -> those two.
+_AMBIGUOUS_CAUSES = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
+#: detector -> (score, None for `cannot tell`; onset [s], None if it finds none)
 Scores = Mapping[str, tuple[float | None, float | None]]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """The figures of a detector's evidence that a row stores; those that are not finite are None."""
+    """The part of a detector's evidence that a row stores; numbers that are not finite become None."""
 
     verdict: Verdict
     score: float | None = None
@@ -40,7 +40,7 @@ class Statement:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence | Statement) -> Statement:
-        """Select the figures of evidence that a row stores."""
+        """Copy the stored fields of evidence, with None for numbers that are not finite."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
             ends = value if isinstance(value, tuple) else (value,)
@@ -50,35 +50,34 @@ class Statement:
 
 
 @cache
-def cause_of(fault: str) -> str:
-    """Return the cause that a detector should name for a fault as text; else the text itself."""
+def expected_cause(fault: str) -> str:
+    """Return the cause that a detector should name for a fault, or the fault's text if no cause is defined for it."""
     try:
         parsed = parse_fault(fault)
-    except InputError:  # of rows that were not simulated
+    except InputError:  # faults of recordings are free text
         return fault
     return fault if parsed is None else parsed.row.cause or fault
 
 
-def duty_of(levels: Mapping[str, str | float]) -> str:
-    """Return the duty within which scores are compared: the command, and the direction of a stroke."""
+def duty_label(levels: Mapping[str, str | float]) -> str:
+    """Format the duty of a record, its command and stroke direction; scores are compared within a duty."""
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
-def covers(named_cause_text: str, true: str) -> bool:
-    """Return True if a named cause is the true one, alone or with another that no channel tells from it."""
-    return named_cause_text == true or true in _EITHER.get(named_cause_text, ())
+def matches_cause(named: str, true_cause: str) -> bool:
+    """Return True if a named cause is the true one, or an ambiguous cause that includes it."""
+    return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
 
-def finite(value: float | None) -> float | None:
-    """Return the number, None where it is not finite."""
+def finite_or_none(value: float | None) -> float | None:
+    """Return the number, or None if it is None or not finite."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def named_cause(evidence: Evidence | Statement) -> str:
-    """Return the cause that evidence names.
+    """Infer the named cause from verdict and cause of evidence; a leak counts only under the verdict `leak`.
 
-    A leak of the piston for `leak` (or of the pump, where it says so), `none` for a plain `no leak`, else `cannot
-    tell`.
+    A verdict `leak` without a cause means a piston leak; without leak and cause the result is `none` or `cannot tell`.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -87,8 +86,8 @@ def named_cause(evidence: Evidence | Statement) -> str:
     return CANNOT_TELL if evidence.verdict == CANNOT_TELL else NO_CAUSE
 
 
-def rank_of(evidence: Evidence | Statement) -> float | None:
-    """Return the score by which records are ordered; None for `cannot tell` or another cause."""
+def ranking_score(evidence: Evidence | Statement) -> float | None:
+    """Return the score that ranks records by leakage; None for `cannot tell` or a cause that is no leak."""
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 
@@ -103,10 +102,10 @@ def error_text(error: Exception) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseRow(CaseInputs):
-    """The stored result of a case: its inputs and the scores; or the `error` of it.
+    """The stored result of a case: its inputs, and either scores or the `error` that prevented them.
 
-    `flow_lpm`: mean leak [L/min] while open, as the run really had it; `scores` and `statements` by the
-    plan's name of a detector; `seconds`: processor time, which takes no part in the result.
+    `flow_lpm`: simulated mean flow [L/min] of the leak while open; `scores` and `statements`: by the plan's name of the
+    detector; `seconds`: processor time, which differs between runs and is not part of the result.
     """
 
     flow_lpm: float | None = None
@@ -114,6 +113,10 @@ class CaseRow(CaseInputs):
     error: str | None = None
     seconds: float = 0.0
     statements: Mapping[str, Statement] = field(default_factory=dict)
+
+    def score(self, detector: str) -> float | None:
+        """Return a detector's score; None for `cannot tell` or without a result."""
+        return self.scores[detector][0] if detector in self.scores else None
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the row to plain JSON values."""
@@ -126,5 +129,5 @@ class CaseRow(CaseInputs):
 
     @classmethod
     def from_dict(cls, tree: Any) -> CaseRow:
-        """Read a row from plain values; raise ValueError for any others."""
-        return as_type(cls, tree)
+        """Build a row from plain JSON values; raise ValueError if a field is missing, unknown or of another type."""
+        return convert_type(cls, tree)

@@ -2,94 +2,93 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 
-from sealscope.campaigns.cases.row import Scores, Statement, finite, rank_of
-from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, plan_detector
+from sealscope.campaigns.cases.row import Scores, Statement, finite_or_none, ranking_score
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
-from sealscope.campaigns.plans.scorers import Sides
+from sealscope.campaigns.plans.scorers import SplitRms
 from sealscope.diagnosis.diagnose import Examination
-from sealscope.diagnosis.inspection import inspected
+from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 
-#: Channels that are inspected for findings: those that can spoil a verdict.
+#: Channels whose defects can invalidate a verdict; the recording is inspected for them first.
 INSPECTED = ("u", "x", "p_A", "p_B")
-#: Samples of a stream arrive in portions of this length [s].
-_PORTION = 1.0
 
 
 def judge_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Run each detector of a plan once; return scores with onsets, and the statements of those that are no scorers.
+    """Run each detector of a plan on a recording; return all scores with onsets, and statements except for scorers.
 
-    `split_s` [s]: the moment on the recording's time axis at which scorers split it, None for its middle; `rig`: what
-    detectors may assume. Raises InputError for a recording that none of them can judge.
+    `split_s` [s]: time on the recording's axis at which scorers split it, None for its middle; `rig`: the rig that
+    detectors may assume. Raises InputError if the inspection finds a defect that rules out any verdict.
     """
-    record = inspected(recording, INSPECTED)
+    record = inspect_recording(recording, INSPECTED)
     if record.defect is not None:
         raise InputError(f"the record cannot be judged: {record.defect}" + (f" ({record.file})" if record.file else ""))
     examination = Examination(record.part, false_alarm_probability=plan.false_alarm, rig=rig, share=record.share)
-    detectors = [plan_detector(name) for name in plan.detectors]
-    examinations = {
-        view: examination.through(plan.views.get(view, ALL_CHANNELS)) for view in {d.view: None for d in detectors}
-    }
+    detectors = [parse_detector_name(name) for name in plan.detectors]
+    views = dict.fromkeys(detector.view for detector in detectors)
+    examinations = {view: examination.with_channels(plan.views.get(view, ALL_CHANNELS)) for view in views}
     scores: dict[str, tuple[float | None, float | None]] = {}
     if any(detector.scorer is not None for detector in detectors):
         split_s = float(record.part.t[0]) + record.part.duration / 2 if split_s is None else split_s
-        scores = score_sides(Sides.from_recording(record.part, split_s), plan.detectors, plan.views)
+        scores = score_details(SplitRms.from_recording(record.part, split_s), plan.detectors, plan.views)
     statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:
-            statement = Statement.from_evidence(_evidence(detector, examinations[detector.view]))
+            statement = Statement.from_evidence(_run_detector(detector, examinations[detector.view]))
             statements[detector.name] = statement
-            rank = _share(statement) if detector.base == DIAGNOSE else rank_of(statement)
-            scores[detector.name] = (rank, statement.onset_s)
+            score = _score_over_threshold(statement) if detector.base == DIAGNOSE else ranking_score(statement)
+            scores[detector.name] = (score, statement.onset_s)
     return scores, statements
 
 
-def _evidence(detector: PlanDetector, examination: Examination) -> Evidence:
+def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
+    """Run the watch, `diagnose` or a registered detector on the examined recording."""
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:
-        return examination.fused()
+        return examination.decide_by_all()
     return examination.evidence(detector.base)
 
 
-def score_sides(sides: Sides, names: Sequence[str], views: Views) -> dict[str, tuple[float | None, float | None]]:
-    """Compute the scores of scorers, which find no onset."""
+def score_details(
+    split_rms: SplitRms, names: Sequence[str], views: Views
+) -> dict[str, tuple[float | None, float | None]]:
+    """Compute the scores of the scorers among the detectors `names`; their onsets are None."""
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
-        detector = plan_detector(name)
+        detector = parse_detector_name(name)
         if detector.scorer is not None:
-            value = detector.scorer.score(sides.through(views.get(detector.view, ALL_CHANNELS)))
-            scores[name] = (finite(value), None)
+            value = detector.scorer.score(split_rms.through(views.get(detector.view, ALL_CHANNELS)))
+            scores[name] = (finite_or_none(value), None)
     return scores
 
 
-def _share(evidence: Statement) -> float | None:
-    """Compute the fused verdict's score over its threshold: the deciding detector differs between records."""
-    rank, threshold = rank_of(evidence), evidence.threshold
-    if rank is None or threshold is None:
+def _score_over_threshold(statement: Statement) -> float | None:
+    """Compute the score of a fused verdict relative to its threshold.
+
+    Another detector may decide each record, so that the scores themselves are not comparable.
+    """
+    score, threshold = ranking_score(statement), statement.threshold
+    if score is None or threshold is None:
         return None
-    return rank / threshold if threshold > 0 else rank - threshold
+    return score / threshold if threshold > 0 else score - threshold
 
 
 def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Run the watch of a machine; return its evidence at the record's end, where a raised alarm stays.
+    """Run the watch of a machine over a recording; return its evidence at the end, which keeps a raised alarm.
 
-    Its rate of alarms is the one at which a healthy machine alarms within the record with the probability
-    `false_alarm` at most.
+    `false_alarm`: bound on the probability that a healthy machine raises an alarm within the recording.
     """
-    watch = Watch(load_rig(rig), false_alarm * 3.6e6 / recording.duration, learn_hours=1000.0)
-    begin = float(recording.t[0])
-    for second in range(math.ceil(recording.duration / _PORTION)):
-        watch.update(recording.between(begin + second * _PORTION, begin + (second + 1) * _PORTION))
-    return replace(watch.evidence, detector=WATCH)
+    alarms_per_1000_hours = false_alarm * 3.6e6 / recording.duration  # 1000 hours are 3.6e6 s
+    watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)
+    watch.update(recording)
+    return watch.evidence

@@ -1,4 +1,4 @@
-"""Carry out one case: simulate, record, let every detector score."""
+"""Run one case: simulate its record and judge it with every detector."""
 
 from __future__ import annotations
 
@@ -7,25 +7,29 @@ from dataclasses import replace
 from pathlib import Path
 
 from sealscope.campaigns.cases.case import CampaignCase
-from sealscope.campaigns.cases.machines import experiment_of
+from sealscope.campaigns.cases.machines import case_experiment
 from sealscope.campaigns.cases.row import CaseRow, error_text
 from sealscope.campaigns.cases.scoring import judge_record
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.simulation.simulate import simulate_experiment
 
 
-def work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
-    """Carry out one case; an error of any kind becomes the row's error. `folder` to write the recording into."""
+def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
+    """Run one case and return its row; an error of any kind is stored in the row.
+
+    The recording is written into `folder`, or discarded if that is None.
+    """
     started = time.process_time()
     try:
-        row = _work(plan, case, folder)
-    except Exception as error:  # a defect of the program must not end ten thousand other cases; the table says it
+        row = _simulate_and_judge(plan, case, folder)
+    except Exception as error:  # a program defect in one case must not end the campaign; its row carries the error
         row = CaseRow.from_case(case, error=error_text(error))
     return replace(row, seconds=round(time.process_time() - started, 4))
 
 
-def _work(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    simulated = simulate_experiment(experiment_of(plan, case))
+def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
+    """Simulate the record of a case, write it if a folder is given, and judge it; raise any error."""
+    simulated = simulate_experiment(case_experiment(plan, case))
     if folder is not None:
         from sealscope.recordings import write
 

@@ -1,1 +1,1 @@
-"""Execution: processes, batches or a cluster carry out the cases; rows are appended to the campaign's folder."""
+"""Execution: processes, batches or a cluster run the cases; rows are appended to the campaign's folder."""

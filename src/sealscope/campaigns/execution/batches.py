@@ -1,8 +1,8 @@
-"""Many cases of a plan at a time: simulated side by side, scored from the RMS of the details about the onset.
+"""Simulate many cases of a plan side by side, and score them from the RMS of the details around the onset.
 
-The scores are the same functions of the same samples as those of a recording (`scorers.Sides`); nothing else of a
-record is there, so that a plan is refused where something asks for more. The solver's step of a case comes from a few
-seconds of its machine.
+The scores are computed by the same functions from the same samples as those of a recording (`scorers.SplitRms`). A
+batch keeps nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen on a
+few seconds of machines of its cell.
 """
 
 from __future__ import annotations
@@ -16,179 +16,187 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.cases.case import CampaignCase, digest, world
-from sealscope.campaigns.cases.machines import sized_once, sizing_run, unsized
+from sealscope.campaigns.cases.case import CampaignCase, digest, shared_inputs
+from sealscope.campaigns.cases.machines import experiment_with_flow_leak, size_leaks_on_short_run, sizing_experiment
 from sealscope.campaigns.cases.row import CaseRow, error_text
-from sealscope.campaigns.cases.scoring import score_sides
-from sealscope.campaigns.plans.detectors import plan_detector
-from sealscope.campaigns.plans.duty import fault_of
+from sealscope.campaigns.cases.scoring import score_details
+from sealscope.campaigns.plans.detectors import parse_detector_name
+from sealscope.campaigns.plans.duty import parse_plan_fault
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.campaigns.plans.scorers import Sides, side_bounds
+from sealscope.campaigns.plans.scorers import SplitRms, split_bounds
 from sealscope.errors import InputError, SealscopeError
 from sealscope.physics.solvers.limits import longest_step
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.batch.batch import simulate_batch
-from sealscope.simulation.batch.run import refuse, with_sizes
+from sealscope.simulation.batch.run import refuse_unbatchable, with_leak_coefficient
 from sealscope.simulation.bench.profile import Profile, load_profile
-from sealscope.simulation.courses import numbers_under
 from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
-from sealscope.simulation.integrate import FINEST, oversampling, steps_per_output, trajectory
+from sealscope.simulation.integrate import MAX_STEP_REFINEMENT, integrate_run, oversampling, steps_per_output
+from sealscope.simulation.targets_and_loads import loaded_rig_numbers
 
-#: Runs of a batch, after each of which the rows are on disk.
-RUNS = 256
-#: Mode of rows of batches: they are not mixed with those of another mode, whose noise differs.
+#: Runs of a batch; the rows are stored after each batch.
+BATCH_SIZE = 256
+#: Mode of rows from batches. Their noise differs from that of single runs, so the two are not combined.
 IN_BATCHES = "in batches"
-#: Machines of a cell on which its step is chosen, and how long [s] each of them runs for that: the first window that
-#: `integrate` checks, and two more.
-SCOUTS, SCOUTED = 4, 4.0
+#: Number of machines of a cell on which its step is chosen, and the length [s] of their runs: three of the windows in
+#: which `integrate` checks its error.
+N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
-def bounds_of(plan: SimulatedPlan) -> IntArray:
-    """Compute the samples (2, 2) of a record that the scorers compare."""
+def scored_bounds(plan: SimulatedPlan) -> IntArray:
+    """Compute first and last (exclusive) sample, (2, 2), of the two parts of a record that scorers compare."""
     rate = plan.rig.daq.sample_rate
-    return side_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
+    return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
-    """Raise InputError for a request of a plan that no batch can carry out."""
+    """Raise InputError if a plan needs something that a batch cannot simulate or score."""
 
-    def no(rule: str) -> InputError:
+    def refusal(rule: str) -> InputError:
+        """Make the error for a plan that breaks a rule of batches."""
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
 
     for name in plan.detectors:
-        if plan_detector(name).scorer is None:
-            raise no(
+        if parse_detector_name(name).scorer is None:
+            raise refusal(
                 f"detectors of the RMS on both sides of the onset alone, got {name!r}, which needs whole recordings"
             )
     if plan.keep_recordings:
-        raise no("keep_recordings = false, got true")
-    if np.diff(bounds_of(plan)).min() < 1:
-        raise no(f"records with details on both sides of the onset, got {plan.duration_s:g} s with {plan.onset_s:g} s")
+        raise refusal("keep_recordings = false, got true")
+    if np.diff(scored_bounds(plan)).min() < 1:
+        got = f"{plan.duration_s:g} s with {plan.onset_s:g} s"
+        raise refusal(f"records with details on both sides of the onset, got {got}")
     for group in plan.records:
         if group.law == "mixture":
-            raise no("leaks of one law each, got a mixture")
-        fault = fault_of(group.fault, plan.onset_s) if group.fault else None
-        if fault is not None and fault.row.of_sensor:
-            raise no(f"no fault of a sensor, got {group.fault!r}")
-    for case in {repr(case.levels): case for case in reversed(cases)}.values():  # one of each cell
+            raise refusal("leaks of one law each, got a mixture")
+        fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
+        if fault is not None and fault.row.is_sensor_fault:
+            raise refusal(f"no fault of a sensor, got {group.fault!r}")
+    for case in {repr(case.levels): case for case in reversed(cases)}.values():  # the first case of each cell
         try:
-            experiment = unsized(plan, case)
-        except SealscopeError:  # then its row says so
+            experiment = experiment_with_flow_leak(plan, case)
+        except SealscopeError:  # the case's row will carry the error
             continue
-        if experiment.rate != plan.rig.daq.sample_rate:
-            raise no(f"one sampling rate, {plan.rig.daq.sample_rate:g} Hz, got {experiment.rate:g} Hz by a factor")
+        rate = plan.rig.daq.sample_rate
+        if experiment.rate != rate:
+            raise refusal(f"one sampling rate, {rate:g} Hz, got {experiment.rate:g} Hz by a factor")
         try:
-            refuse(experiment, 0)
+            refuse_unbatchable(experiment, row=0)
         except InputError as error:
-            raise no(f"runs that can stand side by side, got: {error}") from None
+            raise refusal(f"runs that can be simulated side by side, got: {error}") from None
 
 
-def in_batches(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
-    """Yield the rows of the cases, batch by batch; a case that cannot be carried out costs no other.
+def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
+    """Simulate the cases batch by batch and yield their rows; the error of a case is stored in its row.
 
-    A row derives from its case alone, whatever stands beside it.
+    A row depends on its case only, not on the other cases of its batch.
     """
     profile = load_profile(plan.profile) if plan.profile else None
-    step_of = step_chooser(plan, profile)
-    for start in range(0, len(cases), RUNS):
-        started, batch = time.process_time(), cases[start : start + RUNS]
+    choose_step = make_step_chooser(plan, profile)
+    for start in range(0, len(cases), BATCH_SIZE):
+        started, batch = time.process_time(), cases[start : start + BATCH_SIZE]
         pairs: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in batch:
             try:
-                experiment = unsized(plan, case, profile)
-                pairs.append((case, replace(experiment, step=step_of(case, experiment))))
+                experiment = experiment_with_flow_leak(plan, case, profile)
+                pairs.append((case, replace(experiment, step=choose_step(case, experiment))))
             except Exception as error:
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
-        rows += _carried_out(plan, pairs, threads)
+        rows += _run_batch(plan, pairs, threads)
         seconds = round((time.process_time() - started) / len(batch), 4)
         yield from (replace(row, seconds=seconds) for row in rows)
 
 
-def _carried_out(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
-    """Carry out one batch; where it fails, its halves, down to the run that is to blame."""
+def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
+    """Simulate and score one batch; if it fails, bisect it until the failing runs are isolated."""
     if not pairs:
         return []
-    bounds, rows = bounds_of(plan), []
+    bounds, rows = scored_bounds(plan), []
     try:
-        experiments = _sized([experiment for _, experiment in pairs], threads)
+        experiments = _size_leaks([experiment for _, experiment in pairs], threads)
         batch = simulate_batch(experiments, bounds=bounds.ravel() / plan.rig.daq.sample_rate, threads=threads)
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
-            sides = Sides.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
-            scores = score_sides(sides, plan.detectors, plan.views)
+            # intervals 0 and 2 are the parts; 1 is the gap between them
+            split_rms = SplitRms.from_squares(dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True)), bounds)
+            scores = score_details(split_rms, plan.detectors, plan.views)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
         if len(pairs) == 1:
             return [CaseRow.from_case(pairs[0][0], error=error_text(error))]
     middle = len(pairs) // 2
-    return _carried_out(plan, pairs[:middle], threads) + _carried_out(plan, pairs[middle:], threads)
+    return _run_batch(plan, pairs[:middle], threads) + _run_batch(plan, pairs[middle:], threads)
 
 
-def _sized(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
-    """Choose steps that resolve the experiments' leaks, and size these side by side as `sized_once` does."""
-    sized = list(experiments)
+def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
+    """Solve the leak coefficients of a batch as `size_leaks_on_short_run` does, and shorten steps to resolve them."""
+    sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
     if not leaky:
-        return sized
-    short = [sizing_run(experiments[k]) for k in leaky]
+        return sized_experiments
+    short_runs = [sizing_experiment(experiments[k]) for k in leaky]
     try:
-        sizes = simulate_batch(short, threads=threads).coefficients.tolist()
+        coefficients = simulate_batch(short_runs, threads=threads).coefficients.tolist()
     except SealscopeError:
-        if len(experiments) > 1:  # halving finds the one that is to blame
+        if len(experiments) > 1:  # `_run_batch` bisects the batch
             raise
-        sizes = [leak.coefficient for leak in sized_once(replace(experiments[0], step=None))]
-    for k, size in zip(leaky, sizes, strict=True):
-        experiment = with_sizes(experiments[k], size)
-        laminar = experiment.leaks[0].law == "laminar"
-        numbers = numbers_under(experiment.rig, experiment.load)
-        limit = longest_step(numbers, size if laminar else 0.0, 0.0 if laminar else size)
+        coefficients = [leak.coefficient for leak in size_leaks_on_short_run(replace(experiments[0], step=None))]
+    for k, coefficient in zip(leaky, coefficients, strict=True):
+        experiment = with_leak_coefficient(experiments[k], coefficient)
+        G, C = (coefficient, 0.0) if experiment.leaks[0].law == "laminar" else (0.0, coefficient)
+        limit = longest_step(loaded_rig_numbers(experiment.rig, experiment.load), G, C)
         if experiment.step is not None and experiment.step > limit:
             experiment = replace(experiment, step=dividing_step(experiment.rate * oversampling(experiment), limit))
-        sized[k] = experiment
-    return sized
+        sized_experiments[k] = experiment
+    return sized_experiments
 
 
-def step_chooser(plan: SimulatedPlan, profile: Profile | None = None) -> Callable[[CampaignCase, Experiment], float]:
-    """Build the function that chooses a case's step [s] from the case alone, independent of all others.
+def make_step_chooser(
+    plan: SimulatedPlan, profile: Profile | None = None
+) -> Callable[[CampaignCase, Experiment], float]:
+    """Build the function that chooses a case's step [s] independent of all other cases.
 
-    It is what `integrate` chooses by error on `SCOUTS` machines of the case's cell with seeds of their own, the finest
-    of those with its method, and no longer than its own machine allows.
+    `integrate` chooses a step by its error on `N_SCOUT_MACHINES` machines drawn for the case's cell. The result is the
+    shortest of these steps with the case's method, limited to the longest step that the case's machine allows.
     """
-    shared = digest(world(plan))
+    shared = digest(shared_inputs(plan))
 
     @cache
-    def of_cell(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Compute method -> step of a cell of the factors."""
+    def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
+        """Compute the shortest step [s], by method, that `integrate` chooses on machines drawn for a cell."""
         steps: dict[str, float] = {}
-        for number in range(SCOUTS):
+        for number in range(N_SCOUT_MACHINES):
             content: dict[str, Any] = {"use": "calibrate", "leak_lpm": 0.0, "levels": dict(levels), "replicate": number}
-            seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)
+            seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)  # 60 bits
             try:
-                method, step = _choose_method(
-                    unsized(plan, CampaignCase(id="", machine_seed=seed, noise_seed=0, **content), profile)
-                )
-            except SealscopeError:  # a machine of the bench that cannot do this duty
+                scout = CampaignCase(id="", machine_seed=seed, noise_seed=0, **content)
+                method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout, profile))
+            except SealscopeError:  # this machine cannot follow the cell's command
                 continue
             steps[method] = min(step, steps.get(method, math.inf))
         return steps
 
-    def step_of(case: CampaignCase, experiment: Experiment) -> float:
+    def choose_step(case: CampaignCase, experiment: Experiment) -> float:
+        """Choose the step [s] found for the case's cell and method, else one for this case; at most the stable one."""
         method = choose_method(experiment.rig, experiment.method)
-        step = of_cell(*case.levels.items()).get(method) or _choose_method(experiment)[1]
-        limit = max(longest_step(numbers_under(experiment.rig, experiment.load)), LONGEST_STEP / FINEST)
+        step = cell_steps(*case.levels.items()).get(method)
+        if step is None:  # no scout machine has this method
+            _, step = _choose_method_and_step(experiment)
+        stable_step = longest_step(loaded_rig_numbers(experiment.rig, experiment.load))
+        limit = max(stable_step, LONGEST_STEP / MAX_STEP_REFINEMENT)
         return step if step <= limit else dividing_step(experiment.rate * oversampling(experiment), limit)
 
-    return step_of
+    return choose_step
 
 
 def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step [s] within `limit` [s] that divides the interval of outputs at `rate` [Hz]."""
+    """Compute the longest step [s] up to `limit` [s] that divides the interval between outputs at `rate` [Hz]."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 
-def _choose_method(experiment: Experiment) -> tuple[str, float]:
-    """Find the method and step [s] that `integrate` chooses over the first seconds of an experiment."""
-    path = trajectory(replace(experiment, duration=min(experiment.duration, SCOUTED), leaks=()), ())
-    return path.method, path.step
+def _choose_method_and_step(experiment: Experiment) -> tuple[str, float]:
+    """Return the method and step [s] that `integrate` chooses over the first seconds of an experiment."""
+    run = integrate_run(replace(experiment, duration=min(experiment.duration, SCOUT_SECONDS), leaks=()), ())
+    return run.method, run.step

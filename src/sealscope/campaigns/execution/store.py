@@ -1,4 +1,4 @@
-"""A campaign's folder: the rows that belong to a plan, and the inputs they were made from."""
+"""A campaign's folder: the rows that belong to a plan, and the head, which lists the inputs of these rows."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sealscope.campaigns.cases.case import CaseInputs, cases_of, code_key, digest, world
+from sealscope.campaigns.cases.case import CaseInputs, code_key, digest, list_cases, shared_inputs
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
+from sealscope.campaigns.plans.detectors import DIAGNOSE, parse_detector_name
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.diagnosis.detectors.registry import PlugIn, detectors
 from sealscope.errors import InputError, UnreadableFile
@@ -20,8 +20,8 @@ from sealscope.storage.folders import make_folder
 from sealscope.storage.opening import open_inner
 from sealscope.storage.plain_values import parse_json
 
-#: What rows of one folder must share, and how messages call it.
-_SAME = {
+#: Entries of the head that all rows of a folder share -> their names in messages.
+_SHARED_ENTRIES = {
     "format": "form of rows",
     "name": "campaign",
     "world": "rig, bench, length, onset or seed",
@@ -32,12 +32,12 @@ _SAME = {
     "plug_ins": "detectors of other distributions",
     "views": "channels that its detectors see",
 }
-#: The form of a row: 3 since rows hold no operating point.
+#: Version of the format of rows; 3 since rows contain no operating point.
 FORMAT = 3
+#: Name of the head's file, and of the folder's content in messages.
 HEAD, WHAT = "campaign.json", "a campaign"
-#: Largest head [bytes].
-_LARGEST_HEAD = 1_000_000
-#: How rows are made unless in batches.
+_MAX_HEAD_BYTES = 1_000_000
+#: Mode of rows that are not made in batches.
 RUN_BY_RUN = "run by run"
 
 
@@ -45,8 +45,8 @@ RUN_BY_RUN = "run by run"
 class CampaignProgress:
     """Progress of a campaign.
 
-    `records` in the plan, how many are `done`, and `failed` of these; `seconds`: processor time of a record on
-    average, None where none is done.
+    `records`: number of records in the plan; `done`: those that have a row; `failed`: those whose row is an error;
+    `seconds`: mean processor time of a record, None if no record has a result.
     """
 
     records: int
@@ -60,37 +60,39 @@ class CampaignProgress:
         return self.done == self.records
 
 
-def made_from(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
-    """Collect the inputs of a campaign's rows as plain values; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
-    detectors = [plan_detector(name) for name in plan.detectors]
-    searching = any(detector.scorer is None for detector in detectors)  # its verdict follows from the probability
-    assumed = plan.assumed
+def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
+    """Collect the inputs on which a campaign's rows depend; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
+    detectors = [parse_detector_name(name) for name in plan.detectors]
+    # scores of scorers depend neither on the false-alarm probability nor on the assumed rig
+    has_verdicts = any(detector.scorer is None for detector in detectors)
+    assumed_values = {name: repr(value) for name, value in plan.assumed.present_values().items()}
     return {
         "format": FORMAT,
         "name": plan.name,
         "title": plan.title,
-        "world": world(plan),
+        "world": shared_inputs(plan),
         "mode": mode,
         "code": code_key(),
-        "false_alarm_within": plan.false_alarm if searching else None,
-        "assumed": digest({name: repr(value) for name, value in assumed.present().items()}) if searching else None,
+        "false_alarm_within": plan.false_alarm if has_verdicts else None,
+        "assumed": digest(assumed_values) if has_verdicts else None,
         "plug_ins": _plug_ins(plan),
         "views": {view: list(plan.views.get(view, ())) for view in sorted({detector.view for detector in detectors})},
-        "version": _version(),
+        "version": _installed_version(),
     }
 
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
-    """Collect the detectors of other distributions that a plan runs, each with a hash of its source."""
-    run = {detector.base for name in plan.detectors if (detector := plan_detector(name)).scorer is None}
+    """Collect the plug-in detectors that a plan runs, each with a hash of its source; `diagnose` runs all of them."""
+    bases = {detector.base for name in plan.detectors if (detector := parse_detector_name(name)).scorer is None}
     return {
         name: plug_in.fingerprint
         for name, plug_in in detectors().items()
-        if isinstance(plug_in, PlugIn) and (name in run or DIAGNOSE in run)
+        if isinstance(plug_in, PlugIn) and (name in bases or DIAGNOSE in bases)
     }
 
 
-def _version() -> str:
+def _installed_version() -> str:
+    """Return the version of the installed package, or `unknown`."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -100,47 +102,47 @@ def _version() -> str:
 
 
 def read_rows(folder: Path) -> dict[str, CaseRow]:
-    """Read rows by case id, the last of each (`storage.rows.read_rows`)."""
+    """Read the last row of each case, by case id (`storage.rows.read_rows`)."""
     return rows.read_rows(folder, CaseRow.from_dict, WHAT)
 
 
-def rows_of(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
-    """Read the folder's rows that belong to the plan, by case id in rising order.
+def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
+    """Read the rows of the plan's cases from its folder, by case id in rising order.
 
-    Rows that lack one of the plan's detectors are left out. Raises InputError for rows of another plan, UnreadableFile
-    for a row whose inputs differ from its case's.
+    Rows without a result of one of the plan's detectors are left out. Raises InputError for rows of another plan,
+    UnreadableFile for a row whose inputs differ from its case's.
     """
     rows_by_id = read_rows(folder)
     if rows_by_id:
-        _check_same(folder, head(folder) or {}, made_from(plan), ("mode", "code"))
+        _check_same_inputs(folder, read_head(folder) or {}, collect_row_inputs(plan), ignored=("mode", "code"))
     detectors = set(plan.detectors)
-    of_plan: dict[str, CaseRow] = {}
-    for case in sorted(cases_of(plan), key=lambda case: case.id):
+    plan_rows: dict[str, CaseRow] = {}
+    for case in sorted(list_cases(plan), key=lambda case: case.id):
         row = rows_by_id.get(case.id)
         if row is None:
             continue
         if any(getattr(row, field.name) != getattr(case, field.name) for field in fields(CaseInputs)):
             place = folder / rows.ROWS
-            raise UnreadableFile(f"a row must say the inputs of its case, got others of {case.id} ({place})")
+            raise UnreadableFile(f"a row must state the inputs of its case, got others for {case.id} ({place})")
         if row.error is not None or detectors <= set(row.scores):
-            of_plan[row.id] = row
-    return of_plan
+            plan_rows[row.id] = row
+    return plan_rows
 
 
-def progress_of(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
-    """Compute the progress of the campaign in the folder."""
-    done = rows_of(plan, folder).values()
+def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
+    """Read a campaign's rows and count those done and failed."""
+    done = read_plan_rows(plan, folder).values()
     seconds = [row.seconds for row in done if row.error is None]
     mean = sum(seconds) / len(seconds) if seconds else None
     return CampaignProgress(plan.size, len(done), len(done) - len(seconds), mean)
 
 
-def head(folder: Path) -> dict[str, Any] | None:
-    """Read the inputs of the folder's campaign, None where there is none yet."""
+def read_head(folder: Path) -> dict[str, Any] | None:
+    """Read the head of the folder's campaign; return None if there is no campaign yet."""
     path = folder / HEAD
     try:
         with open_inner(path, "a campaign's head") as file:
-            tree = parse_json(file.read(_LARGEST_HEAD))
+            tree = parse_json(file.read(_MAX_HEAD_BYTES))
     except FileNotFoundError:
         return None
     except InputError:
@@ -152,21 +154,23 @@ def head(folder: Path) -> dict[str, Any] | None:
     return tree
 
 
-def begin(folder: Path, source: Mapping[str, Any]) -> None:
-    """Make the folder a campaign's, or continue in it; raise InputError where it holds rows of another campaign."""
+def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
+    """Write the head of a new or continued campaign; raise InputError if the folder has rows from other inputs."""
     make_folder(folder)
-    before = head(folder) or {}
+    existing = read_head(folder) or {}
     if (folder / rows.ROWS).is_file():
-        open_inner(folder / rows.ROWS, f"{WHAT}'s file of rows", "ab+").close()
-        _check_same(folder, before, source)
+        open_inner(folder / rows.ROWS, f"{WHAT}'s file of rows", "ab+").close()  # raises if no row can be appended
+        _check_same_inputs(folder, existing, row_inputs)
     with atomic_write(folder / HEAD) as temporary:
-        temporary.write_text(json.dumps(source, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(row_inputs, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _check_same(folder: Path, before: Mapping[str, Any], source: Mapping[str, Any], but: Collection[str] = ()) -> None:
-    """Raise InputError where the inputs `before` differ from `source`, except in the entries `but`."""
-    for key, name in _SAME.items():
-        if key not in but and before.get(key) != source[key]:
+def _check_same_inputs(
+    folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
+) -> None:
+    """Raise InputError if the `existing` head differs from `row_inputs` in an entry that is not `ignored`."""
+    for key, name in _SHARED_ENTRIES.items():
+        if key not in ignored and existing.get(key) != row_inputs[key]:
             raise InputError(
                 f"a campaign continues only with the same {name}: its rows would not belong together; choose "
                 f"another folder or remove this one ({folder})"

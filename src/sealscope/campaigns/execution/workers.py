@@ -1,4 +1,4 @@
-"""Items carried out by processes of this machine, or by a Dask cluster; the death of one costs its item alone."""
+"""Run a task on many items in processes of this machine or on a Dask cluster, and survive processes that die."""
 
 from __future__ import annotations
 
@@ -19,106 +19,113 @@ from sealscope.errors import InputError, MissingExtra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-#: Environment of a process: one thread for linear algebra, as processes run side by side, and no module from the
+#: Environment of a process: one thread for linear algebra, as there is a process per core, and no modules from the
 #: working folder, which may be hostile.
 _ENVIRONMENT = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "PYTHONSAFEPATH"), "1"
 )
-#: Items handed out ahead of each worker of a cluster, so that it never waits.
-_AHEAD = 4
+#: Items queued per worker of a cluster, so that it never waits.
+_QUEUED_PER_WORKER = 4
 
 
-def carried_out(
+def iter_results(
     task: Callable[[Item], Result], items: Iterable[Item], jobs: int, cluster: str | None = None
 ) -> Generator[tuple[Item, Result | None], None, None]:
-    """Yield each item and its result as it ends: from `jobs` spawned processes, or from this one alone (1).
+    """Run `task` on each item and yield item and result as they finish.
 
-    `cluster`: address of a Dask scheduler, whose workers are taken instead. An item is taken from `items` when a
-    process is free for it. `task` and items are pickled; `task` goes to each process once. An item whose process dies,
-    by a hand or the memory's end, is tried once more after all others, alone, and has then the result None. Processes
-    ignore the interrupt, and end when the generator is closed or the parent ends, however that ends. Raises what `task`
-    raised; MissingExtra without Dask, InputError where no scheduler answers or a worker has another Sealscope.
+    `jobs`: number of spawned processes, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
+    are used instead. Items are taken from `items` when a process is free. Items and `task` are pickled, `task` once per
+    process. If a process dies, for example killed for its memory, its item is run once more after all others, alone; a
+    second death gives the result None. Processes ignore the keyboard interrupt and end with the generator or the
+    parent. Raises the exceptions of `task`, MissingExtra without Dask, and InputError if no scheduler answers or a
+    worker has another version of Sealscope.
     """
     if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
         return
-    waiting, died, tried_again = iter(items), list[Item](), False
+    waiting, lost_items, is_retry = iter(items), list[Item](), False
     idle: list[Executor] = []
     busy: dict[Future[Result], tuple[Executor, Item]] = {}
-    with _processes(task, jobs) if cluster is None else _on_cluster(task, cluster) as pools:
+    with _local_processes(task, jobs) if cluster is None else _cluster_workers(task, cluster) as pools:
         while True:
-            for item in islice(waiting, (1 if tried_again else pools.most) - len(busy)):
-                pool = idle.pop() if idle else pools.new()
+            for item in islice(waiting, (1 if is_retry else pools.max_items) - len(busy)):
+                pool = idle.pop() if idle else pools.start_pool()
                 try:
                     future = pools.submit(pool, item)
-                except pools.death:  # of an idle process
-                    pool = pools.new()
+                except pools.death:  # the process died while idle
+                    pool = pools.start_pool()
                     future = pools.submit(pool, item)
                 busy[future] = pool, item
             if not busy:
-                if tried_again or not died:
+                if is_retry or not lost_items:
                     return
-                waiting, tried_again = iter(died), True
+                waiting, is_retry = iter(lost_items), True
                 continue
             for future in wait(busy, return_when=FIRST_COMPLETED).done:
                 pool, item = busy.pop(future)
                 try:
                     result = future.result()
                 except pools.death:
-                    if tried_again:
+                    if is_retry:
                         yield item, None
                     else:
-                        died.append(item)
+                        lost_items.append(item)
                     continue
                 idle.append(pool)
                 yield item, result
 
 
-def in_order(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | None]]:
-    """Yield results of `carried_out` in the order of the items."""
+def iter_results_in_order(
+    jobs: int, task: Callable[[Item], Result], items: Sequence[Item]
+) -> Iterator[tuple[Item, Result | None]]:
+    """Run `task` on each item in `jobs` processes, and yield items and results in the order of the items."""
     results: dict[int, Result | None] = {}
-    place = 0
-    for (number, _), result in carried_out(partial(_numbered, task), enumerate(items), jobs):
+    next_number = 0
+    for (number, _), result in iter_results(partial(_run_numbered, task), enumerate(items), jobs):
         results[number] = result
-        while place in results:
-            yield items[place], results.pop(place)
-            place += 1
+        while next_number in results:
+            yield items[next_number], results.pop(next_number)
+            next_number += 1
 
 
 class _Pools(NamedTuple):
-    """Pools of workers: at most `most`, each from `new`, takes items by `submit`; a process's end raises `death`."""
+    """Pools of workers. `start_pool` starts one; `submit` queues an item in it; a process that dies raises `death`.
 
-    new: Callable[[], Executor]
-    most: int
+    `max_items`: limit of items that run or are queued.
+    """
+
+    start_pool: Callable[[], Executor]
+    max_items: int
     submit: Callable[[Executor, Any], Future[Any]]
     death: type[Exception]
 
 
 @contextmanager
-def _processes(task: Callable[[Any], Any], most: int) -> Iterator[_Pools]:
-    """Start processes of this machine, each a pool of its own, so that one that dies breaks no other."""
+def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Pools]:
+    """Provide processes of this machine; each is a separate pool, as a dead process breaks its whole pool."""
     context = get_context("spawn")
-    lifeline, far_end = context.Pipe(duplex=False)
+    lifeline, parent_end = context.Pipe(duplex=False)
     pools: list[Executor] = []
 
-    def new() -> Executor:
-        with _worker_environment():  # a process starts with what it is given first
-            pools.append(ProcessPoolExecutor(1, context, _begin, (task, lifeline)))
-            pools[-1].submit(os.getpid)
+    def start_process() -> Executor:
+        """Start a process, as a pool of one."""
+        with _worker_environment():
+            pools.append(ProcessPoolExecutor(1, context, _initialise_worker, (task, lifeline)))
+            pools[-1].submit(os.getpid)  # the first item starts the process, within the environment
         return pools[-1]
 
     try:
-        yield _Pools(new, most, lambda pool, item: pool.submit(_carry_out, item), BrokenProcessPool)
+        yield _Pools(start_process, max_items, lambda pool, item: pool.submit(_run_task, item), BrokenProcessPool)
     finally:
-        far_end.close()
+        parent_end.close()
         lifeline.close()
         for pool in pools:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextmanager
-def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
-    """Use the workers of the Dask scheduler at `address`, which are one pool."""
+def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
+    """Provide the workers of the Dask scheduler at `address` as one pool."""
     try:
         import distributed
     except ImportError:
@@ -139,30 +146,33 @@ def _on_cluster(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
             raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})") from None
         if keys != {code_key()}:
             raise InputError(f"the cluster's workers must have this machine's Sealscope, got another ({address})")
-        pool, most = client.get_executor(pure=False), _AHEAD * sum(client.nthreads().values())
-        yield _Pools(lambda: pool, most, lambda pool, item: pool.submit(task, item), dask.KilledWorker)
+        pool, max_items = client.get_executor(pure=False), _QUEUED_PER_WORKER * sum(client.nthreads().values())
+        yield _Pools(lambda: pool, max_items, lambda pool, item: pool.submit(task, item), dask.KilledWorker)
 
 
-def _numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
+def _run_numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
+    """Run `task` on the item of a (number, item) pair."""
     return task(numbered[1])
 
 
-#: In a worker process: what it carries out its items with.
+#: The task of this worker process, set by `_initialise_worker`.
 _task: list[Callable[[Any], Any]] = []
 
 
-def _begin(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
+def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
+    """Initialise a worker process: store its task, ignore the interrupt, and end the process with its parent."""
     _task[:] = [task]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
 
 
-def _carry_out(item: Any) -> Any:
+def _run_task(item: Any) -> Any:
+    """Run this process's task on an item."""
     return _task[0](item)
 
 
-def _end_with(lifeline: Connection[Any, Any]) -> None:
-    """End this process when the parent closes its end of the pipe, or has ended."""
+def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
+    """Exit this process when its parent closes the other end of the pipe or ends."""
     with suppress(EOFError, OSError):
         lifeline.recv_bytes()
     os._exit(1)
@@ -170,7 +180,7 @@ def _end_with(lifeline: Connection[Any, Any]) -> None:
 
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Set `_ENVIRONMENT` for processes that start in the block, where the caller has not chosen otherwise."""
+    """Set `_ENVIRONMENT` for processes started in the block, except for variables that are set already."""
     added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
     os.environ.update(added)
     try:
@@ -186,5 +196,5 @@ def cores() -> int:
 
 
 def process_count(jobs: int | None) -> int:
-    """Choose the number of processes: `jobs`, at most two a core; by default one a core."""
+    """Choose the number of processes: `jobs` up to two per core, by default one per core."""
     return min(jobs or cores(), 2 * cores())

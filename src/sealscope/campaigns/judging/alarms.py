@@ -1,4 +1,4 @@
-"""Alarms of each detector on records that have something in common: a size of leak, levels, a fault, a family."""
+"""Count each detector's alarms on groups of records: by size of the leak, cell of the factors, fault or family."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sealscope.campaigns.cases.case import FAMILY
-from sealscope.campaigns.cases.row import cause_of, covers, named_cause
-from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, grouped, without_fault
+from sealscope.campaigns.cases.row import expected_cause, matches_cause, named_cause
+from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, drop_other_faults, group_by
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
 
-#: Two detectors that do not look, beside which the others are shown.
+#: Reference detectors that ignore the record; they are listed for comparison.
 ALWAYS, NEVER = "always fire", "never fire"
-#: What stands for all families together, and for all laws of a leak.
+#: Labels of all families together, and of all laws of a leak together.
 ALL, ANY_LAW = "all", "any"
 
 
 @dataclass(frozen=True)
-class AlarmShares:
-    """Alarms of one detector on records that have something in common.
+class AlarmFractions:
+    """Fractions of alarms of one detector on a group of records.
 
-    `leak_lpm` (0: no leak, nan: any) and `law` of the leak, `fault` that is no leak, `family` of machines, `levels` of
-    the factors: what they have in common, where it was asked for. `coverage`: how often a stated interval holds the
-    flow that there was; `false_alarm` and `per_hour`: of that detector on its leak-free records, None where there are
-    none, or no hours; `named`: alarms that name the fault's cause, alone or with the piston, None where the detector
-    names no cause; `failed`: records without a result, which are among those that cannot be told.
+    `leak_lpm` (0: no leak, nan: any), `law`, `fault`, `family` and `levels` define the group. `cannot_tell` includes
+    the `failed` records, which have no result. `coverage`: fraction of stated intervals that contain the true flow;
+    `false_alarm` and `per_hour`: false alarms on the detector's leak-free records, None if there are no such records
+    or no hours; `named`: fraction of records with an alarm that names the true cause (`matches_cause`), None if the
+    detector names no causes.
     """
 
     detector: str
@@ -46,89 +46,96 @@ class AlarmShares:
 
     @property
     def leak(self) -> str:
-        """Size and law of the leak, in words."""
+        """Size and law of the leak as text."""
         return f"{self.leak_lpm:g} {self.law}" if self.leak_lpm else "no leak"
 
     @property
     def informedness(self) -> float:
-        """Share of alarms less that of false alarms, 0 for chance."""
+        """Fraction of alarms minus that of false alarms (Youden's J), 0 for a detector that guesses."""
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
 @dataclass(frozen=True)
 class Alarms:
-    """Counts of the alarms in the verdicts of each detector, with intervals of `confidence`."""
+    """Summarises the alarms in each detector's verdicts; proportions have intervals of `confidence`."""
 
     verdicts: Verdicts
     confidence: float
 
     def _with_references(self) -> Verdicts:
-        """Append the verdicts of two detectors that do not look: one always fires, one never."""
+        """Append the verdicts of the two reference detectors to those of the plan's detectors."""
         rows = [record.row for record in next(iter(self.verdicts.values()), ())]
-        always = {name: [JudgedRow(row, verdict, None) for row in rows]
-                  for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
-        return {**self.verdicts, **always}
+        references = {name: [JudgedRow(row, verdict, None) for row in rows]
+                      for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
+        return {**self.verdicts, **references}
 
-    def by_size(self, hours: float | None, together: bool = False) -> Iterator[AlarmShares]:
-        """Yield alarms by size, or of all sizes `together`, with false alarms; those of the references last.
+    def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
+        """Yield alarms for each size of leak, or `pooled` over all sizes; the reference detectors come last.
 
-        A detector without a record with a leak has one row of size 0, with no detection.
+        `hours`: operating time of a record, for false alarms per hour. Without leaky records, a detector has one row of
+        size 0 with no detections.
         """
-        for name, records in without_fault(self._with_references()).items():
-            free, leaky = ([record for record in records if bool(record.size) == leaks] for leaks in (False, True))
-            alarms = self._share(record.alarm for record in free) if free else None
-            hourly = events_per_hour(alarms.count, hours * alarms.n, self.confidence) if alarms and hours else None
-            for size, group in grouped(leaky or free, lambda record: math.nan if together else record.size).items():
-                shares = self._shares(name, group, leak_lpm=size)
-                detected = shares.alarms if leaky else self._share(())
-                yield replace(shares, alarms=detected, false_alarm=alarms, per_hour=hourly)
+        for name, records in drop_other_faults(self._with_references()).items():
+            free = [record for record in records if not record.size]
+            leaky = [record for record in records if record.size]
+            false_alarm = self._proportion(record.alarm for record in free) if free else None
+            per_hour = None
+            if false_alarm and hours:
+                per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, self.confidence)
+            for size, group in group_by(leaky or free, lambda record: math.nan if pooled else record.size).items():
+                fractions = self._summarise(name, group, leak_lpm=size)
+                detected = fractions.alarms if leaky else self._proportion(())
+                yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
-    def by_cell(self) -> Iterator[AlarmShares]:
-        """Yield the alarms at each size in each cell of the factors."""
-        for name, records in without_fault(self.verdicts).items():
-            cells = grouped(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
+    def by_cell(self) -> Iterator[AlarmFractions]:
+        """Yield the alarms for each size of leak in each cell of the factors."""
+        for name, records in drop_other_faults(self.verdicts).items():
+            cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
             for (size, _), group in cells.items():
-                yield self._shares(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
+                yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
-    def by_fault(self) -> Iterator[AlarmShares]:
-        """Yield the alarms on records with each fault that is no piston leak."""
+    def by_fault(self) -> Iterator[AlarmFractions]:
+        """Yield the alarms for each fault other than a piston leak."""
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
-            for fault, group in grouped(faulty, lambda record: record.row.fault).items():
-                yield self._shares(name, group, fault=fault)
+            for fault, group in group_by(faulty, lambda record: record.row.fault).items():
+                yield self._summarise(name, group, fault=fault)
 
-    def by_family(self) -> Iterator[AlarmShares]:
-        """Yield the alarms by family, size and law; all families together first, none where there are no families.
+    def by_family(self) -> Iterator[AlarmFractions]:
+        """Yield the alarms for each family, size and law, with all families together first.
 
-        Each size has its laws apart, and together where there are several.
+        A size with several laws also has a row of all its laws. Without families nothing is yielded.
         """
-        for name, records in without_fault(self.verdicts).items():
+        for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)
-            families = grouped(members, lambda record: str(record.row.levels[FAMILY]))
-            for family, relatives in {ALL: records, **families}.items() if families else ():
-                for size, group in grouped(relatives, lambda record: record.size).items():
-                    laws = grouped(group, lambda record: record.row.law) if size else {}
-                    for law, of_law in laws.items() if len(laws) == 1 else {ANY_LAW: group, **laws}.items():
-                        yield self._shares(name, of_law, family=family, leak_lpm=size, law=law)
+            families = group_by(members, lambda record: str(record.row.levels[FAMILY]))
+            for family, family_records in {ALL: records, **families}.items() if families else ():
+                for size, group in group_by(family_records, lambda record: record.size).items():
+                    laws = group_by(group, lambda record: record.row.law) if size else {}
+                    by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}
+                    for law, law_records in by_law.items():
+                        yield self._summarise(name, law_records, family=family, leak_lpm=size, law=law)
 
-    def _share(self, flags: Iterable[bool]) -> Proportion:
+    def _proportion(self, flags: Iterable[bool]) -> Proportion:
+        """Count the true flags and return their proportion with its interval."""
         values = list(flags)
         return proportion(sum(values), len(values), self.confidence)
 
-    def _shares(self, detector: str, group: Sequence[JudgedRow], **common: Any) -> AlarmShares:
-        statements = [(record, record.statement) for record in group if record.statement is not None]
-        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
-        naming = [
-            record.alarm and covers(named_cause(statement), cause_of(record.row.fault))
-            for record, statement in statements
+    def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
+        """Compute the fractions of a group of records; `group_fields` are the fields that define the group."""
+        stating = [(record, record.statement) for record in group if record.statement is not None]
+        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in stating]
+        names_cause = [
+            record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
+            for record, statement in stating
         ]
-        silent = [False] * (len(group) - len(statements))
-        return AlarmShares(
+        without_statement = [False] * (len(group) - len(stating))
+        return AlarmFractions(
             detector=detector,
-            alarms=self._share(record.alarm for record in group),
-            cannot_tell=self._share(record.verdict == CANNOT_TELL for record in group),
-            coverage=self._share(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
-            named=self._share(naming + silent) if statements else None,
+            alarms=self._proportion(record.alarm for record in group),
+            cannot_tell=self._proportion(record.verdict == CANNOT_TELL for record in group),
+            coverage=self._proportion(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
+            named=self._proportion(names_cause + without_statement) if stating else None,
             failed=sum(record.row.error is not None for record in group),
-            **common,
+            **group_fields,
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sealscope.campaigns.judging.verdicts import Verdicts
 from sealscope.errors import InputError
-from sealscope.evaluation.pod import HitMiss, SizeDetection, by_size, fit_hit_miss, proven_size
+from sealscope.evaluation.pod import HitMiss, SizeDetection, detection_by_size, fit_hit_miss, proven_size
 from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 
 
@@ -16,8 +16,8 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 class DetectorPod:
     """One detector's probability of detection over the size of the leak.
 
-    `sizes`: the detection at each size; `curve`: the logistic curve through hits and misses, None where there is none,
-    for the reason `why`; `proven`: the smallest size found nine times in ten without a curve.
+    `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted,
+    with the reason in `why`; `proven`: smallest size whose detection probability is proven to be 90 %, without a curve.
     """
 
     detector: str
@@ -28,13 +28,13 @@ class DetectorPod:
 
     @property
     def description(self) -> str:
-        """Method of the curve's fit, or the reason why there is none."""
+        """Method of the curve's fit, or the reason why there is no curve."""
         return self.curve.estimator if self.curve else self.why
 
 
 @dataclass(frozen=True)
 class SizeRoc:
-    """One detector's ROC at one size of leak (nan: all sizes), against the leak-free records to judge."""
+    """One detector's ROC between the judged leak-free records and those with one size of leak (nan: all sizes)."""
 
     detector: str
     leak_lpm: float
@@ -42,14 +42,14 @@ class SizeRoc:
     area: Area
 
 
-def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield the probability of detection over the size, where there are leaks."""
+def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
+    """Yield each detector's probability of detection over the size of the leak, if there are leaky records."""
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:
             continue
         sizes, hits = [record.size for record in leaky], [record.alarm for record in leaky]
-        detections = by_size(sizes, hits, confidence)
+        detections = detection_by_size(sizes, hits, confidence)
         curve, why = None, ""
         try:
             curve = fit_hit_miss(sizes, hits)
@@ -58,18 +58,18 @@ def pods_of(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
         yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
 
 
-def rocs_of(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
-    """Yield curves over the scores, with no threshold; a record that cannot be judged counts as the lowest."""
+def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
+    """Yield ROC curves over each detector's scores; a record without a score ranks below all others."""
     for name, records in verdicts.items():
-        scores = [record.row.scores[name][0] if record.row.error is None else None for record in records]
-        lowest = min((score for score in scores if score is not None), default=None)
-        if lowest is None:
+        scores = [record.row.score(name) if record.row.error is None else None for record in records]
+        min_score = min((score for score in scores if score is not None), default=None)
+        if min_score is None:
             continue
         by_leak: dict[float, list[float]] = {}
         for record, score in zip(records, scores, strict=True):
-            by_leak.setdefault(record.size, []).append(lowest - 1.0 if score is None else score)
+            by_leak.setdefault(record.size, []).append(min_score - 1.0 if score is None else score)
         free = by_leak.pop(0.0, [])
         all_scores = [score for leaky in by_leak.values() for score in leaky]
-        for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):
+        for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes
             if min(len(free), len(leaky)) > 1:
                 yield SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence))

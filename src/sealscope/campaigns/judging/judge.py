@@ -9,11 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.alarms import Alarms, AlarmShares
-from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc, pods_of, rocs_of
-from sealscope.campaigns.judging.statements import NamedCauses, StatedErrors, causes_of, flow_errors, onset_errors
-from sealscope.campaigns.judging.verdicts import Thresholds, grouped, thresholds_of, verdicts_of, without_fault
-from sealscope.campaigns.plans.detectors import plan_detector
+from sealscope.campaigns.judging.alarms import AlarmFractions, Alarms
+from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc, iter_pods, iter_rocs
+from sealscope.campaigns.judging.statements import (
+    NamedCauses,
+    StatedErrors,
+    flow_errors,
+    iter_cause_confusions,
+    onset_errors,
+)
+from sealscope.campaigns.judging.verdicts import (
+    Thresholds,
+    collect_verdicts,
+    compute_thresholds,
+    drop_other_faults,
+    group_by,
+)
+from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import Promise
 
@@ -22,28 +34,28 @@ from sealscope.evaluation.thresholds import Promise
 class Judgement:
     """The statistics of a campaign's verdicts.
 
-    `table` by size, `overall` with all leaks together; `onsets`, `flows` and `causes`: of detectors that state them;
-    `thresholds`: of scorers, from `leak_free` records; `judged`: records that had a result; `failed`: rows that had
-    none (they are `cannot tell` for every detector); `cells`, `faults`, `families`: alarms by cell of the factors, by
-    fault that is no leak, by family of machines; `realised`: size -> mean and standard deviation of the flow the leaks
-    really had [L/min].
+    `thresholds`: thresholds of scorers, set from `leak_free` records; `judged`: number of records with a result;
+    `failed`: rows with an error, which are `cannot tell` for every detector; `table`: alarms by size of the leak;
+    `overall`: alarms of all sizes together; `onsets`, `flows`, `causes`: errors of the detectors that state them;
+    `cells`, `faults`, `families`: alarms by cell of the factors, by other fault, by family of machines;
+    `achieved_flows`: size -> mean and standard deviation of the simulated leak flow [L/min].
     """
 
     thresholds: Thresholds
     leak_free: int
     judged: int
     failed: tuple[CaseRow, ...]
-    table: tuple[AlarmShares, ...]
-    overall: tuple[AlarmShares, ...]
+    table: tuple[AlarmFractions, ...]
+    overall: tuple[AlarmFractions, ...]
     onsets: tuple[StatedErrors, ...]
     flows: tuple[StatedErrors, ...]
     causes: tuple[NamedCauses, ...]
     pods: tuple[DetectorPod, ...]
     rocs: tuple[SizeRoc, ...]
-    cells: tuple[AlarmShares, ...]
-    faults: tuple[AlarmShares, ...]
-    families: tuple[AlarmShares, ...]
-    realised: Mapping[float, tuple[float, float]]
+    cells: tuple[AlarmFractions, ...]
+    faults: tuple[AlarmFractions, ...]
+    families: tuple[AlarmFractions, ...]
+    achieved_flows: Mapping[float, tuple[float, float]]
 
 
 def judge(
@@ -57,26 +69,22 @@ def judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
-    """Compute verdicts and figures of all rows to judge.
+    """Compute the verdicts on all rows to judge, and their statistics.
 
-    A detector's verdict is its own, or its score's against a threshold. The threshold is the one in `limits`, else the
-    scorer's, else that of the leak-free rows of the same duty (`thresholds_of`), which `limits` turn off. `onset_s`
-    [s]: true onset in leaky records, `hours`: operating time of a record; without them there are no errors of onsets
-    and no alarms per hour. Raises InputError where there is no row to judge.
+    A detector states its verdict, or its score is compared with a threshold. Given `limits`, only these are used;
+    otherwise a scorer's fixed threshold, or the one from leak-free rows of the same duty (`compute_thresholds`).
+    `onset_s` [s]: true onset in leaky records; `hours`: operating time of a record; without them no errors of onsets
+    and no alarms per hour are computed. Raises InputError if there is no row to judge.
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    thresholds = {} if limits is not None else thresholds_of(rows, detectors, false_alarm, promise, confidence)
+    thresholds = {} if limits is not None else compute_thresholds(rows, detectors, false_alarm, promise, confidence)
     if limits is None:
-        scorers = {name: plan_detector(name).scorer for name in detectors}
-        limits = {
-            name: scorer.threshold
-            for name, scorer in scorers.items()
-            if scorer is not None and scorer.threshold is not None
-        }
-    verdicts = verdicts_of(judged, detectors, limits, thresholds)
-    of_leaks = without_fault(verdicts)
+        scorers = {name: scorer for name in detectors if (scorer := parse_detector_name(name).scorer) is not None}
+        limits = {name: scorer.threshold for name, scorer in scorers.items() if scorer.threshold is not None}
+    verdicts = collect_verdicts(judged, detectors, limits, thresholds)
+    leak_verdicts = drop_other_faults(verdicts)
     alarms = Alarms(verdicts, confidence)
     return Judgement(
         thresholds=thresholds,
@@ -84,24 +92,25 @@ def judge(
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
         table=tuple(alarms.by_size(hours)),
-        overall=tuple(alarms.by_size(hours, together=True)),
-        onsets=() if onset_s is None else tuple(onset_errors(of_leaks, onset_s, confidence)),
-        flows=tuple(flow_errors(of_leaks, confidence)),
-        causes=tuple(causes_of(verdicts, confidence)),
-        pods=tuple(pods_of(of_leaks, confidence)),
-        rocs=tuple(rocs_of(of_leaks, confidence)),
+        overall=tuple(alarms.by_size(hours, pooled=True)),
+        onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s, confidence)),
+        flows=tuple(flow_errors(leak_verdicts, confidence)),
+        causes=tuple(iter_cause_confusions(verdicts, confidence)),
+        pods=tuple(iter_pods(leak_verdicts, confidence)),
+        rocs=tuple(iter_rocs(leak_verdicts, confidence)),
         cells=tuple(alarms.by_cell()),
         faults=tuple(alarms.by_fault()),
         families=tuple(alarms.by_family()),
-        realised=_realised([row for row in judged if not row.fault]),
+        achieved_flows=_achieved_flows([row for row in judged if not row.fault]),
     )
 
 
-def _realised(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    realised = {}
-    for size, group in grouped((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
+def _achieved_flows(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
+    """Compute the mean and the standard deviation of the simulated leak flow [L/min] for each size of leak."""
+    achieved = {}
+    for size, group in group_by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
         flows = [row.flow_lpm for row in group if row.flow_lpm is not None]
         if flows:
-            spread = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
-            realised[size] = (float(np.mean(flows)), spread)
-    return realised
+            standard_deviation = float(np.std(flows, ddof=1)) if len(flows) > 1 else math.nan
+            achieved[size] = (float(np.mean(flows)), standard_deviation)
+    return achieved

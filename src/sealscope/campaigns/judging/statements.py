@@ -1,15 +1,16 @@
-"""Statements of detectors against the truth: the onset of the leak, its size, its cause."""
+"""Compare detectors' statements with the truth: onset, flow and cause of the leak."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import numpy as np
 
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, cause_of, covers, named_cause
-from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, grouped
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, expected_cause, matches_cause, named_cause
+from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.evaluation.binomial import Proportion, proportion
 from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
 from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
@@ -17,9 +18,9 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 
 @dataclass(frozen=True)
 class StatedErrors:
-    """Errors of what one detector states at one size of leak (0: leak-free records).
+    """Errors of one detector's estimates at one size of leak (0: leak-free records).
 
-    Of the onset [s] over its alarms, or of the flow over all records, alarm or not.
+    They are errors of the onset [s] in its alarms, or of the flow in all records.
     """
 
     detector: str
@@ -29,9 +30,9 @@ class StatedErrors:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """Counts of the causes that one detector names, by true cause; `none` without leak and fault.
+    """Confusion matrix of the true causes and those that one detector names; `none`: neither leak nor fault.
 
-    `covered`: records for which it names the true cause, alone or with the one that no channel tells from it.
+    `covered`: fraction of records for which it names the true cause, also as part of an ambiguous one.
     """
 
     detector: str
@@ -40,40 +41,39 @@ class NamedCauses:
 
 
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
-    """Yield, for detectors that search for the onset, its error over the alarms, by size."""
+    """Yield the errors of the onset in the alarms, by detector and size of leak, for detectors that estimate it."""
     for name, records in verdicts.items():
-        for size, group in grouped((record for record in records if record.size > 0 and record.alarm), _size).items():
+        for size, group in group_by(
+            (record for record in records if record.size > 0 and record.alarm), attrgetter("size")
+        ).items():
             estimates = [
                 (onset, onset_s, None if record.statement is None else record.statement.onset_interval_s)
                 for record in group
-                if (onset := record.row.scores[name][1]) is not None
+                for _score, onset in [record.row.scores[name]]
+                if onset is not None
             ]
-            yield from _errors(name, size, estimates, confidence)
+            yield from _iter_errors(name, size, estimates, confidence)
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield, for detectors that state a flow, its errors against the record's true flow, by size."""
+    """Yield the errors of the leak flow, by detector and size of leak, for detectors that estimate it."""
     for name, records in verdicts.items():
-        for size, group in grouped(records, _size).items():
+        for size, group in group_by(records, attrgetter("size")).items():
             estimates = [
                 (record.statement.leak_lpm, record.flow_lpm, record.statement.leak_interval_lpm)
                 for record in group
                 if record.statement is not None
             ]
-            yield from _errors(name, size, estimates, confidence)
+            yield from _iter_errors(name, size, estimates, confidence)
 
 
-def _size(record: JudgedRow) -> float:
-    return record.size
-
-
-def _errors(
+def _iter_errors(
     detector: str,
     leak_lpm: float,
     stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of (estimate, truth, interval), where there is any estimate."""
+    """Yield the errors of the `stated` (estimate, truth, interval), or nothing if all estimates are missing."""
     estimates = [math.nan if value is None else value for value, _, _ in stated]
     if np.isfinite(estimates).any():
         low, high = zip(*((math.nan, math.nan) if ends is None else ends for _, _, ends in stated), strict=True)
@@ -81,25 +81,29 @@ def _errors(
         yield StatedErrors(detector, leak_lpm, estimate_errors(estimates, truth, low, high, confidence))
 
 
-def causes_of(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
-    """Count the causes that detectors name, where there are faults.
+def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
+    """Yield the confusion of true and named causes of each detector that names any, if the records have faults.
 
-    A record with a leak and another fault is left out; one that failed is `cannot tell`.
+    A record with a leak and another fault has two true causes and is left out; a failed one counts as `cannot tell`.
     """
     for name, records in verdicts.items():
-        single = [record for record in records if not (record.size > 0 and record.row.fault)]
-        other_causes = sorted({cause_of(record.row.fault) for record in single if record.row.fault})
-        if not other_causes or not any(name in record.row.statements for record in single):
+        single_cause_records = [record for record in records if not (record.size > 0 and record.row.fault)]
+        other_causes = sorted({expected_cause(record.row.fault) for record in single_cause_records if record.row.fault})
+        if not other_causes or not any(name in record.row.statements for record in single_cause_records):
             continue
-        truth = [_true_cause(record) for record in single]
+        truth = [_true_cause(record) for record in single_cause_records]
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
-        named_causes = [CANNOT_TELL if record.statement is None else named_cause(record.statement) for record in single]
+        named_causes = [
+            CANNOT_TELL if record.statement is None else named_cause(record.statement)
+            for record in single_cause_records
+        ]
         causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})
-        covered = proportion(sum(map(covers, named_causes, truth)), len(truth), confidence)
+        covered = proportion(sum(map(matches_cause, named_causes, truth)), len(truth), confidence)
         yield NamedCauses(name, confusion_matrix(truth, named_causes, causes, confidence), covered)
 
 
 def _true_cause(record: JudgedRow) -> str:
+    """Return the true cause of a record: piston leak, the cause of its fault, or none."""
     if record.size > 0:
         return PISTON_LEAK
-    return cause_of(record.row.fault) if record.row.fault else NO_CAUSE
+    return expected_cause(record.row.fault) if record.row.fault else NO_CAUSE

@@ -1,4 +1,4 @@
-"""A judgement as tables, and the files of a campaign's result: the same rows give the same bytes."""
+"""Convert a judgement to tables and write them as a campaign's result files; equal rows give equal bytes."""
 
 from __future__ import annotations
 
@@ -17,107 +17,113 @@ from sealscope.storage.csv_file import write_csv
 Value = str | float | int | None
 #: Name of a column -> value; every row of a table has the same columns.
 TableRow = dict[str, Value]
-_SHARE = ("count", "of", "fraction", "low", "high")
+#: Columns of a proportion.
+_PROPORTION = ("count", "of", "fraction", "low", "high")
 
 
 @dataclass(frozen=True)
 class PriorKnowledge:
-    """A detector's knowledge besides the recording.
+    """The information that a detector is given.
 
-    `onset`: whether it knew the true onset of the leak; `channels`: those it saw; `rig`: the rig that it assumes, ""
-    for none.
+    `onset`: whether it is given the true onset of the leak; `channels`: the channels it sees; `rig`: the rig that it
+    assumes, "" for none.
     """
 
     onset: bool
     channels: tuple[str, ...]
     rig: str
 
-    def plain(self) -> TableRow:
-        """Format the knowledge for a table."""
+    def as_row(self) -> TableRow:
+        """Convert the fields to cells of a table."""
         return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
 
 
 @cache
-def _columns() -> dict[str, dict[str, str]]:
+def _table_layouts() -> dict[str, dict[str, str]]:
+    """Load `tables.toml`: table -> column -> path of its content."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def attribute_of(source: Any, path: str) -> Any:
-    """Find an attribute by its path through mappings and tuples; None where one on the way is None."""
+def resolve_attribute(source: Any, path: str) -> Any:
+    """Follow a dotted path of attributes, mapping keys and tuple indices; return None if a value on the way is None."""
     for name in path.split("."):
         if source is None:
             return None
-        source = (
-            source[name]
-            if isinstance(source, Mapping)
-            else source[int(name)]
-            if name.isdigit()
-            else getattr(source, name)
-        )
+        if isinstance(source, Mapping):
+            source = source[name]
+        else:
+            source = source[int(name)] if name.isdigit() else getattr(source, name)
     return source
 
 
-def _cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the cells of one column of `tables.toml`: one, or several by name."""
-    *how, path = content.split(" ")
-    value = attribute_of(row, path)
+def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
+    """Build the cells of one column of `tables.toml`; a proportion and the levels take several cells.
+
+    `content`: flags, and the path of the value. Flags: "share" for a proportion, with "stated" empty if it counts no
+    records; "size" for a size of leak, nan for any size.
+    """
+    *flags, path = content.split(" ")
+    value = resolve_attribute(row, path)
     if path == "levels":
         return {name: value.get(name) for name in factors}
-    if "share" in how:
-        is_stated = value is not None and (value.n or "stated" not in how)
-        parts = (value.count, value.n, value.value, value.low, value.high) if is_stated else (None,) * 5
-        return {f"{column}: {part}": value_of_part for part, value_of_part in zip(_SHARE, parts, strict=True)}
-    return {column: "any" if "size" in how and math.isnan(value) else value}
+    if "share" in flags:
+        is_stated = value is not None and (value.n or "stated" not in flags)
+        numbers = (value.count, value.n, value.value, value.low, value.high) if is_stated else (None,) * 5
+        return {f"{column}: {part}": number for part, number in zip(_PROPORTION, numbers, strict=True)}
+    return {column: "any" if "size" in flags and math.isnan(value) else value}
 
 
-def tables_of(
+def build_tables(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> dict[str, list[TableRow]]:
-    """Build every table of a judgement by the stem of its file, as `tables.toml` lays them out.
+    """Build the tables of a judgement with the columns of `tables.toml`; the keys are the stems of their files.
 
-    Sizes of leaks in `unit`, `known`: what each detector was given, `part`: what the campaign's families are for.
+    `unit`: unit of the leaks' sizes; `known`: detector -> the information it was given; `part`: the plan's purpose.
     """
-    j, knowledge = judgement, {name: row.plain() for name, row in (known or {}).items()}
-    factors = list(dict.fromkeys(name for cell in j.cells for name in cell.levels))
+    knowledge = {name: row.as_row() for name, row in (known or {}).items()}
+    factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
     rows: dict[str, Iterable[Any]] = {
-        "table": (*j.table, *j.overall),
-        "pod": ({"pod": pod, "at": entry} for pod in j.pods for entry in pod.sizes),
-        "roc": j.rocs,
-        "cells": j.cells,
-        "onsets": j.onsets,
-        "estimates": j.flows,
-        "thresholds": ({"detector": name, "duty": duty, "at": entry} for (name, duty), entry in j.thresholds.items()),
-        "faults": j.faults,
-        "causes": (
-            {"detector": row.detector, "true": true, "named": named, "records": share}
-            for row in j.causes
-            for true, shares in zip(row.confusion.rows, row.confusion.shares, strict=True)
-            for named, share in zip(row.confusion.columns, shares, strict=True)
-            if share.n
+        "table": (*judgement.table, *judgement.overall),
+        "pod": ({"pod": pod, "at": entry} for pod in judgement.pods for entry in pod.sizes),
+        "roc": judgement.rocs,
+        "cells": judgement.cells,
+        "onsets": judgement.onsets,
+        "estimates": judgement.flows,
+        "thresholds": (
+            {"detector": name, "duty": duty, "at": entry} for (name, duty), entry in judgement.thresholds.items()
         ),
-        "families": ({"of": row, "part": part, "detector": row.detector} for row in j.families),
+        "faults": judgement.faults,
+        "causes": (
+            {"detector": row.detector, "true": true_cause, "named": cause, "records": fraction}
+            for row in judgement.causes
+            for true_cause, fractions in zip(row.confusion.rows, row.confusion.shares, strict=True)
+            for cause, fraction in zip(row.confusion.columns, fractions, strict=True)
+            if fraction.n
+        ),
+        "families": ({"of": row, "part": part, "detector": row.detector} for row in judgement.families),
     }
 
-    def laid_out(columns: Mapping[str, str], row: Any) -> TableRow:
+    def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
+        """Build one row; without `knowledge`, columns on what a detector knows (content "known ...") are left out."""
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and knowledge:
-                cells[column] = attribute_of(
-                    knowledge.get(attribute_of(row, "detector")), content.removeprefix("known ")
+                cells[column] = resolve_attribute(
+                    knowledge.get(resolve_attribute(row, "detector")), content.removeprefix("known ")
                 )
             elif not content.startswith("known "):
                 name = column.format(unit=unit)
-                cells |= _cells(name, content, row, factors)
+                cells |= _build_cells(name, content, row, factors)
         return cells
 
-    return {name: [laid_out(_columns()[name], row) for row in table] for name, table in rows.items()}
+    return {name: [build_row(_table_layouts()[name], row) for row in table] for name, table in rows.items()}
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
-    """Build the table of all records in the order of their ids, without values that differ from run to run."""
+    """Build the table of all records in the order of their ids, without run times, as reruns must give equal tables."""
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
-    stating = sorted({name for row in ordered for name in row.statements})
+    stating_detectors = sorted({name for row in ordered for name in row.statements})
     table = []
     for row in ordered:
         record: TableRow = {
@@ -128,17 +134,17 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
             **{name: row.levels.get(name) for name in factors},
             "replicate": row.replicate,
             f"flow [{unit}]": row.flow_lpm,
-            **{name: row.scores[name][0] if name in row.scores else None for name in detectors},
+            **{name: row.score(name) for name in detectors},
         }
-        for name in stating:
-            for column, content in _columns()["records"].items():
-                record[f"{name}: {column}"] = attribute_of(row.statements.get(name), content)
+        for name in stating_detectors:
+            for column, content in _table_layouts()["records"].items():
+                record[f"{name}: {column}"] = resolve_attribute(row.statements.get(name), content)
         table.append({**record, "error": row.error})
     return table
 
 
 def write_tables(folder: Path, tables: Mapping[str, Sequence[TableRow]]) -> list[Path]:
-    """Write each table that has rows as `NAME.csv`, numbers in full; return the files."""
+    """Write each table as `NAME.csv` with all digits, and remove the file of an empty table; return the files."""
     paths = []
     for name, rows in tables.items():
         path = folder / f"{name}.csv"

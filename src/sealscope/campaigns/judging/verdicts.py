@@ -1,23 +1,23 @@
-"""The judged verdicts: a detector's own on each record, or its score's against a threshold."""
+"""Collect the verdicts on each record: stated by a detector, or from its score and a threshold."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from sealscope.campaigns.cases.row import CaseRow, Statement, duty_of
-from sealscope.campaigns.plans.detectors import plan_detector
+from sealscope.campaigns.cases.row import CaseRow, Statement, duty_label
+from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.errors import InputError
 from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _T = TypeVar("_T")
-#: (detector, duty) -> threshold from leak-free records of that duty
+#: (detector, duty) -> threshold from leak-free records of that duty.
 Thresholds = Mapping[tuple[str, str], Threshold]
 
 
 class JudgedRow(NamedTuple):
-    """A row, one detector's verdict on it, and its statement; None where there is none or the record failed."""
+    """A row with one detector's verdict, and its statement; None for a scorer or a failed record."""
 
     row: CaseRow
     verdict: str
@@ -30,7 +30,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def flow_lpm(self) -> float:
-        """Flow [L/min] of the true leak, where it is known."""
+        """Simulated mean flow [L/min] of the true leak, or its planned size if there is no simulated one."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
@@ -39,53 +39,57 @@ class JudgedRow(NamedTuple):
         return self.verdict == "leak"
 
 
-#: detector -> its verdict on each record to judge
+#: detector -> its verdict on each record to judge.
 Verdicts: TypeAlias = Mapping[str, Sequence[JudgedRow]]
 
 
-def thresholds_of(
+def compute_thresholds(
     rows: Iterable[CaseRow],
     detectors: Sequence[str],
     false_alarm: float,
     promise: Promise = "average",
     confidence: float = 0.95,
 ) -> Thresholds:
-    """Compute the thresholds of the scorers that need one, from the leak-free rows of each duty.
+    """Compute a threshold for each scorer that needs one and each duty with enough leak-free rows.
 
-    A row without a score raises no alarm and counts as the lowest. Raises InputError where no duty has enough rows,
-    saying how many it takes.
+    A row without a score cannot raise an alarm and counts as the lowest score. Raises InputError if no duty has enough
+    rows for `false_alarm`.
     """
-    needing = [name for name in detectors if plan_detector(name).needs_threshold]
+    scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
     for row in rows:
         if row.use == "calibrate" and row.error is None:
-            leak_free.setdefault(duty_of(row.levels), []).append(row)
+            leak_free.setdefault(duty_label(row.levels), []).append(row)
     needed = records_needed(false_alarm, confidence if promise == "bound" else None)
-    most = max(map(len, leak_free.values()), default=0)
-    if needing and most < needed:
-        raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {most}")
+    max_rows = max(map(len, leak_free.values()), default=0)
+    if scorers and max_rows < needed:
+        raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {max_rows}")
     thresholds = {}
-    for name in needing:
+    for name in scorers:
         for duty, group in leak_free.items():
-            scores_of_group = [score for row in group if (score := row.scores[name][0]) is not None]
-            if scores_of_group and len(group) >= needed:
-                scores = scores_of_group + [min(scores_of_group)] * (len(group) - len(scores_of_group))
+            scores = [score for row in group if (score := row.score(name)) is not None]
+            if scores and len(group) >= needed:
+                scores += [min(scores)] * (len(group) - len(scores))
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 
 
-def verdicts_of(
+def collect_verdicts(
     rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
-    """Collect each detector's verdicts: its own, or its score's against its limit or the duty's threshold."""
+    """Collect each detector's verdicts.
+
+    A scorer's verdict is `leak` if its score exceeds its entry in `limits`, else the threshold of the record's duty.
+    """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:
+        """Return a detector's verdict on a row."""
         if row.error is not None:
             return JudgedRow(row, CANNOT_TELL, None)
         if (statement := row.statements.get(detector)) is not None:
             return JudgedRow(row, statement.verdict, statement)
-        score, limit = row.scores[detector][0], limits.get(detector)
-        if limit is None and (threshold := thresholds.get((detector, duty_of(row.levels)))) is not None:
+        score, limit = row.score(detector), limits.get(detector)
+        if limit is None and (threshold := thresholds.get((detector, duty_label(row.levels)))) is not None:
             limit = threshold.value
         if score is None or limit is None:
             return JudgedRow(row, CANNOT_TELL, None)
@@ -94,13 +98,13 @@ def verdicts_of(
     return {detector: [judge_row(row, detector) for row in rows] for detector in detectors}
 
 
-def without_fault(verdicts: Verdicts) -> Verdicts:
-    """Select the verdicts on records without another fault."""
+def drop_other_faults(verdicts: Verdicts) -> Verdicts:
+    """Remove the records with a fault other than a leak."""
     return {name: [record for record in records if not record.row.fault] for name, records in verdicts.items()}
 
 
-def grouped(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:
-    """Group the items by a key, in rising order."""
+def group_by(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:
+    """Group the items by a key; the keys are in rising order."""
     groups: dict[Any, list[_T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

@@ -1,10 +1,10 @@
 """The names in a plan's `detectors`: scorers, registered detectors and `diagnose`, each on a set of channels.
 
-"d3 of p_A fell"            a scorer, its threshold from the plan's leak-free records
-"volume balance"            a registered detector by its own verdict at the plan's false-alarm probability
+"d3 of p_A fell"            a scorer; the plan's leak-free records set its threshold
+"volume balance"            a registered detector, with its own verdict at the plan's false-alarm probability
 "diagnose"                  the verdict of `diagnose`
-"diagnose @ pressures"      the same, given the channels of the view `pressures` alone
-"watch"                     what the watch of the machine has raised by the record's end, second by second
+"diagnose @ pressures"      `diagnose` with the channels of the view `pressures` only
+"watch"                     the state of the machine's watch at the end of the record
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sealscope.recordings.recording import CHANNEL_UNITS
 DIAGNOSE = "diagnose"
 WATCH = "watch"
 _VIEW = " @ "
-#: name -> channels; the name "" stands for what detectors see that name no view.
+#: View -> its channels; the view "" applies to detectors that name none.
 Views = Mapping[str, tuple[str, ...]]
-#: Channels that detectors see by default: all but the flow meter of the bypass, which is no part of the machine.
+#: Channels that detectors see by default: all except the test bench's flow meter, which measures the leak itself.
 ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 
 
@@ -32,8 +32,8 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """One name of a plan's `detectors`, parsed.
 
-    `base`: the scorer, the detector, `diagnose` or `watch`; `scorer`: None where it is judged by its own verdict;
-    `view`: the set of channels it sees, "" where none is named.
+    `base`: name of a scorer or detector, `diagnose` or `watch`; `scorer`: None for a detector with its own verdict;
+    `view`: name of the set of channels it sees, "" if none is named.
     """
 
     name: str
@@ -43,13 +43,13 @@ class PlanDetector:
 
     @property
     def needs_threshold(self) -> bool:
-        """True if leak-free records must set its threshold."""
+        """True if its threshold must be set from leak-free records."""
         return self.scorer is not None and self.scorer.threshold is None
 
 
 @cache
-def plan_detector(name: str) -> PlanDetector:
-    """Parse a detector's name, known or not."""
+def parse_detector_name(name: str) -> PlanDetector:
+    """Split a plan's detector name into base and view; the base need not exist (`check_detector`)."""
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
         return PlanDetector(name, base, view, SCORERS[base])
@@ -57,11 +57,11 @@ def plan_detector(name: str) -> PlanDetector:
 
 
 def check_detector(name: str, views: Views) -> None:
-    """Raise InputError for a name that is no detector, or names an unknown view."""
-    parsed = plan_detector(name)
+    """Raise InputError if the name is no detector or its view is not defined in the plan."""
+    parsed = parse_detector_name(name)
     if parsed.view and parsed.view not in views:
         known_views = ", ".join(view for view in views if view) or "none"
-        raise InputError(f"what stands behind '@' must be one of [views] ({known_views}), got {name!r}")
+        raise InputError(f"the view after '@' must be one of [views] ({known_views}), got {name!r}")
     names = [DIAGNOSE, WATCH, *detectors()]
     if parsed.scorer is not None or parsed.base in names:
         return

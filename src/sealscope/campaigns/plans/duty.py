@@ -1,7 +1,7 @@
-"""Levels and faults of a plan on a rig: closings, targets, controllers, loads and faults as text.
+"""Check and parse a plan's levels and faults: throttle closings, commands, controllers, loads and faults as text.
 
-The words are those of `sealscope simulate`: `command` as `--command` (a voltage or a target for the piston),
-`controller` as `--controller`, `load` as `--load`.
+Texts have the form of the options of `sealscope simulate`: `command` as `--command` (a voltage or a target for the
+piston), `controller` as `--controller`, `load` as `--load`.
 """
 
 from __future__ import annotations
@@ -9,41 +9,41 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.control.registry import CONTROLLERS, check_name, controller_named, is_installed
+from sealscope.control.registry import CONTROLLERS, check_controller_name, controller_named, is_installed
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.courses import Position, command_or_target, parse_force, parse_position
 from sealscope.simulation.experiment import check_target
 from sealscope.simulation.faults import Fault, parse_fault
+from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force, parse_position
 from sealscope.units import parse_quantity
 
-#: Factors whose levels are the duty of a machine, in the words of the command line.
+#: Factors that set the duty of a machine.
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
-#: Rate [Hz] at which a target is looked at before any run.
-_LOOKED = 50.0
+#: Rate [Hz] at which a target is sampled to check that the piston can reach it.
+_TARGET_CHECK_RATE = 50.0
 
 
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
-    """Raise InputError for a level of `command`, `controller` or `load` that no run of `duration` [s] can have."""
+    """Raise InputError if a level of `command`, `controller` or `load` is not valid for the rig over `duration` [s]."""
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
         raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
     if name == CONTROLLER and level in CONTROLLERS:
-        CONTROLLERS[level](rig)
+        CONTROLLERS[level](rig)  # raises if the controller does not fit the rig
     elif name == CONTROLLER:
-        check_name(level)
+        check_controller_name(level)
     elif name == LOAD:
         parse_force(level)
     elif isinstance(command := command_or_target(level), Position):
-        check_target(command, np.arange(0.0, duration, 1.0 / _LOOKED), rig.cylinder.L / 2)
+        check_target(command, np.arange(0.0, duration, 1.0 / _TARGET_CHECK_RATE), rig.cylinder.L / 2)
 
 
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
-    """Make each of the user's controllers before a campaign begins.
+    """Check that every controller of a plan is trusted and can be built; raise InputError otherwise.
 
-    Raises InputError where one cannot be made, and where one is a program that the plan leads to and the caller does
-    not `trust` it: a plan may be hostile. Installed controllers are trusted.
+    A controller in a file that the plan names is run only if the caller says `trust`, as a plan may be hostile.
+    Installed controllers are always trusted.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
@@ -60,24 +60,24 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
             controller_named(name, plan.rig)
 
 
-def voltage_in(commands: tuple[str | float, ...]) -> str | None:
-    """Find the first of these commands that is no target for a piston, None where all are."""
+def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
+    """Find the first command that is a voltage and no target for the piston; None if all are targets."""
     return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
-def closing_values(level: str | float) -> dict[str, str | float]:
-    """Compute the rig's parameters for both throttles closed by a share; 0 leaves `line.orifices` unchanged."""
-    share = parse_quantity(level, "1") if isinstance(level, str) else float(level)
-    if not 0.0 <= share < 1.0:
+def throttle_values(level: str | float) -> dict[str, str | float]:
+    """Return the rig's parameters for both throttles closed by a fraction; 0 leaves `line.orifices` unchanged."""
+    fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
+    if not 0.0 <= fraction < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
-    values: dict[str, str | float] = {"line.closed_A": share, "line.closed_B": share}
-    return {**values, "line.orifices": "present"} if share > 0 else values
+    values: dict[str, str | float] = {"line.closed_A": fraction, "line.closed_B": fraction}
+    return {**values, "line.orifices": "present"} if fraction > 0 else values
 
 
-def fault_of(text: str, onset_s: float) -> Fault:
-    """Parse a fault other than a piston leak; its onset is the plan's unless the text states one."""
-    timed = any(f" {word} " in f" {text} " for word in ("from", "growing"))
-    fault = parse_fault(text if timed else f"{text} from {onset_s:g} s")
+def parse_plan_fault(text: str, onset_s: float) -> Fault:
+    """Parse a fault other than a piston leak; it starts at `onset_s` [s] unless the text states its own time."""
+    has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
+    fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")
     if fault is None:
         raise InputError(f"a fault must be one, got {text!r}")
     return fault

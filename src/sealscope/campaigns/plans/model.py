@@ -1,6 +1,6 @@
 """The two kinds of plan: simulated records, and recordings of a real machine.
 
-Fields are the entries of a plan's file, under their names there or their `alias`, and `place`, the file.
+A field is the entry of the plan's file with its name or its `alias`; `place` is the path of the file.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from sealscope.units import parse_quantity
 Use = Literal["calibrate", "judge"]
 LeakLaw = Literal["laminar", "orifice", "mixture"]
 
-_LONGEST_NAME = 80
+_MAX_NAME_LENGTH = 80
 
 
-def _quantity(unit: str) -> BeforeValidator:
-    """Build a validator that reads a number with its unit from text."""
+def _quantity_validator(unit: str) -> BeforeValidator:
+    """Build a validator that converts a text such as '20 s' to a number in `unit`."""
     return BeforeValidator(lambda value: parse_quantity(value, unit) if isinstance(value, str) else value)
 
 
-def _file_name(name: str) -> str:
-    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _LONGEST_NAME:
-        raise ValueError(f"must be of at most {_LONGEST_NAME} letters, digits, '-', '_' and '.'")
+def _validate_file_name(name: str) -> str:
+    """Return `name`; raise ValueError if it is no plain file name."""
+    if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
+        raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
     return name
 
 
-def _pattern(files: str) -> str:
+def _validate_pattern(files: str) -> str:
+    """Return the pattern `files`; raise ValueError if it leaves its folder or uses `**` in an unsupported way."""
     parts = Path(files).parts
     if not parts or Path(files).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
@@ -45,59 +47,62 @@ def _pattern(files: str) -> str:
     return files
 
 
-def _level(value: Any) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if isinstance(value, str) or (number and math.isfinite(value)):
+def _validate_level(value: Any) -> Any:
+    """Return the level `value`; raise ValueError if it is neither text nor a finite number."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, str) or (is_number and math.isfinite(value)):
         return value
     raise ValueError(f"must be a text or a number, got {value!r:.60}")
 
 
-def _channels(names: tuple[str, ...]) -> tuple[str, ...]:
+def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the channels `names`; raise ValueError for an unknown or repeated one, or the measured leak."""
     if not set(names) <= set(CHANNEL_UNITS) or len(set(names)) < len(names):
         raise ValueError(f"must be a list of channels, each once, got {list(names)}")
     if "q_leak" in names:
-        raise ValueError("must not hold q_leak: it measures what detectors are to find")
+        raise ValueError("must not contain q_leak: it measures the leak that detectors are to find")
     return names
 
 
-def _view(name: str) -> str:
+def _validate_view_name(name: str) -> str:
+    """Return the view's name; raise ValueError if `parse_detector_name` could not parse it."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Share = Annotated[Number, Field(gt=0, lt=1)]
-Whole = Annotated[int, Field(strict=True, ge=0)]
+Fraction = Annotated[Number, Field(gt=0, lt=1)]
+Count = Annotated[int, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(pattern=r"^[^\n]*$")]
-FileName = Annotated[str, Field(min_length=1), AfterValidator(_file_name)]
-Seconds = Annotated[Number, _quantity("s")]
-#: Names, one or more.
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_validate_file_name)]
+Seconds = Annotated[Number, _quantity_validator("s")]
+#: One name or more.
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
-Channels = Annotated[Names, AfterValidator(_channels)]
-Level = Annotated[str | int | float, BeforeValidator(_level)]
+Channels = Annotated[Names, AfterValidator(_validate_channels)]
+Level = Annotated[str | int | float, BeforeValidator(_validate_level)]
 Values = Mapping[str, Any]
 
 
-class _Entries:
-    """Entries of a table, which has no others."""
+class _TomlTable:
+    """A table of a plan's file; entries that are no field are refused."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordGroup(_Entries):
+class RecordGroup(_TomlTable):
     """`count` records of one kind, spread evenly over the cells of the factors.
 
-    `use`: `calibrate` sets thresholds (leak-free), `judge` is judged by them, on seeds of its own; `leak_lpm`: mean
-    flow [L/min] of a leak of that `law` (`mixture`: half of each) from the plan's onset on, 0 for none; `fault`:
-    another fault, as text.
+    `use`: `calibrate` for leak-free records that set thresholds, `judge` for records that are judged by them;
+    `leak_lpm`: mean flow [L/min] of the leak from the plan's onset on, 0 for none; `law`: its law, `mixture` for half
+    of each; `fault`: another fault, as text.
     """
 
-    count: Annotated[Whole, Field(ge=1)]
+    count: Annotated[Count, Field(ge=1)]
     use: Use = "judge"
-    leak_lpm: Annotated[Number, Field(ge=0, alias="leak"), _quantity("L/min")] = 0.0
+    leak_lpm: Annotated[Number, Field(ge=0, alias="leak"), _quantity_validator("L/min")] = 0.0
     law: LeakLaw = "laminar"
     fault: Text = ""
 
@@ -107,12 +112,12 @@ class RecordGroup(_Entries):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Plan(_Entries):
-    """The fields of all plans; `title`: the name where it is empty."""
+class _Plan(_TomlTable):
+    """The fields of all plans; an empty `title` is replaced by the name."""
 
     name: FileName
     title: Text = ""
-    confidence: Share = 0.95
+    confidence: Fraction = 0.95
     note: Text = ""
     place: str = ""
 
@@ -121,20 +126,21 @@ class _Plan(_Entries):
 class _JudgedPlan(_Plan):
     """The fields of plans over records of a machine.
 
-    `unit`: of the sizes of leaks; `views`: sets of channels by name, for the detectors that name one (`detectors`);
-    `channels`: for all others; `assume`: the rig that detectors may assume, with the values `assume_set`.
+    `unit`: unit of the leaks' sizes; `views`: sets of channels by the names that `detectors` may use; `channels`: the
+    channels of all other detectors; `assume`: the rig that detectors may assume, with the values `assume_set`.
     """
 
-    false_alarm: Share = 0.01
+    false_alarm: Fraction = 0.01
     promise: Promise = "average"
     detectors: Names
     unit: Text = "L/min"
-    views: Mapping[Annotated[str, AfterValidator(_view)], Channels] = field(default_factory=dict)
+    views: Mapping[Annotated[str, AfterValidator(_validate_view_name)], Channels] = field(default_factory=dict)
     channels: Channels | None = None
     assume: Text | None = None
     assume_set: Values = field(default_factory=dict)
 
-    def _assumed(self, rig: Rig | None) -> Rig | None:
+    def _load_assumed(self, rig: Rig | None) -> Rig | None:
+        """Load the rig to assume, by default `rig`, and apply `assume_set` to it."""
         rig = rig if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
             return rig
@@ -145,11 +151,11 @@ class _JudgedPlan(_Plan):
 class SimulatedPlan(_JudgedPlan):
     """A simulated campaign.
 
-    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench whose nuisances each
-    record draws, "" for the rig without drift; `onset_s`: of the leaks, nan for half of the duration; `factors`: name
-    -> levels, every combination is a cell; `command` and `closed` are the duty, `family` names families of the profile,
-    other names are parameters of the rig; `seed`: the base of every case's seed; `part`: what the plan is for, such as
-    development or judging.
+    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench from whose nuisances
+    each record is drawn, "" for the rig as it is; `onset_s`: start [s] of the leaks, nan for half of the duration;
+    `factors`: name -> levels, every combination is a cell. The factors `command`, `controller`, `load` and `closed` set
+    the duty, `family` selects families of the profile, other names are parameters of the rig. `seed`: base of every
+    case's seed; `part`: purpose of the plan, such as development or judging.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -158,7 +164,7 @@ class SimulatedPlan(_JudgedPlan):
     profile: Text = ""
     duration_s: Annotated[Seconds, Field(alias="duration")]
     onset_s: Annotated[Seconds, Field(alias="onset")] = math.nan
-    seed: Whole = 0
+    seed: Count = 0
     keep_recordings: Flag = False
     records: Annotated[tuple[RecordGroup, ...], Field(min_length=1)]
     factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
@@ -174,7 +180,7 @@ class SimulatedPlan(_JudgedPlan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume."""
-        return self._assumed(self.rig) or self.rig
+        return self._load_assumed(self.rig) or self.rig
 
     @property
     def size(self) -> int:
@@ -183,18 +189,18 @@ class SimulatedPlan(_JudgedPlan):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordingSet(_Entries):
+class RecordingSet(_TomlTable):
     """Recordings of one kind.
 
-    `files`: a pattern; of the files that match, in the order of the numbers in their names, the `first` to before the
-    `end`-th belong to the set; `size`: 0 for healthy recordings, else the grade of the leak.
+    `files`: pattern of the files, which are ordered by the numbers in their names; those from `first` up to, but
+    without, `end` belong to the set, counted from 1; `size`: 0 for healthy recordings, else the grade of the leak.
     """
 
-    files: Annotated[Text, AfterValidator(_pattern)]
+    files: Annotated[Text, AfterValidator(_validate_pattern)]
     use: Use = "judge"
     size: Annotated[Number, Field(ge=0)] = 0.0
-    first: Annotated[Whole, Field(ge=1)] = 1
-    end: Annotated[Whole, Field(ge=2)] = 10**9
+    first: Annotated[Count, Field(ge=1)] = 1
+    end: Annotated[Count, Field(ge=2)] = 10**9
     label: Text = ""
 
     def __post_init__(self) -> None:
@@ -207,13 +213,13 @@ class RecordedPlan(_JudgedPlan):
     """A campaign over recordings in a folder of the caller."""
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)
-    rate_hz: Annotated[Number | None, _quantity("Hz"), Field(alias="rate")] = None
+    rate_hz: Annotated[Number | None, _quantity_validator("Hz"), Field(alias="rate")] = None
     sets: Annotated[tuple[RecordingSet, ...], Field(min_length=1)]
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """The rig that detectors may assume, None where the plan states none."""
-        return self._assumed(None)
+        """The rig that detectors may assume, None if the plan states none."""
+        return self._load_assumed(None)
 
 
 AnyPlan: TypeAlias = SimulatedPlan | RecordedPlan

@@ -1,6 +1,6 @@
-"""The thesis's rules as scorers: one number a record from the RMS of its details, high for a leak.
+"""The thesis's rules as scorers: a record's score is computed from the RMS of its details and is high for a leak.
 
-A threshold comes from a plan's leak-free records; a bare sign rule has one of its own.
+A plan's leak-free records set the threshold of a scorer; that of a sign rule is 0.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, details, edge_samples, mean_squares
 from sealscope.signals.filters import IntArray
 
-#: What is left out at the beginning of a recording: this long, but no more than this share of the first part, so that
-#: the machine's start does not stand against its running.
-START_SECONDS, START_SHARE = 2.0, 0.05
-#: Word of a rule -> what of the log RMS it scores (its change over the split, or its level), and the sign.
-_WORDS = {
+#: The machine's start is left out of the first part: this many seconds, but at most this fraction of the part.
+START_SECONDS, START_FRACTION = 2.0, 0.05
+#: Direction that a rule tests, the last word of its name -> statistic of the log RMS, and its sign in the score (0:
+#: the absolute value).
+_DIRECTIONS = {
     "fell": ("change", -1.0),
     "rose": ("change", 1.0),
     "changed": ("change", 0.0),
@@ -32,58 +32,59 @@ _WORDS = {
 _BOTH = "d3d4 of both chambers as the thesis says"
 
 
-def side_bounds(n: int, rate: float, split: int) -> IntArray:
-    """Compute first and last (exclusive) sample (2, 2) of each side of the sample `split` of `n` at `rate` [Hz].
+def split_bounds(n: int, rate: float, split: int) -> IntArray:
+    """Compute the usable samples, [begin, end) in rows (2, 2), of the parts before and after sample `split` of `n`.
 
-    Without the start (`START_SECONDS`), and without details that saw the other side or the recording's ends. A side
-    that has no sample left ends before it begins.
+    Details whose filters reach into the other part or beyond the recording are left out, and so is the start:
+    `START_SECONDS` at `rate` [Hz], at most `START_FRACTION` of the part. A part without samples ends before it begins.
     """
     before, after = (int(samples) for samples in edge_samples()[-1])
-    begin = max(before, int(min(START_SECONDS * rate, START_SHARE * split)))
+    begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
 
 
 @dataclass(frozen=True)
-class Sides:
-    """Chamber -> log RMS of d1..d4 and d3d4, (5,) each: before the split, after it, over both."""
+class SplitRms:
+    """The log RMS of d1..d4 and d3d4, (5,), of each chamber: before the split, after it, and over both parts."""
 
     log_rms: Mapping[str, tuple[Array, Array, Array]]
 
     @classmethod
-    def from_recording(cls, recording: Recording, split_s: float) -> Sides:
-        """Compute both sides of the time `split_s` [s], for each chamber whose two sides have details.
+    def from_recording(cls, recording: Recording, split_s: float) -> SplitRms:
+        """Compute the log RMS on both sides of the time `split_s` [s]; no chamber is included if a part is too short.
 
-        The recording is uniformly sampled without missing samples.
+        The recording must be uniformly sampled without missing samples.
         """
         rate = recording.rate
-        bounds = side_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
+        bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
         squares = {}
         for chamber in CHAMBERS if np.diff(bounds).min() > 0 else ():
             if chamber in recording:
-                squares[chamber] = mean_squares(details(recording[chamber]), bounds.ravel())[::2]
+                before, _gap, after = mean_squares(details(recording[chamber]), bounds.ravel())
+                squares[chamber] = np.array([before, after])
         return cls.from_squares(squares, bounds)
 
     @classmethod
-    def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> Sides:
-        """Build the sides from mean squares (2, 5) of each chamber's details over samples `bounds` (2, 2)."""
+    def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
+        """Compute the log RMS from mean squares (2, 5) of each chamber's details over the samples `bounds` (2, 2)."""
         log_rms = {}
         with np.errstate(divide="ignore"):
-            for chamber, parts in squares.items():
-                both = np.average(parts, axis=0, weights=np.diff(bounds)[:, 0])
-                log_rms[chamber] = (0.5 * np.log(parts[0]), 0.5 * np.log(parts[1]), 0.5 * np.log(both))
+            for chamber, (before, after) in squares.items():
+                overall = np.average((before, after), axis=0, weights=np.diff(bounds)[:, 0])
+                log_rms[chamber] = (0.5 * np.log(before), 0.5 * np.log(after), 0.5 * np.log(overall))
         return cls(log_rms)
 
-    def through(self, channels: Iterable[str]) -> Sides:
-        """Select some of the chambers."""
+    def through(self, channels: Iterable[str]) -> SplitRms:
+        """Select the chambers whose pressures are among `channels`."""
         visible = set(channels)
-        return Sides({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
+        return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
-    def value(self, chamber: str, quantity: str, what: str) -> float | None:
-        """Return the `change` of a quantity's log RMS over the split, or its `level`; None where it has none."""
+    def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
+        """Return the `change` of a quantity's log RMS over the split, or its `level`; None if it cannot be computed."""
         if chamber not in self.log_rms:
             return None
-        before, after, both = (float(log_rms[QUANTITIES.index(quantity)]) for log_rms in self.log_rms[chamber])
-        value = after - before if what == "change" else both
+        before, after, overall = (float(log_rms[QUANTITIES.index(quantity)]) for log_rms in self.log_rms[chamber])
+        value = after - before if statistic == "change" else overall
         return value if math.isfinite(value) else None
 
 
@@ -91,8 +92,8 @@ class Sides:
 class Scorer:
     """A rule of the thesis.
 
-    `parts`: quantity, chamber and word of what it scores; of several the smallest score counts. `threshold`: its own,
-    None where leak-free records set it.
+    `parts`: quantity, chamber and direction (`fell`, ...) of each condition; the score is the smallest of theirs.
+    `threshold`: fixed threshold, None if leak-free records set it.
     """
 
     name: str
@@ -100,38 +101,46 @@ class Scorer:
     threshold: float | None = None
 
     @property
-    def split(self) -> bool:
-        """True if the rule compares the two sides of the split."""
-        return all(_WORDS[word][0] == "change" for _, _, word in self.parts)
+    def compares_parts(self) -> bool:
+        """True if the rule compares the parts before and after the split."""
+        return all(_DIRECTIONS[direction][0] == "change" for _, _, direction in self.parts)
 
     @property
     def description(self) -> str:
-        """The score in words."""
-        text = " and ".join(f"the RMS of {quantity} of {chamber} {word}" for quantity, chamber, word in self.parts)
-        ending = " over the split, as change of its logarithm" if self.split else " over the record, as its logarithm"
+        """Description of the score in plain English."""
+        text = " and ".join(
+            f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.parts
+        )
+        ending = " over the record, as its logarithm"
+        if self.compares_parts:
+            ending = ", as change of its logarithm from the first to the second part"
         return text + ending + ("; any change at all" if self.threshold is not None else "")
 
-    def score(self, sides: Sides) -> float | None:
-        """Compute the score; None for a recording that is too short, or a reading that does not move."""
+    def score(self, split_rms: SplitRms) -> float | None:
+        """Compute the score; None if a recording is too short, or a constant reading makes the log RMS infinite."""
         scores = []
-        for quantity, chamber, word in self.parts:
-            what, sign = _WORDS[word]
-            value = sides.value(chamber, quantity, what)
+        for quantity, chamber, direction in self.parts:
+            statistic, sign = _DIRECTIONS[direction]
+            value = split_rms.value(chamber, quantity, statistic)
             if value is None:
                 return None
             scores.append(sign * value if sign else abs(value))
-        return min(scores)
+        return min(scores)  # every part must have changed
 
 
 def _iter_scorers() -> Iterator[Scorer]:
-    for chamber, quantity, word in product(CHAMBERS, QUANTITIES, _WORDS):
-        rule = Scorer(f"{quantity} of {chamber} {word}", ((quantity, chamber, word),))
+    """Yield threshold rules on one wavelet detail of one chamber, the thesis's rule on both, and their sign rules.
+
+    A sign rule fires at any change in its direction, however small.
+    """
+    for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
+        rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))
         yield rule
-        if word in ("fell", "rose"):
-            yield Scorer(f"sign rule: {rule.name}", rule.parts, 0.0)
-    both = (("d3d4", "p_A", "fell"), ("d3d4", "p_B", "rose"))
-    yield Scorer(_BOTH, both)
-    yield Scorer(f"sign rule: {_BOTH}", both, 0.0)
+        if direction in ("fell", "rose"):
+            yield Scorer(f"sign rule: {rule.name}", rule.parts, threshold=0.0)
+    conditions = (("d3d4", "p_A", "fell"), ("d3d4", "p_B", "rose"))  # d3d4: product of the details of levels 3 and 4
+    yield Scorer(_BOTH, conditions)
+    yield Scorer(f"sign rule: {_BOTH}", conditions, threshold=0.0)
 
 
 #: Every scorer by name.

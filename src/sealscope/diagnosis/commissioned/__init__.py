@@ -1,1 +1,1 @@
-"""A machine commissioned once: the lessons of its healthy recordings, saved and used everywhere."""
+"""A machine commissioned once: the summaries of its healthy recordings, saved and used everywhere."""

@@ -1,77 +1,49 @@
-"""Each healthy recording judged by all others, with the decision that later recordings meet.
+"""Each healthy recording judged by all others, by the same decision as later recordings.
 
-Called by `commission`: what the others call a leak is no healthy recording, or they are none to judge others by.
+Called by `commission`: if the others call one leaking, either it or they are no healthy recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
-from sealscope.diagnosis.learnt import Learnt
+from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
 
-#: Fewest recordings of which each is judged by the others: fewer say nothing of their scatter.
-FEWEST = 4
-#: What the remark on a recording that stands out says of its judges.
+#: Fewest recordings of which each is judged by the others: the scatter of fewer is not known.
+MIN_RECORDINGS = 4
+#: How the text on a recording that differs from the others names its judges.
 BY_OTHERS = "by the others"
 
 
-class Outlier(NamedTuple):
-    """A healthy recording that stands out of the others: its file, its verdict in short and why."""
+def cross_check(
+    healthy: Sequence[SummarisedRecording],
+    judge: Callable[[SummarisedRecording, tuple[SummarisedRecording, ...]], Diagnosis],
+    keep: bool = False,
+) -> tuple[tuple[SummarisedRecording, ...], tuple[str, ...]]:
+    """Judge each healthy recording by the others; return those that remain, and why each other one is left out.
 
-    file: str
-    summary: str
-    reason: str
-    is_leak: bool
-
-    def __str__(self) -> str:
-        return f"{self.file}: {self.summary} {BY_OTHERS}: {self.reason}"
-
-
-def find_outliers(
-    healthy: Sequence[Learnt], judge: Callable[[Learnt, tuple[Learnt, ...]], Diagnosis]
-) -> tuple[Outlier, ...]:
-    """Judge each healthy recording by the others.
-
-    Parameters
-    ----------
-    healthy : sequence of Learnt
-    judge : callable
-        Diagnoses the recording of the first argument by the recordings of the second.
-
-    Returns
-    -------
-    tuple of Outlier
-        Those that are called leaking, or of which another event is named; empty for fewer than `FEWEST` recordings.
+    `judge`: diagnoses the recording of the first argument by those of the second; `keep`: leave none out. A recording
+    is left out if it is called leaking, unless half of all are, as then no majority is healthy. If a leak or another
+    event was found in one that remains, the verdict is added to its problems.
     """
-    outliers = []
-    for learnt in healthy if len(healthy) >= FEWEST else ():
-        diagnosis = judge(learnt, tuple(other for other in healthy if other is not learnt))
+    verdicts, leaking = dict[str, str](), dict[str, str]()
+    for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():
+        diagnosis = judge(recording, tuple(other for other in healthy if other is not recording))
         if diagnosis.verdict == LEAK or diagnosis.cause is not None:
-            outliers.append(Outlier(learnt.file, diagnosis.summary, diagnosis.reason, diagnosis.verdict == LEAK))
-    return tuple(outliers)
+            verdicts[recording.file] = f"{diagnosis.summary} {BY_OTHERS}: {diagnosis.reason}"
+        if diagnosis.verdict == LEAK:
+            leaking[recording.file] = f"{recording.file}: {verdicts[recording.file]}"
+    if keep or 2 * len(leaking) >= len(healthy):
+        leaking = {}
+    remaining = (recording for recording in healthy if recording.file not in leaking)
+    return tuple(_add_problem(recording, verdicts.get(recording.file)) for recording in remaining), (*leaking.values(),)
 
 
-def without_leaks(healthy: Sequence[Learnt], outliers: Sequence[Outlier]) -> tuple[tuple[Learnt, ...], tuple[str, ...]]:
-    """Return the recordings that the others do not call leaking, and why each other one is left out.
-
-    Where half of them or more stand out, no majority says what is healthy, and all are kept.
-    """
-    leaking = {outlier.file: str(outlier) for outlier in outliers if outlier.is_leak}
-    if 2 * len(leaking) >= len(healthy):
-        return tuple(healthy), ()
-    return tuple(learnt for learnt in healthy if learnt.file not in leaking), tuple(leaking.values())
-
-
-def with_remarks(healthy: Sequence[Learnt], outliers: Sequence[Outlier]) -> tuple[Learnt, ...]:
-    """Add the verdict by the others to the problems of each recording."""
-    remarks = {outlier.file: f"{outlier.summary} {BY_OTHERS}: {outlier.reason}" for outlier in outliers}
-    return tuple(
-        replace(learnt, about={**learnt.about, "wrong": [*learnt.about.get("wrong", ()), remarks[learnt.file]]})
-        if learnt.file in remarks
-        else learnt
-        for learnt in healthy
-    )
+def _add_problem(recording: SummarisedRecording, problem: str | None) -> SummarisedRecording:
+    """Add a problem, if there is one, to those of a recording."""
+    if problem is None:
+        return recording
+    return replace(recording, about={**recording.about, "wrong": [*recording.about.get("wrong", ()), problem]})

@@ -1,4 +1,4 @@
-"""A commissioned machine: its rig, the map of its logs, and the lessons of its healthy recordings."""
+"""A commissioned machine: its rig, the map of its logs, and the summaries of its healthy recordings."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.cross_check import find_outliers, with_remarks, without_leaks
-from sealscope.diagnosis.commissioned.lessons_file import check_lesson
-from sealscope.diagnosis.detectors.detector import failure, unusable
-from sealscope.diagnosis.detectors.observation import rarities_of
+from sealscope.diagnosis.commissioned.cross_check import cross_check
+from sealscope.diagnosis.commissioned.healthy_file import check_summary
+from sealscope.diagnosis.detectors.detector import log_failure, unusable_reason
+from sealscope.diagnosis.detectors.observation import healthy_surprisals, limit_threads
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
-from sealscope.diagnosis.inspection import inspected
-from sealscope.diagnosis.learnt import Learnt, Lesson
+from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
+from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
 from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
+from sealscope.paragraphs import format_count
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
-from sealscope.recordings.formats.columns import ChannelMap, counted
+from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
-from sealscope.storage.folders import inner_files
+from sealscope.storage.folders import iter_inner_files
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.commissioned.summary import Summary
+    from sealscope.diagnosis.commissioned.summary import MachineSummary
 
 #: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
 NO_RECORDINGS = frozenset(
-    {".toml", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
+    {".toml", ".healthy", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
 )
-#: How a trend, or a verdict, that was written beside the recordings begins.
-_WRITTEN = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
+#: Beginning of a trend, or a verdict, that was written into the folder of the recordings.
+_OWN_OUTPUT = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
+#: Most samples that stay in memory between learning and judging; further recordings are read again.
+_MAX_SAMPLES = 20_000_000
 
-
-#: Samples that are kept in memory between learning and judging; recordings beyond are read again.
-_KEPT_SAMPLES = 20_000_000
-
-#: What a person may say of an alarm's leak.
+#: Judgements of a person on an alarm's leak.
 Judgement = Literal["valid", "invalid", "repaired"]
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
@@ -56,8 +56,8 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 class JudgedAlarm(NamedTuple):
     """A person's judgement of an alarm of the monitor.
 
-    `alarm`: its name, "" for a repair without one; `mark`, said at `date_s`; of a leak since `onset_s` [s since 1970];
-    `leak_lpm` [L/min] and `reason`, where they are known.
+    `alarm`: its name, "" for a repair without one; `mark`: the judgement, made at `date_s`, on a leak that began at
+    `onset_s` [s since 1970]; `leak_lpm` [L/min] and `reason`, if they are known.
     """
 
     alarm: str
@@ -69,8 +69,9 @@ class JudgedAlarm(NamedTuple):
 
     def __str__(self) -> str:
         leak = "" if self.leak_lpm is None else f", {self.leak_lpm:.2g} L/min"
-        onset_text = "" if self.mark == "invalid" else f", since {_date(self.onset_s)}{leak}"
-        return f"{self.alarm} {self.mark} {_date(self.date_s)}{onset_text}{self.reason and f' ({self.reason})'}".strip()
+        onset_text = "" if self.mark == "invalid" else f", since {_format_date(self.onset_s)}{leak}"
+        reason = f" ({self.reason})" if self.reason else ""
+        return f"{self.alarm} {self.mark} {_format_date(self.date_s)}{onset_text}{reason}".strip()
 
 
 class Origin(NamedTuple):
@@ -80,13 +81,8 @@ class Origin(NamedTuple):
     parts: frozenset[bytes]
 
 
-def _is_taken_back(word: JudgedAlarm, later: Iterable[JudgedAlarm]) -> bool:
-    """Test whether a later word calls the alarm invalid; a new alarm of the same name begins after this word."""
-    answers = (answer for answer in later if answer.alarm == word.alarm and answer.onset_s <= word.date_s)
-    return any(answer.mark == "invalid" for answer in answers)
-
-
-def _date(moment: float) -> str:
+def _format_date(moment: float) -> str:
+    """Format a time [s since 1970] to the minute."""
     return datetime.fromtimestamp(moment, UTC).isoformat(" ", "minutes").removesuffix("+00:00")
 
 
@@ -98,8 +94,8 @@ class CommissionedMachine:
     ----------
     name : str
         Name of the machine.
-    healthy : tuple of Learnt
-        What each healthy recording has taught, in the order of their dates.
+    healthy : tuple of SummarisedRecording
+        Its healthy recordings, in the order of their dates.
     rig : Rig, optional
         What is stated of the machine; None: nothing.
     channel_map : mapping of str to str, or "auto", optional
@@ -111,7 +107,7 @@ class CommissionedMachine:
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
-        What persons said of the monitor's alarms, and repairs.
+        Judgements of persons on the monitor's alarms, and repairs.
     origin : Origin, optional
         The file that it was loaded from.
 
@@ -123,7 +119,7 @@ class CommissionedMachine:
     """
 
     name: str
-    healthy: tuple[Learnt, ...]
+    healthy: tuple[SummarisedRecording, ...]
     rig: Rig | None = None
     channel_map: ChannelMap = field(default_factory=dict)
     rate: float | None = None
@@ -133,15 +129,15 @@ class CommissionedMachine:
     origin: Origin | None = field(default=None, repr=False, compare=False)
 
     @cached_property
-    def summary(self) -> Summary:
+    def summary(self) -> MachineSummary:
         """Summary of the machine, its sensors and the smallest leak, from the healthy recordings."""
-        from sealscope.diagnosis.commissioned.summary import summarised
+        from sealscope.diagnosis.commissioned.summary import summarise_machine
 
-        return summarised(self.healthy, self.rig, self.left_out)
+        return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
         """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
-        return read_of_machine(path, self.channel_map, self.rate)
+        return read_by_map(path, self.channel_map, self.rate)
 
     def diagnose(
         self,
@@ -166,132 +162,146 @@ class CommissionedMachine:
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
         """Return the machine with one more healthy recording.
 
-        Raises InputError where it is judged leaking, or a person found a leak then, or it is known already, or cannot
-        be trusted.
+        Raises InputError if it is judged leaking, or overlaps a leak that a person confirmed, or is known already, or
+        cannot be trusted.
         """
-        added = self._add(recording, file, checksum)
+        extended = self._with_recording(recording, file, checksum)
         if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
             raise InputError(f"a healthy recording must not leak, got one that does: {result.reason} ({file})")
         start_s = start_seconds(recording, file)
-        if start_s is not None and (leak := self._find_leak(start_s, start_s + recording.duration)) is not None:
+        if start_s is not None and (leak := self._find_confirmed_leak(start_s, start_s + recording.duration)):
             raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
-        return added
+        return extended
 
-    def _add(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Return the machine with one more recording, whether it leaks or not."""
-        learnt = learn(recording, assumed_rig(self.rig, recording)[0], file, checksum)
-        if copy := next((earlier for earlier in self.healthy if earlier.digest == learnt.digest), None):
+    def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
+        """Return the machine with one more healthy recording, untested for a leak; raise InputError for a copy."""
+        summarised = summarise_healthy(recording, assumed_rig(self.rig, recording)[0], file, checksum)
+        if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
-        healthy = sorted((*self.healthy, learnt), key=lambda lesson: (lesson.start_s or 0.0, lesson.file))
+        healthy = sorted((*self.healthy, summarised), key=lambda entry: (entry.start_s or 0.0, entry.file))
         return replace(self, healthy=tuple(healthy))
 
-    def _find_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
-        """Find the alarm of a leak found by a person and not repaired in a time [s since 1970]; None without one."""
-        repairs = [alarm.date_s for alarm in self.alarms if alarm.mark == "repaired"]
-        words = enumerate(self.alarms, 1)
-        alarms = (word for k, word in words if word.mark != "invalid" and not _is_taken_back(word, self.alarms[k:]))
-        leaks = (word for word in alarms if word.onset_s <= end_s)
-        return next((leak for leak in leaks if not any(leak.onset_s <= repair <= start_s for repair in repairs)), None)
+    def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
+        """Find a leak that a person confirmed, from before `end_s` and not repaired before `start_s` [s since 1970].
+
+        A judgement is revoked by a later one that calls the alarm invalid, unless that is of a new alarm of the same
+        name: the onset of a new alarm is after the first judgement.
+        """
+        for number, leak in enumerate(self.alarms, 1):
+            is_revoked = any(
+                later.mark == "invalid" and later.alarm == leak.alarm and later.onset_s <= leak.date_s
+                for later in self.alarms[number:]
+            )
+            is_repaired = any(
+                alarm.mark == "repaired" and leak.onset_s <= alarm.date_s <= start_s for alarm in self.alarms
+            )
+            if leak.mark != "invalid" and leak.onset_s <= end_s and not is_revoked and not is_repaired:
+                return leak
+        return None
 
     def since(self, start_s: float) -> CommissionedMachine:
-        """Return the machine without the recordings of before a repair, `start_s` [s since 1970].
-
-        Raises InputError where none is left.
-        """
-        left = tuple(
+        """Drop recordings and alarms from before `start_s` [s since 1970]; raise InputError if no recording is left."""
+        healthy = tuple(
             recording for recording in self.healthy if recording.start_s is not None and recording.start_s >= start_s
         )
-        if not left:
-            raise InputError(f"a machine must keep a healthy recording, got none of {_date(start_s)} or later")
+        if not healthy:
+            raise InputError(f"a machine must keep a healthy recording, got none of {_format_date(start_s)} or later")
         alarms = tuple(alarm for alarm in self.alarms if alarm.onset_s >= start_s)
-        return replace(self, healthy=left, alarms=alarms)
+        return replace(self, healthy=healthy, alarms=alarms)
 
     def __repr__(self) -> str:
-        return f"<CommissionedMachine {self.name}: {counted(len(self.healthy), 'healthy recording')}>"
+        return f"<CommissionedMachine {self.name}: {format_count(len(self.healthy), 'healthy recording')}>"
 
     def __str__(self) -> str:
         alarms = [f"  {'alarm':<14}{alarm}" for alarm in self.alarms]
         return "\n".join([self.summary.text(self.healthy, self.rig), *alarms])
 
 
-def read_of_machine(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
+def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a log by the map of its machine, or without the map if it lacks the map's columns.
 
-    Raises UnreadableFile with what is wrong by the map, where neither can be read.
+    Raises UnreadableFile with the error of reading by the map if neither way succeeds.
     """
     if not channel_map:
         return read(path, rate=rate)
     try:
         return read(path, map=channel_map, rate=rate)
-    except UnreadableFile as unmapped:
+    except UnreadableFile as map_error:
         try:
             return read(path, rate=rate)
         except UnreadableFile:
-            raise unmapped from None
+            raise map_error from None
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
-    """List the files of recordings of a path, of several, or of a folder; InputError where there is none.
+    """List the files of recordings in a folder, or at one or several paths; raise InputError if there is none.
 
-    A link in a folder that leads out of it is left out, and a warning says so: name it to have it read.
+    Hidden files and Sealscope's own files in a folder are left out, and, with a warning, links that lead out of it.
     """
     try:
-        named = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-        entries = [Path(path) for path in named]
+        named_paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+        folders_and_files = [Path(path) for path in named_paths]
     except TypeError:
         raise InputError(f"recordings must be a folder's path or paths of files, got {paths!r:.60}") from None
     files: list[Path] = []
-    for path in entries:
+    for path in folders_and_files:
         if path.is_dir():
-            contents = inner_files(path, sorted(item for item in path.iterdir() if not item.name.startswith(".")))
-            files += [file for file in contents if file.suffix.lower() not in NO_RECORDINGS and not _is_written(file)]
+            visible = sorted(item for item in path.iterdir() if not item.name.startswith("."))
+            candidates = (file for file in iter_inner_files(path, visible) if file.suffix.lower() not in NO_RECORDINGS)
+            files += [file for file in candidates if not _is_own_output(file)]
         else:
             files.append(path)
     if not files:
-        raise InputError(f"a folder of recordings must hold one, got none ({', '.join(map(str, named)) or 'no path'})")
+        place = ", ".join(map(str, named_paths)) or "no path"
+        raise InputError(f"a folder of recordings must hold one, got none ({place})")
     return files
 
 
-def _is_written(file: Path) -> bool:
+def _is_own_output(file: Path) -> bool:
+    """Test whether a file begins as a verdict or a trend that this program wrote."""
     try:
-        with file.open("rb") as opened:
-            return _WRITTEN.match(opened.read(200)) is not None
+        with file.open("rb") as content:
+            return _OWN_OUTPUT.match(content.read(200)) is not None
     except OSError:
-        return False  # it is read again, and the error then is named
+        return False  # reading it later reports the error
 
 
-def learn(recording: Recording, rig: Rig, file: str, checksum: str = "") -> Learnt:
-    """Return the lessons of a healthy recording for every detector.
+def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
+    """Compute every detector's summary of a healthy recording; raise InputError if it cannot be trusted or used."""
+    from sealscope.diagnosis.commissioned.summary import describe_recording
 
-    Raises InputError where it cannot be trusted, or teaches nothing.
-    """
-    from threadpoolctl import threadpool_limits
-
-    from sealscope.diagnosis.commissioned.summary import about_recording
-
-    inspection = inspected(recording)
+    inspection = inspect_recording(recording)
     part = inspection.part
     if inspection.defect is not None:
         raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
-    lessons: dict[str, Lesson] = {}
-    with np.errstate(all="ignore"), threadpool_limits(limits=1):
+    summaries: dict[str, Summary] = {}
+    with np.errstate(all="ignore"), limit_threads():
         for name, factory in detectors().items():
             try:
                 detector = factory(rig)
-                if hasattr(detector, "learn") and unusable(detector, part) is None:
-                    lesson = detector.learn(part)
-                    if lesson is not None:
-                        check_lesson(name, lesson)
-                        lessons[name] = lesson
+                can_learn = hasattr(detector, "learn") and unusable_reason(detector, part) is None
+                if can_learn and (summary := detector.learn(part)) is not None:  # type: ignore[attr-defined]
+                    check_summary(name, summary)
+                    summaries[name] = summary
             except Exception as error:  # as in a diagnosis, a method that fails is left out
-                failure(name, getattr(factory, "distribution", None), error)
-    if not lessons:
+                log_failure(name, getattr(factory, "distribution", None), error)
+    if not summaries:
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
-    units = {name: part.units[name] for name in part.channels}
-    description = {"sha256": checksum, **about_recording(recording, inspection)}
-    start = start_seconds(recording, file)
-    rarities = dict(rarities_of(part, rig))
-    return Learnt(file, inspection.digest, units, part.rate, recording.duration, start, lessons, description, rarities)
+    if (levels := HealthyLevels().learn(part)) is not None:
+        summaries[HealthyLevels.name] = levels
+    with limit_threads():
+        surprisals = dict(healthy_surprisals(part, rig))
+    return SummarisedRecording(
+        file,
+        digest=inspection.digest,
+        units={name: part.units[name] for name in part.channels},
+        rate=part.rate,
+        seconds=recording.duration,
+        start_s=start_seconds(recording, file),
+        summaries=summaries,
+        about={"sha256": checksum, **describe_recording(recording, inspection)},
+        statistics=surprisals,
+    )
 
 
 @checked_call
@@ -322,7 +332,7 @@ def commission(
     name : str, optional
         Name of the machine.
     keep : bool, optional
-        Whether recordings that the others call leaking are kept; by default they are left out.
+        Whether to keep recordings that are judged leaking by the others; by default they are left out.
 
     Returns
     -------
@@ -346,32 +356,32 @@ def commission(
     >>> machine.diagnose(ss.simulate(duration="20 s", leak="0.02 L/min", seed=4)).verdict
     'leak'
     """
-    RepairLimit.of(limit)
-    known = None if rig is None else load_rig(rig)
-    channel_map = map if map is not None else {} if known is None else known.channel_map
-    machine, problems = CommissionedMachine(name, (), known, channel_map, rate, limit), list[str]()
-    places, recordings, samples = dict[str, Path](), dict[str, Recording](), 0
+    RepairLimit.parse(limit)
+    stated_rig = None if rig is None else load_rig(rig)
+    channel_map = map if map is not None else {} if stated_rig is None else stated_rig.channel_map
+    machine, problems = CommissionedMachine(name, (), stated_rig, channel_map, rate, limit), list[str]()
+    # by file name; recordings only as far as they fit into memory
+    path_of, recording_of, n_samples = dict[str, Path](), dict[str, Recording](), 0
     for path in recordings_in(paths):
         try:
             recording = machine.read(path)
-            machine = machine._add(recording, path.name, checksum_of(path))
+            machine = machine._with_recording(recording, path.name, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
             continue
-        places[path.name], samples = path, samples + len(recording) * len(recording.channels)
-        if samples < _KEPT_SAMPLES:
-            recordings[path.name] = recording
+        path_of[path.name], n_samples = path, n_samples + len(recording) * len(recording.channels)
+        if n_samples < _MAX_SAMPLES:
+            recording_of[path.name] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
-    machine = replace(machine, left_out=tuple(problems))
 
-    def judge(learnt: Learnt, rest: tuple[Learnt, ...]) -> Diagnosis:
-        recording = recordings.get(learnt.file) or machine.read(places[learnt.file])
-        return replace(machine, healthy=rest).diagnose(recording)
+    def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
+        """Diagnose a healthy recording by the `reference` ones."""
+        recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
+        return replace(machine, healthy=reference).diagnose(recording)
 
-    outliers = find_outliers(machine.healthy, judge)
-    healthy, leaking = (machine.healthy, ()) if keep else without_leaks(machine.healthy, outliers)
-    return replace(machine, healthy=with_remarks(healthy, outliers), left_out=(*machine.left_out, *leaking))
+    healthy, leaking = cross_check(machine.healthy, judge, keep)
+    return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
 
 
 def checksum_of(path: str | os.PathLike[str]) -> str:

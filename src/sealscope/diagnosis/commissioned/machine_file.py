@@ -1,12 +1,11 @@
-"""The file of a commissioned machine: TOML that people read and edit, with its lessons in a file beside it.
+"""The file of a commissioned machine: TOML that people read and edit, with its summaries in a file next to it.
 
 It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
-`[machine]` names it, `[learnt]` is what its healthy recordings say, for people to read, and each `[[healthy]]` names a
-recording and the checksum of what it has taught, its lesson in the file beside (`lessons_file`). `[[alarms]]` is what
-persons said of alarms.
+`[machine]` names it, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]` names a
+recording and the checksum of its summary in that file (`healthy_file`). `[[alarms]]` are judgements of persons.
 
-The lessons are written before the text, with those of the text that is there and of the one that is kept as `.bak`. So
-each text finds its lessons whenever a writer is killed.
+The summaries are written before the text, with those of the present text and of its backup, `.bak`,
+so that each text finds its summaries whenever a writer is killed.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -24,41 +24,44 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.lessons_file import (
+from sealscope.diagnosis.commissioned.healthy_file import (
+    OLD_SUFFIX,
     SUFFIX,
-    format_lesson,
-    list_of,
-    make_table,
-    read_lessons,
+    Line,
+    format_summary,
+    list_type,
     read_lines,
-    table_of,
+    read_summaries,
+    table_type,
+    uniform_table_type,
     write_lines,
 )
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, Judgement, Origin
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
-from sealscope.parameters.load import OF_MACHINES
-from sealscope.recordings.formats.columns import REST, check_call
+from sealscope.parameters.load import MACHINE_TABLES
+from sealscope.recordings.formats.columns import REST, check_request
 from sealscope.storage.atomic import atomic_write, check_folder
-from sealscope.storage.folders import locked
-from sealscope.storage.plain_values import as_type
+from sealscope.storage.folders import lock_file
+from sealscope.storage.plain_values import convert_type
 from sealscope.storage.toml_file import parse_toml, read_toml
 
 #: What this version writes and reads; names in [machine] that are written anew with each change.
-_FORMAT, _REWRITTEN = 2, ("sealscope", "written", "lessons")
-#: Lessons that neither text names are kept while the file is smaller [bytes].
+_FORMAT, _REWRITTEN = 2, ("sealscope", "written", "summaries")
+#: Summaries that neither text names are written, too, while the file is smaller [bytes].
 _SPARE = 5_000_000
-#: Longest wait for another process that writes [s], and what is said then.
+#: Longest wait for another process that writes [s], and the error then.
 _LONGEST_WAIT, _BUSY = 60.0, "a machine's file must be free to be written, got another process that writes it ({})"
 _HEAD = """\
 # A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
-# change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. What the
-# recordings have taught is in the file of lessons beside this one: move them together.
+# change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. The numbers
+# of the recordings are in the file of healthy summaries beside this one: move them together.
 """
 
 
-def _moment(text: Any) -> float:
+def _parse_moment(text: Any) -> float:
+    """Parse an ISO 8601 time as seconds since 1970; raise ValueError otherwise."""
     try:
         moment = datetime.fromisoformat(text).timestamp()
         datetime.fromtimestamp(moment, UTC)
@@ -67,19 +70,20 @@ def _moment(text: Any) -> float:
     return moment
 
 
-#: A file's name, which leads to no other folder.
-_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.lessons")
-_Moment = Annotated[float, BeforeValidator(_moment)]
+#: Name of a file of summaries in the same folder.
+_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.(healthy|lessons)")
+_Moment = Annotated[float, BeforeValidator(_parse_moment)]
 
 
 def _check_format(number: int) -> int:
+    """Check that a file is of the format that this version reads; raise ValueError otherwise."""
     if number != _FORMAT:
         raise ValueError(f"must be {_FORMAT}, got {number}: commission it anew")
     return number
 
 
-_HEALTHY = make_table(file=str, lesson=Annotated[str, Field(pattern="^[0-9a-f]{64}$")])
-_ALARM = make_table(
+_HEALTHY = table_type(file=str, summary=Annotated[str, Field(pattern="^[0-9a-f]{64}$")])
+_ALARM = table_type(
     alarm=str,
     mark=Judgement,
     date_s=Annotated[_Moment, Field(alias="date")],
@@ -87,16 +91,16 @@ _ALARM = make_table(
     leak_lpm=(float, None),
     reason=(str, None),
 )
-_FILE = make_table(
-    machine=make_table(
+_FILE = table_type(
+    machine=table_type(
         format=Annotated[int, AfterValidator(_check_format)],
         name=str,
         rate=(float, None),
         limit=(str, None),
-        left_out=(list_of(str), None),
+        left_out=(list_type(str), None),
     ),
-    map=(table_of(str), None),
-    healthy=list_of(_HEALTHY, fewest=1),
+    map=(uniform_table_type(str), None),
+    healthy=list_type(_HEALTHY, min_length=1),
 )
 
 
@@ -104,7 +108,7 @@ _FILE = make_table(
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
     """Write a machine's file completely or not at all; an existing file is kept as `.toml.bak`.
 
-    A link is written through. Its lessons are written beside it, as `.lessons`.
+    A link is written through. The summaries of its healthy recordings are written next to it, as `.healthy`.
 
     Parameters
     ----------
@@ -135,13 +139,14 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     ...     ss.read_machine(path)
     <CommissionedMachine machine: 1 healthy recording>
     """
-    target = _resolve(path)
-    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
+    target = _resolve_target(path)
+    with _lock(target):
         if machine.origin is not None and machine.origin.path == target and target.exists():
-            change = _change_since(machine.origin, _parts(_read(target)), _parts(_tree_of(machine, target)))
+            new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
+            change = _find_change(machine.origin, _hash_parts(_read_checked(target)), _hash_parts(new_tree))
             if change is not None:
                 raise InputError(f"a machine's file must be as it was read, got {change}: load it again ({target})")
-        _write(machine, target)
+        _write_files(machine, target)
     return Path(path)
 
 
@@ -150,30 +155,30 @@ def update_machine(
 ) -> CommissionedMachine:
     """Read, change and write a machine's file without losing the changes of another process.
 
-    `change` is called once, and once more where the file has changed meanwhile; nobody waits for the first call. Raises
-    InputError as `read_machine`, `write_machine` and `change` do; then the file stays as it was.
+    `change` is called once without a lock, and once more if the file has changed meanwhile. Raises InputError as
+    `read_machine`, `write_machine` and `change` do; then the file stays as it was.
     """
-    target = _resolve(path)
+    target = _resolve_target(path)
     machine = read_machine(target)
     changed = change(machine)
-    with locked(_lock_of(target), _BUSY.format(target), _LONGEST_WAIT):
-        if machine.origin != Origin(target, frozenset(_parts(_read(target)))):
+    with _lock(target):
+        if machine.origin != Origin(target, frozenset(_hash_parts(_read_checked(target)))):
             changed = change(read_machine(target))
-        _write(changed, target)
+        _write_files(changed, target)
     return changed
 
 
-def _resolve(path: str | os.PathLike[str]) -> Path:
-    """Follow a path's links to the file to write; InputError where its name does not end in .toml."""
-    target = _follow(path)
+def _resolve_target(path: str | os.PathLike[str]) -> Path:
+    """Follow a path's links to the file to write; raise InputError if it does not end in .toml."""
+    target = _follow_links(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
     check_folder(target)
     return target
 
 
-def _follow(path: str | os.PathLike[str]) -> Path:
-    """Follow a path's links to a file; InputError where they end in a circle."""
+def _follow_links(path: str | os.PathLike[str]) -> Path:
+    """Follow a path's links to a file; raise InputError if they end in a circle."""
     try:
         return Path(path).resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -181,24 +186,28 @@ def _follow(path: str | os.PathLike[str]) -> Path:
         raise InputError(f"a machine's file must be readable, got: {reason} ({os.fspath(path)})") from None
 
 
-def _lock_of(target: Path) -> Path:
-    return target.with_name(f".{target.name}.lock")
+def _lock(target: Path) -> AbstractContextManager[object]:
+    """Lock a machine's file against other processes that write it; raise InputError if one takes too long."""
+    return lock_file(target.with_name(f".{target.name}.lock"), _BUSY.format(target), _LONGEST_WAIT)
 
 
-def _write(machine: CommissionedMachine, target: Path) -> None:
-    """Write lessons, kept text and text, in this order: each text finds its lessons after any of them.
+def _write_files(machine: CommissionedMachine, target: Path) -> None:
+    """Write the file of summaries, the backup, and the machine's text, so that an interruption leaves no text without.
 
-    Raises InputError where the text would not be read again.
+    The file of summaries has those of the machine, those that the present text and its backup name, and further
+    present ones, while it is small. Raises InputError if the text would not be read again.
     """
-    lessons, data = [format_lesson(learnt) for learnt in machine.healthy], _format_text(machine, target)
-    _stated_in(parse_toml(data, "a machine's file", str(target)), str(target))
-    backup, lines = target.with_suffix(".toml.bak"), {line.checksum: line for line in lessons}
-    texts = [(path, _read_if_there(path)) for path in (target, backup)]
-    present = {line.checksum: line for path, tree in texts for line in read_lines(_lessons_path(path, tree))}
-    for checksum in (checksum for _, tree in texts for checksum in _lessons_named(tree) if checksum in present):
-        lines.setdefault(checksum, present[checksum])
+    data = _format_text(machine, target)
+    _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
+    backup, present_lines, named_checksums = target.with_suffix(".toml.bak"), dict[str, Line](), list[str]()
+    for path in (target, backup):
+        tree = _read_if_valid(path)
+        present_lines |= {line.checksum: line for line in read_lines(_summaries_path(path, tree))}
+        named_checksums += _named_summaries(tree)
+    lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
+    lines |= {line.checksum: line for line in map(format_summary, machine.healthy)}
     size = sum(len(line.data) for line in lines.values())
-    for checksum, line in present.items():  # of texts that were renamed or copied
+    for checksum, line in present_lines.items():  # texts that were renamed or copied may name it
         if checksum not in lines and (size := size + len(line.data)) < _SPARE:
             lines[checksum] = line
     write_lines([*lines.values()], target.with_suffix(SUFFIX))
@@ -210,95 +219,107 @@ def _write(machine: CommissionedMachine, target: Path) -> None:
 
 
 def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
-    return (_HEAD + "\n".join(_lines(_tree(machine, target))) + "\n").encode()
+    """Format the text of a machine's file at `target`."""
+    return (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
 
 
-def _tree_of(machine: CommissionedMachine, target: Path) -> dict[str, Any]:
-    """Return the tables of a machine's text as they are read again."""
-    return parse_toml(_format_text(machine, target), "a machine's file", str(target))
-
-
-def _read_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
-    """Read the rows of [[alarms]], one after the other; ValueError for the first that breaks a rule."""
+def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
+    """Parse the rows of [[alarms]], one at a time to save memory; raise ValueError for the first that breaks a rule."""
     if not isinstance(rows, list):
         raise ValueError(f"alarms must be tables, got {rows!r:.60}")
     alarms = []
     for number, row in enumerate(rows, 1):
         try:
-            alarms.append(JudgedAlarm(**as_type(_ALARM, row).model_dump(exclude_unset=True)))
+            alarms.append(JudgedAlarm(**convert_type(_ALARM, row).model_dump(exclude_unset=True)))
         except ValueError as error:
             raise ValueError(f"alarms[{number}].{error}") from None
     return tuple(alarms)
 
 
-def _parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Return the hash and name of each part of a machine's text that another process may add or remove."""
+def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
+    """Hash each part of a machine's text that another process may change; return a description of each by its hash."""
 
-    def hash_of(value: Any) -> bytes:
+    def hash_value(value: Any) -> bytes:
+        """Hash a plain value."""
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
-    head = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
-    tables = {name: table for name, table in tree.items() if name not in OF_MACHINES}
-    parts = {hash_of([head, tables]): "another statement of the machine"}
-    parts |= {hash_of(row["lesson"]): f"another recording, {row['file']}" for row in tree["healthy"]}
-    return parts | {hash_of(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
+    statements = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
+    rig_tables = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
+    parts = {hash_value([statements, rig_tables]): "another statement of the machine"}
+    parts |= {hash_value(row["summary"]): f"another recording, {row['file']}" for row in tree["healthy"]}
+    return parts | {hash_value(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _change_since(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Name a part added to, or removed from, a machine's file that writing would undo; None for nothing.
+def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
+    """Find a part added to, or removed from, a machine's file since it was read, which writing would undo.
 
-    `present`: parts of the file; `written`: parts of the machine to be written, which was read with those of `origin`.
+    `present`, `written`: parts (`_hash_parts`) of the present file, and of the machine to be written, which was read
+    with those of `origin`.
     """
-    added = [name for part, name in present.items() if part not in origin.parts and part not in written]
-    removed = [name for part, name in written.items() if part in origin.parts and part not in present]
-    return next(iter((*added, *removed)), None)
+    changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
+    changes += [text for part, text in written.items() if part in origin.parts and part not in present]
+    return changes[0] if changes else None
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """Return the tables of a machine's text, checked but for its rig; InputError where one breaks a rule."""
-    tree = read_toml(path, "a machine's file", str(path))
-    _stated_in(tree, str(path))
+def _read_checked(path: Path) -> dict[str, Any]:
+    """Read and check the tables of a machine's text except its rig's; raise InputError if one breaks a rule."""
+    tree = _read_tree(path, str(path))
+    _convert_tree(tree, str(path))
     return tree
 
 
-def _read_if_there(path: Path) -> dict[str, Any]:
-    """Return the tables of a machine's text, none where it cannot be read."""
+def _read_tree(path: Path, place: str) -> dict[str, Any]:
+    """Read the tables of a machine's text at `place` without a check, keys from before version 0.1 renamed."""
+    tree = read_toml(path, "a machine's file", place)
+    rows = tree.get("healthy")
+    for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
+        for name in ("lesson", "lessons") if isinstance(table, dict) else ():
+            if name in table:
+                table["summary" if name == "lesson" else "summaries"] = table.pop(name)
+    return tree
+
+
+def _read_if_valid(path: Path) -> dict[str, Any]:
+    """Read the tables of a machine's text; none if it cannot be read."""
     try:
-        return read_toml(path, "a machine's file", str(path))
+        return _read_tree(path, str(path))
     except InputError:
         return {}
 
 
-def _lessons_named(tree: Mapping[str, Any]) -> list[str]:
-    """Return the checksums of the lessons that a machine's text, valid or not, names."""
+def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
+    """List the checksums of the summaries that a machine's text, valid or not, names."""
     rows = tree.get("healthy")
-    checksums = [row.get("lesson") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
 
 
-def _lessons_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return a machine's file of lessons: the one of the same name if it exists, else the one its text states."""
-    default, head = path.with_suffix(SUFFIX), tree.get("machine")
-    name = head.get("lessons") if isinstance(head, dict) else None
-    if default.exists() or not isinstance(name, str) or _FILE_NAME.fullmatch(name) is None:
-        return default
-    return path.with_name(name) if path.with_name(name).exists() else default
+def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
+    """Return a machine's file of healthy summaries: the one of the same name if it exists, else that its text names."""
+    machine_table = tree.get("machine")
+    name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
+    candidates = [path.with_suffix(SUFFIX), path.with_suffix(OLD_SUFFIX)]
+    if isinstance(name, str) and _FILE_NAME.fullmatch(name) is not None:
+        candidates.append(path.with_name(name))
+    return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
 
 
-def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Return the tables of a machine's file at `path`."""
+def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
+    """Build the tables of a machine's file at `path`."""
     from importlib.metadata import version
 
-    summary, columns, now = machine.summary, machine.channel_map, datetime.now(UTC).isoformat(timespec="seconds")
-    head = {
+    summary, columns = machine.summary, machine.channel_map
+    machine_table = {
         "format": _FORMAT,
         "name": machine.name,
-        "lessons": path.with_suffix(SUFFIX).name,
+        "summaries": path.with_suffix(SUFFIX).name,
         "sealscope": version("sealscope"),
-        "written": now,
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "rate": machine.rate,
+        "limit": machine.limit,
+        "left_out": machine.left_out or None,
     }
-    head |= {"rate": machine.rate, "limit": machine.limit, "left_out": machine.left_out or None}
-    tree: dict[str, Any] = {"machine": head}
+    tree: dict[str, Any] = {"machine": machine_table}
     if columns:
         tree["map"] = {REST: columns} if isinstance(columns, str) else columns
     if machine.rig is not None:
@@ -306,49 +327,55 @@ def _tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
     terms = {name: term._asdict() for name, term in summary.terms.items()}
     tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
-    tree["healthy"] = [{"file": learnt.file, "lesson": format_lesson(learnt).checksum} for learnt in machine.healthy]
+    tree["healthy"] = [{"file": entry.file, "summary": format_summary(entry).checksum} for entry in machine.healthy]
     tree["alarms"] = [
-        {"alarm": alarm.alarm, "mark": alarm.mark, "date": _stamp(alarm.date_s), "onset": _stamp(alarm.onset_s)}
-        | {"leak_lpm": alarm.leak_lpm or None, "reason": alarm.reason or None}
+        {
+            "alarm": alarm.alarm,
+            "mark": alarm.mark,
+            "date": datetime.fromtimestamp(alarm.date_s, UTC).isoformat(),
+            "onset": datetime.fromtimestamp(alarm.onset_s, UTC).isoformat(),
+            "leak_lpm": alarm.leak_lpm or None,
+            "reason": alarm.reason or None,
+        }
         for alarm in machine.alarms
     ]
     return tree
 
 
-def _stamp(moment: float | None) -> str | None:
-    return None if moment is None else datetime.fromtimestamp(moment, UTC).isoformat()
+def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
+    """Format a table as lines of TOML: values and inline tables of plain values first, then the inner tables.
 
-
-def _lines(tree: Mapping[str, Any], path: str = "", head: str = "") -> list[str]:
-    """Return the lines of a table: its values, tables of figures alone among them, then the tables within."""
-    lines, within = list[str](), list[str]()
+    `path`: its dotted name, "" for the whole file, in which lists are of tables; `heading`: its first line.
+    """
+    lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
-        place = f"{path}.{_key(name)}" if path else _key(name)
-        figures = isinstance(value, Mapping) and all(
-            isinstance(item, str | float | int | None) for item in value.values()
-        )
-        if isinstance(value, Mapping) and not (path and value and figures):
-            within += _lines(value, place, f"[{place}]")
+        inner_path = f"{path}.{_format_key(name)}" if path else _format_key(name)
+        is_table = isinstance(value, Mapping)
+        is_plain = is_table and all(isinstance(member, str | float | int | None) for member in value.values())
+        is_inline = path and value and is_plain
+        if is_table and not is_inline:
+            inner_lines += _format_table(value, inner_path, f"[{inner_path}]")
         elif isinstance(value, list) and not path:
-            within += [line for row in value for line in _lines(row, place, f"[[{place}]]")]
+            inner_lines += [line for row in value for line in _format_table(row, inner_path, f"[[{inner_path}]]")]
         elif value is not None:
-            lines.append(f"{_key(name)} = {_value(value)}")
-    return [*(["", head, *lines] if lines else []), *within]
+            lines.append(f"{_format_key(name)} = {_format_value(value)}")
+    return [*(["", heading, *lines] if lines else []), *inner_lines]
 
 
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _value(name)
+def _format_key(name: str) -> str:
+    """Format a TOML key, quoted unless it may be bare."""
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _format_value(name)
 
 
-def _value(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """Format a plain value as TOML, without members that are None; numbers to the last digit."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
-        members = (f"{_key(name)} = {_value(item)}" for name, item in value.items() if item is not None)
+        members = (f"{_format_key(name)} = {_format_value(item)}" for name, item in value.items() if item is not None)
         return "{ " + ", ".join(members) + " }"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        return "[" + ", ".join(map(_format_value, value)) + "]"
     if isinstance(value, float):
         return repr(value)
     if isinstance(value, str):  # names of files may be no text
@@ -382,38 +409,37 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     Traceback (most recent call last):
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """
-    place, target = os.fspath(path), _follow(path)
-    tree = read_toml(target, "a machine's file", place)
-    stated = _stated_in(tree, place)
-    head, rig = stated["machine"], {name: table for name, table in tree.items() if name not in (*OF_MACHINES, "map")}
-    lessons = _lessons_path(target, tree)
-    if not lessons.exists():
-        rule = (
-            f"{lessons.name} must lie beside a machine's file, got none: move it there, or commission the machine anew"
-        )
-        raise InputError(f"{rule} ({place})")
+    place, target = os.fspath(path), _follow_links(path)
+    tree = _read_tree(target, place)
+    tables = _convert_tree(tree, place)
+    machine_table = tables["machine"]
+    rig_tables = {name: table for name, table in tree.items() if name not in (*MACHINE_TABLES, "map")}
+    summaries = _summaries_path(target, tree)
+    if not summaries.exists():
+        rule = "must lie beside a machine's file, got none: move it there, or commission the machine anew"
+        raise InputError(f"{summaries.name} {rule} ({place})")
     return CommissionedMachine(
-        name=head["name"],
-        healthy=tuple(read_lessons(lessons, {row["lesson"]: row["file"] for row in stated["healthy"]})),
-        rig=Rig.from_dict(rig, place=place) if rig else None,
-        channel_map=stated.get("map", {}),
-        rate=head.get("rate"),
-        limit=head.get("limit"),
-        left_out=tuple(head.get("left_out", ())),
-        alarms=stated["alarms"],
-        origin=Origin(target, frozenset(_parts(tree))),
+        name=machine_table["name"],
+        healthy=tuple(read_summaries(summaries, {row["summary"]: row["file"] for row in tables["healthy"]})),
+        rig=Rig.from_dict(rig_tables, place=place) if rig_tables else None,
+        channel_map=tables.get("map", {}),
+        rate=machine_table.get("rate"),
+        limit=machine_table.get("limit"),
+        left_out=tuple(machine_table.get("left_out", ())),
+        alarms=tables["alarms"],
+        origin=Origin(target, frozenset(_hash_parts(tree))),
     )
 
 
-def _stated_in(tree: dict[str, Any], place: str) -> dict[str, Any]:
-    """Return the checked tables of a machine's text; InputError, with the `place`, where a value breaks a rule."""
+def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
+    """Check and convert the tables of a machine's text; raise InputError, with the `place`, if one breaks a rule."""
     try:
-        stated: dict[str, Any] = as_type(_FILE, tree).model_dump(exclude_unset=True)
-        check_call(stated.get("map", {}), stated["machine"].get("rate"))
-        RepairLimit.of(stated["machine"].get("limit"))
-        stated["alarms"] = _read_alarms(tree.get("alarms", []))
-        if len({row["lesson"] for row in stated["healthy"]}) < len(stated["healthy"]):
-            raise ValueError("healthy must name each lesson once")
+        tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)
+        check_request(tables.get("map", {}), tables["machine"].get("rate"))
+        RepairLimit.parse(tables["machine"].get("limit"))  # raises InputError, a ValueError
+        tables["alarms"] = _parse_alarms(tree.get("alarms", []))
+        if len({row["summary"] for row in tables["healthy"]}) < len(tables["healthy"]):
+            raise ValueError("healthy must name each summary once")
     except ValueError as error:
         raise InputError(f"{error} ({place})") from None
-    return stated
+    return tables

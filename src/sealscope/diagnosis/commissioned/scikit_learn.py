@@ -64,21 +64,22 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def score_samples(self, X: Paths) -> Array:
-        """Return the negative score of each file: the lower, the more it leaks; nan where it cannot be judged."""
+        """Compute the negative score of each file: the lower, the more it leaks; nan if it cannot be judged."""
         return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
-        """Return threshold less score of each file: < 0 for a leak, nan where it cannot be judged."""
+        """Compute the threshold minus the score of each file: < 0 for a leak, nan if it cannot be judged."""
         diagnoses = self._diagnoses(X)
         score: Array = np.array([diagnosis.score for diagnosis in diagnoses], dtype=float)
         return np.array([diagnosis.threshold for diagnosis in diagnoses], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
-        """Return -1 for each file with a leak, 1 for one without, 0 where it cannot be told."""
+        """Return -1 for each file with a leak, 1 for one without, 0 if it cannot be judged."""
         labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
         return np.array([labels[diagnosis.verdict] for diagnosis in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
+        """Diagnose each file by the commissioned machine."""
         check_is_fitted(self)
         p = self.false_alarm_probability
         return [self.machine_.diagnose(path, false_alarm_probability=p) for path in X]

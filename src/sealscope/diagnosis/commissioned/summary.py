@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -11,26 +12,30 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
-from sealscope.diagnosis.inference.blocks import Columns, solve
+from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
-from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.priors.commissioned import COMMISSIONED
+from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.paragraphs import paragraphs
+from sealscope.recordings.motion import estimate_quantum
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.learnt import Learnt
+    from sealscope.diagnosis.healthy import SummarisedRecording, Summary
     from sealscope.parameters import Rig
 
-_BALANCE, _ASKED = VolumeBalance.name, priors("commissioned")["smallest"]
+#: Findings that a logger causes in each recording: corrected there, and reported when the machine is commissioned.
+_LOGGER_HABITS = ("unsigned_speed",)
+_PRIORS = COMMISSIONED.smallest
 
 
 class TermEstimate(NamedTuple):
-    """A coefficient of the balance: estimate, its standard deviation, its scatter between recordings, unit."""
+    """A coefficient of the balance: value, standard error, standard deviation between recordings (or None), unit."""
 
     value: float
     deviation: float
@@ -38,11 +43,11 @@ class TermEstimate(NamedTuple):
     unit: str
 
 
-class Smallest(NamedTuple):
-    """The smallest leak that the next recording shows.
+class SmallestLeak(NamedTuple):
+    """The smallest leak that the next recording detects with the stated probability.
 
-    `lpm` [L/min], None where the machine's size is not stated, and `share` of the pump's flow; `halved_by`: how many
-    times as many healthy recordings, of as many more days, make it half as large, None where ten times do not.
+    `lpm` [L/min], None if the machine's size is not stated, and `share`, a fraction of the pump's flow; `halved_by`:
+    factor of healthy recordings, and days, that halves it; None if the largest factor tried does not.
     """
 
     lpm: float | None
@@ -55,63 +60,62 @@ class Smallest(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Summary:
+class MachineSummary:
     """Figures of a machine from its healthy recordings.
 
-    `terms` by name; `noise` of each channel in its unit; `smallest` leak, None where no balance states one; `problems`:
-    what looks wrong, a line each.
+    `terms` by name; `noise`: standard deviation by channel in its unit; `smallest` leak, None if no balance states one;
+    `problems`: a line each.
     """
 
     terms: Mapping[str, TermEstimate]
     noise: Mapping[str, float]
-    smallest: Smallest | None
+    smallest: SmallestLeak | None
     problems: list[str] = field(default_factory=list)
 
-    def text(self, healthy: Sequence[Learnt], rig: Rig | None) -> str:
-        """Format the summary in some ten lines."""
-        units = healthy[0].units if healthy else {}
+    def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
+        """Format the summary as a table of some ten lines."""
+        units = dict(healthy[0].units) if healthy else {}
+        display_units = {name: _display_unit(healthy, name, unit) for name, unit in units.items()}
         starts = [recording.start_s for recording in healthy if recording.start_s is not None]
         dates = sorted(datetime.fromtimestamp(start, UTC).date().isoformat() for start in starts)
         span = f", {' to '.join(dict.fromkeys((dates[0], dates[-1])))}" if dates else ""
         noise = []
         for name, value in self.noise.items():
-            unit = units.get(name, "")
-            display_unit = {"Pa": "bar", "m": "mm"}.get(unit, unit)
-            noise.append(f"{name} {from_si(value, display_unit, unit):.2g} {display_unit}")
+            unit, display_unit = units.get(name, ""), display_units.get(name, "")
+            deviation = from_si(value, display_unit, unit) - from_si(0.0, display_unit, unit) if unit else value
+            noise.append(f"{name} {deviation:.2g} {display_unit}")
+        seconds = sum(recording.seconds for recording in healthy)
+        n_alarms = sum(BY_OTHERS in problem for problem in self.problems)
+        rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
         rows = [
-            (
-                "recordings",
-                f"{len(healthy)} healthy, {sum(recording.seconds for recording in healthy):.4g} s in all{span}",
-            ),
-            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in units.items())),
+            ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
+            ("channels", ", ".join(f"{name} [{unit}]" for name, unit in display_units.items())),
             ("machine", _describe_rig(rig)),
-            ("duty", _duty(healthy)),
+            ("duty", _format_duty(healthy, display_units.get("p_A", "bar"))),
             ("noise", ", ".join(noise)),
+            *self._smallest_leak_rows(len(healthy), are_dated=bool(dates)),
+            ("false alarms", f"{rate}; {n_alarms or 'none'} of them stand out of the others"),
+            *(("check", problem) for problem in self.problems),
         ]
-        if self.smallest is not None:
-            share = 100.0 * _ASKED["power"]
-            rows.append(("smallest leak", f"the next recording shows {self.smallest} ({share:g} % of the time)"))
-            half = "twice the pressure difference at the same flow; more recordings alone do not"
-            if (times := self.smallest.halved_by) is not None:
-                half = f"{times * len(healthy)} healthy recordings instead of {len(healthy)}"
-                half += ", of as many more days" if dates else ""
-            rows.append(("half of that", half))
-        else:
-            needs = "speed or angle of the pump, flow or command, and two recordings"
-            rows.append(("smallest leak", f"not known, that needs {needs}; the ringing alone judges"))
-        alarms = sum(BY_OTHERS in problem for problem in self.problems)
-        promised = (
-            f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
-        )
-        rows.append(("false alarms", f"{promised}; {alarms or 'none'} of them stand out of the others"))
-        rows += [("check", problem) for problem in self.problems]
         return "\n".join(paragraphs(rows, 16))
+
+    def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
+        """Format the smallest leak, and what halves it, for `n_healthy` recordings, with days if they `are_dated`."""
+        if self.smallest is None:
+            needs = "speed or angle of the pump, flow or command, and two recordings"
+            return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
+        half = "twice the pressure difference at the same flow; more recordings alone do not"
+        if (factor := self.smallest.halved_by) is not None:
+            half = f"{factor * n_healthy} healthy recordings instead of {n_healthy}"
+            half += ", of as many more days" if are_dated else ""
+        power = f"{100.0 * _PRIORS.power:g} % of the time"
+        return [("smallest leak", f"the next recording shows {self.smallest} ({power})"), ("half of that", half)]
 
 
 def _describe_rig(rig: Rig | None) -> str:
-    """Describe the stated sizes of the machine in words."""
-    rig = rig or unstated()
-    if rig.states("cylinder.M_eq"):
+    """Format the stated sizes of the machine."""
+    rig = rig or unstated_rig()
+    if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
         return rig.title or rig.name
     parts = []
     if rig.states("cylinder.A_A", "cylinder.A_B"):
@@ -122,14 +126,22 @@ def _describe_rig(rig: Rig | None) -> str:
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 
-def _duty(healthy: Sequence[Learnt]) -> str:
-    """Return the ranges of the pump's mean flow, where the machine's size is stated, of pressure and temperature."""
-    lessons = [recording.lessons.get(_BALANCE, {}) for recording in healthy]
-    flows = [lesson.get("flow", 0.0) * lesson.get("scale", 0.0) / LITRE_PER_MINUTE for lesson in lessons]
+def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) -> str:
+    """Return the unit to display a channel in: that of the log, else a common one instead of the SI `unit`."""
+    log_unit = healthy[0].about.get("log_units", {}).get(name)
+    return str(log_unit or {"Pa": "bar", "m": "mm"}.get(unit, unit))
+
+
+def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
+    """Format the ranges of pump flow, if the machine's size is stated, of pressure difference and oil temperature."""
+    summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
+    flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
     ranges = {
         "L/min": [flow for flow in flows if flow > 0.0],
-        "bar between the chambers": [
-            recording.about["pressure_bar"] for recording in healthy if "pressure_bar" in recording.about
+        f"{pressure_unit} between the chambers": [
+            from_si(BAR * recording.about["pressure_bar"], pressure_unit, "Pa")
+            for recording in healthy
+            if "pressure_bar" in recording.about
         ],
         "deg C": [recording.about["oil_degC"] for recording in healthy if "oil_degC" in recording.about],
     }
@@ -141,123 +153,139 @@ def _duty(healthy: Sequence[Learnt]) -> str:
     return ", ".join(texts)
 
 
-def about_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Describe a healthy recording for people, with its problems."""
+def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
+    """Describe a healthy recording for the summary: pressure, oil temperature, noise, units and problems."""
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
-        description["pressure_bar"] = _rounded(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
+        description["pressure_bar"] = _round_to_4_digits(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
-        description["oil_degC"] = _rounded(oil)
-    description["noise"] = {name: noise for name in part.channels if (noise := _noise(part[name])) > 0.0}
-    description["wrong"] = [
-        *(finding.text for finding in inspection.findings if finding.severity != "note"),
-        *(text for name in ("p_A", "p_B") if name in part and (text := _below_vacuum(part, name))),
-        *(text for name in ("omega", "u") if name in part and (text := _glitches(part, name))),
-    ]
+        description["oil_degC"] = _round_to_4_digits(oil)
+    description["noise"] = {name: noise for name in part.channels if (noise := _estimate_noise(recording[name])) > 0.0}
+    log_units = {name: unit for name in part.channels if (unit := recording.unit_in_log(name))}
+    if log_units:
+        description["log_units"] = log_units
+    findings = inspection.findings
+    problems = [finding.text for finding in findings if finding.severity != "note" or finding.code in _LOGGER_HABITS]
+    problems += [_describe_vacuum(part, name) for name in ("p_A", "p_B") if name in part]
+    problems += [_describe_glitches(part, name) for name in ("omega", "u") if name in part]
+    description["wrong"] = [text for text in problems if text]
     return description
 
 
-def summarised(healthy: Sequence[Learnt], rig: Rig | None, left_out: Sequence[str] = ()) -> Summary:
+def summarise_machine(
+    healthy: Sequence[SummarisedRecording], rig: Rig | None, left_out: Sequence[str] = ()
+) -> MachineSummary:
     """Summarise a machine's healthy recordings; `left_out`: the unusable ones with reasons."""
-    problems = [*left_out, *_collected(healthy)]
-    noises = [recording.about.get("noise", {}) for recording in healthy]
-    names = dict.fromkeys(name for noise_of in noises for name in noise_of)
-    noise = {name: float(np.median([noise_of[name] for noise_of in noises if name in noise_of])) for name in names}
-    with_lessons = [recording for recording in healthy if _BALANCE in recording.lessons]
-    comparable = [
-        recording
-        for recording in with_lessons
-        if recording.lessons[_BALANCE]["terms"] == with_lessons[0].lessons[_BALANCE]["terms"]
-    ]
-    problems += [
-        f"{recording.file} has other channels than {with_lessons[0].file}"
-        for recording in with_lessons
-        if recording not in comparable
-    ]
-    rig, channels = rig or unstated(), frozenset(comparable[0].units if comparable else ())
-    if not (comparable and equations(rig, channels)):
-        return Summary({}, noise, None, problems)
-    lessons, balance = [recording.lessons[_BALANCE] for recording in comparable], VolumeBalance(rig)
-    terms = _terms([np.asarray(lesson["sums"], dtype=float)[0] for lesson in lessons], rig, channels)
-    if len(comparable) == 1:
-        return Summary(terms, noise, None, problems)
-    return Summary(terms, noise, _smallest(balance, lessons, channels), problems)
+    problems = [*left_out, *_collect_problems(healthy)]
+    noises = defaultdict[str, list[float]](list)
+    for recording in healthy:
+        for name, value in recording.about.get("noise", {}).items():
+            noises[name].append(value)
+    noise = {name: float(np.median(values)) for name, values in noises.items()}
+    with_balance = [recording for recording in healthy if VOLUME_BALANCE in recording.summaries]
+    summaries: list[Summary] = []
+    for recording in with_balance:
+        summary = recording.summaries[VOLUME_BALANCE]
+        if not summaries or summary["terms"] == summaries[0]["terms"]:
+            summaries.append(summary)
+        else:
+            problems.append(f"{recording.file} has other channels than {with_balance[0].file}")
+    rig, channels = rig or unstated_rig(), frozenset(with_balance[0].units if with_balance else ())
+    if not (summaries and equations(rig, channels)):
+        return MachineSummary({}, noise, None, problems)
+    terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
+    smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if len(summaries) > 1 else None
+    return MachineSummary(terms, noise, smallest, problems)
 
 
-def _terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Return the estimates of the terms from all recordings together, and how each scatters between them."""
+def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
+    """Estimate the balance's terms from the Gram matrices of all recordings, and their scatter between recordings."""
     equation = equations(rig, channels)[0]
-    columns, units = Columns(equation), {term.name: term.unit for term in equation.terms}
-    chosen = list(columns.nuisance)
-
-    def fitted(gram: Array) -> Array:
-        return solve(gram[np.ix_(chosen, chosen)], gram[chosen, columns.left])
-
-    total, single = np.sum(sums, axis=0), np.array([fitted(gram) for gram in sums])
-    values = fitted(total)
-    variance = np.diag(solve(total[np.ix_(chosen, chosen)], np.eye(len(chosen))))
-    scatter = single.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(chosen)
+    roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
+    nuisance = list(roles.nuisance)
+    total, by_recording = np.sum(sums, axis=0), np.array([fit_columns(gram, roles, nuisance) for gram in sums])
+    values = fit_columns(total, roles, nuisance)
+    variance = np.diag(solve(total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))))  # rows have unit noise
+    scatter = by_recording.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(nuisance)
     return {
         name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
-        for i, name in enumerate(columns.names[k] for k in chosen)
+        for i, name in enumerate(roles.names[k] for k in nuisance)
     }
 
 
-def _smallest(balance: VolumeBalance, lessons: Sequence[Mapping[str, Any]], channels: frozenset[str]) -> Smallest:
-    """Return the smallest leak that a recording of another day shows, of the duties of the healthy ones.
+def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
+    """Fit the coefficients of some `columns` of a balance by least squares from its Gram matrix (m, m)."""
+    return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
-    A rise is found where it passes the threshold of Student's t; half is reached where the days are repeated so often
-    that the threshold and the deviation of their mean, and nothing of their scatter, take it there.
+
+def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
+    """Estimate the smallest leak that a recording on a later day, of a duty like the healthy ones, detects.
+
+    A leak is detected with the probability `power` if it exceeds the threshold (Student's t) by that quantile. More
+    healthy days lower the threshold and the error of their mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
-    def findable(repeated: int) -> float:
-        rise = balance.next_rise(lessons, channels, repeated)
-        return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_ASKED["power"])) * rise.deviation)
+    def smallest_rise(n_repeats: int) -> float:
+        """Estimate the smallest rise that is detected, given `n_repeats` times as many healthy days."""
+        rise = balance.predict_rise(summaries, channels, n_repeats)
+        return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 
-    pressure, flow = (float(np.median([lesson[name] for lesson in lessons])) for name in ("pressure", "flow"))
-    scale, smallest = float(np.median([lesson["scale"] for lesson in lessons])), findable(1)
-    halved = next((times for times in _ASKED["repeats"] if findable(times) <= 0.5 * smallest), None)
+    pressure, flow, scale = (
+        float(np.median([summary[name] for summary in summaries])) for name in ("pressure", "flow", "scale")
+    )
+    smallest = smallest_rise(1)
+    halved_by = next((n for n in _PRIORS.repeats if smallest_rise(n) <= 0.5 * smallest), None)
     share = smallest * pressure / flow if flow > 0.0 else float("nan")
-    return Smallest(smallest * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None, share, halved)
+    lpm = smallest * pressure * scale / LITRE_PER_MINUTE if scale > 0.0 else None
+    return SmallestLeak(lpm, share, halved_by)
 
 
-def _collected(healthy: Sequence[Learnt]) -> list[str]:
-    """Return the problems, each kind once, with the file or the number of files."""
-    kinds: dict[str, list[tuple[str, str]]] = {}
+def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
+    """List the problems of the recordings, each kind (text before a colon) once, with its file or number of files."""
+    by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
         for text in recording.about.get("wrong", ()):
-            kinds.setdefault(text.partition(":")[0], []).append((text, recording.file))
-    return [
-        f"{max(kind)[0]} ({kind[0][1] if len(kind) == 1 else f'in {len(kind)} of {len(healthy)}'})"
-        for kind in kinds.values()
-    ]
+            by_kind[text.partition(":")[0]].append((text, recording.file))
+    lines = []
+    for problems in by_kind.values():
+        text, file = max(problems)
+        lines.append(f"{text} ({file if len(problems) == 1 else f'in {len(problems)} of {len(healthy)}'})")
+    return lines
 
 
-def _noise(values: Array) -> float:
-    """Estimate the standard deviation of white noise from second differences, without outliers."""
-    second = np.diff(values[np.isfinite(values)], 2)
-    return _rounded(float(np.median(np.abs(second))) / 0.6745 / np.sqrt(6.0)) if second.size else 0.0
+def _estimate_noise(values: Array) -> float:
+    """Estimate the standard deviation of white noise from second differences, at least that of rounding.
+
+    Second differences of white noise have 6 times its variance; 0.6745: median size of a standard normal number.
+    """
+    known = values[np.isfinite(values)]
+    if known.size < 3:
+        return 0.0
+    deviation = float(np.median(np.abs(np.diff(known, 2)))) / 0.6745 / np.sqrt(6.0)
+    return _round_to_4_digits(max(deviation, estimate_quantum(known) / np.sqrt(12.0)))
 
 
-def _below_vacuum(part: Recording, name: str) -> str:
-    if part.units[name] != "Pa" or not (least := float(np.quantile(part[name], 0.01))) < -P_ATM:
+def _describe_vacuum(part: Recording, name: str) -> str:
+    """Report a pressure below vacuum in more than 1 % of the samples, "" if there is none."""
+    if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
-    off = (-P_ATM - least) / BAR
-    return f"{name} reads below vacuum: its zero is at least {off:.1g} bar too low"
+    offset = (-P_ATM - low_pressure) / BAR
+    return f"{name} reads below vacuum: its zero is at least {offset:.1g} bar too low"
 
 
-def _glitches(part: Recording, name: str) -> str:
-    """Report the number of samples that jump away and back by far more than all others."""
+def _describe_glitches(part: Recording, name: str) -> str:
+    """Report single samples that differ from both neighbours by more than the channel's range, "" if there are none."""
     values = part[name]
     if len(values) < 3:
         return ""
-    middle = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
-    away = np.abs(values[1:-1] - middle)
-    span = float(np.subtract(*np.quantile(values, (0.99, 0.01))))
-    jumped = int(np.count_nonzero(away > span)) if span > 0.0 else 0
-    return f"{name} has glitches: single samples jump beyond its whole range, and are weighted down" if jumped else ""
+    medians = np.median([values[:-2], values[1:-1], values[2:]], axis=0)
+    value_range = float(np.subtract(*np.quantile(values, (0.99, 0.01))))
+    if not (value_range > 0.0 and np.any(np.abs(values[1:-1] - medians) > value_range)):
+        return ""
+    return f"{name} has glitches: single samples jump beyond its whole range, and are weighted down"
 
 
-def _rounded(value: float) -> float:
+def _round_to_4_digits(value: float) -> float:
+    """Round a number to 4 significant digits."""
     return float(f"{value:.4g}")

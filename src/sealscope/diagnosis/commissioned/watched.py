@@ -1,8 +1,7 @@
-"""A machine's file as the monitor takes it: the rig that sizes flows, and how its logs are read."""
+"""What the monitor reads of a machine's file: the rig, how its logs are read, its repair limit and healthy level."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,22 +9,21 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.machine_file import read_machine
-from sealscope.diagnosis.inference.blocks import Columns, solve
-from sealscope.diagnosis.inference.terms import equations
-from sealscope.diagnosis.learnt import Learnt
+from sealscope.diagnosis.commissioned.summary import fit_columns
+from sealscope.diagnosis.healthy import SummarisedRecording
+from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.terms import PUMP, equations
 from sealscope.diagnosis.live.estimates import HealthyLevel
-from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.machine import unstated
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.storage.toml_file import read_toml
-from sealscope.units import LITRE_PER_MINUTE
 
-#: Method whose lessons hold the size of the flows.
-_BALANCE = "volume balance"
-#: Fewest healthy recordings whose leakage is compared with.
-_FEWEST = 2
+#: Fewest healthy recordings with which a leakage is compared: a single one has no scatter.
+_MIN_RECORDINGS = 2
 _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 
@@ -33,20 +31,11 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 class WatchedMachine:
     """An actuator to be watched, from a rig's or a machine's file.
 
-    Parameters
-    ----------
-    rig : Rig
-        Sizes the flows. Where areas alone are stated, the displacement is the one that the healthy recordings measured.
-    channel_map : mapping of str to str, or "auto"
-        Channel to column of its logs.
-    rate : float, optional
-        Sampling rate [Hz] of logs without a time column.
-    limit_lpm : float, optional
-        Leak from which it is to be repaired [L/min], None where it needs an area that is not stated.
-    machine : CommissionedMachine, optional
-        The machine whose healthy recordings judge whole recordings; None where there are none.
-    healthy : HealthyLevel, optional
-        What pump and piston pass together in them; None where they do not tell.
+    `rig`: machine's sizes; if only the areas are stated, with the displacement measured by the healthy recordings;
+    `channel_map`: channel to column of its logs; `rate` [Hz] of logs without a time column; `limit_lpm`: leak from
+    which it is to be repaired [L/min], None if that needs an area that is not stated; `machine` by whose healthy
+    recordings whole recordings are judged, None if it has none; `healthy`: leakage of pump and piston together in
+    these, None if they do not determine it.
     """
 
     rig: Rig
@@ -58,69 +47,67 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load a packaged rig, a rig's file or a machine's file for the monitor; InputError as `load_rig`."""
+    """Load a packaged rig, a rig file or a machine file for the monitor; raise InputError as `load_rig`."""
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
-        known = load_rig(rig)
-        return WatchedMachine(known, known.channel_map)
+        named_rig = load_rig(rig)
+        return WatchedMachine(named_rig, named_rig.channel_map)
     machine = read_machine(rig)
-    known = _with_measured_displacement(machine.rig or unstated(), machine.healthy)
-    limit_lpm, commissioned = _limit_lpm(machine.limit, known), machine if machine.healthy else None
-    level = _healthy_level(machine.healthy, machine.rig or unstated())
-    return WatchedMachine(known, machine.channel_map, machine.rate, limit_lpm, commissioned, level)
+    measured_rig = _with_measured_displacement(machine.rig or unstated_rig(), machine.healthy)
+    cylinder = measured_rig.cylinder
+    area = 0.5 * (cylinder.A_A + cylinder.A_B) if measured_rig.states(*_AREAS) else None
+    return WatchedMachine(
+        measured_rig,
+        machine.channel_map,
+        machine.rate,
+        limit_lpm=RepairLimit.parse(machine.limit).flow_lpm(area),
+        machine=machine if machine.healthy else None,
+        healthy=_healthy_level(machine.healthy, machine.rig or unstated_rig()),
+    )
 
 
-def is_remeasured(rig: Rig, before: Rig) -> bool:
-    """Test whether two rigs differ only in the displacement, measured anew from more healthy recordings."""
-    values, values_before = rig.model_dump(), before.model_dump()
+def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
+    """Test whether two rigs differ only in the displacement, by up to 5 % as a new measurement of it may."""
+    values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
         tree.get("pump", {}).pop("q_b", None)
-    return values == values_before and bool(np.isclose(rig.pump.q_b, before.pump.q_b, rtol=0.05))
+    return values == values_before and bool(np.isclose(rig.pump.q_b, rig_before.pump.q_b, rtol=0.05))
 
 
-def _with_measured_displacement(rig: Rig, healthy: tuple[Learnt, ...]) -> Rig:
-    """Add the displacement measured by the healthy recordings to a rig of stated areas."""
+def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
+    """Set a rig's displacement to that measured by the healthy recordings, if the areas alone are stated."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
-    lessons = (recording.lessons.get(_BALANCE) for recording in healthy)
-    scales = [float(lesson["scale"]) for lesson in lessons if isinstance(lesson, Mapping) and "scale" in lesson]
-    measured = [scale for scale in scales if np.isfinite(scale) and scale > 0.0]
-    if not measured:
+    summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
+    scales = [scale for summary in summaries if (scale := float(summary.get("scale", 0.0))) > 0.0]
+    if not scales:
         return rig
-    source = f"measured by {len(measured)} healthy recordings beside the stated areas"
-    return rig.with_overrides({_DISPLACEMENT: float(np.median(measured)) * rig.pump.q_b}, source=source)
+    source = f"measured by {len(scales)} healthy recordings beside the stated areas"
+    return rig.with_overrides({_DISPLACEMENT: float(np.median(scales)) * rig.pump.q_b}, source=source)
 
 
-def _healthy_level(healthy: tuple[Learnt, ...], rig: Rig) -> HealthyLevel | None:
-    """Estimate the leakage conductance of pump and piston together in healthy recordings, by the sums of their balance.
+def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
+    """Estimate the leakage conductance of pump and piston together from the sums of the healthy recordings.
 
-    None where fewer than two of them have one: how it scatters is not known then; and behind a valve, each edge of
-    which is a balance.
+    None if fewer than two recordings have it; a machine behind a servo valve, with several balances, has none.
     """
-    levels = []
-    for recording in healthy:
-        lesson, equation = recording.lessons.get(_BALANCE), equations(rig, frozenset(recording.units))
-        if not isinstance(lesson, Mapping) or not lesson.keys() >= {"sums", "scale"} or len(equation) != 1:
-            continue
-        columns, sums = Columns(equation[0]), np.asarray(lesson["sums"], dtype=float)[0]
-        if sums.shape != 2 * (columns.left + 1,):
-            continue
-        nuisances = [k for k in columns.nuisance if k != columns.leak and columns.names[k] != "pump leak"]
-        chosen = [*nuisances, columns.leak]
-        value = float(solve(sums[np.ix_(chosen, chosen)], sums[chosen, columns.left])[-1] * float(lesson["scale"]))
-        if np.isfinite(value):
-            levels.append(value)
-    if len(levels) < _FEWEST:
+    levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
+    if len(levels) < _MIN_RECORDINGS:
         return None
-    # what the warmest of them shows is healthy: the oil then may have been the warmest
-    low = max(min(levels), max(levels) / priors("inference")["oil"]["warmest"])
+    # the highest level may be due to the warmest oil: the lowest is no lower than that allows
+    low = max(min(levels), max(levels) / INFERENCE.oil.warmest)
     known_s = max((recording.start_s for recording in healthy if recording.start_s is not None), default=0.0)
-    return HealthyLevel(float(np.mean(levels)), low, max(levels), float(np.std(levels, ddof=1)), known_s)
+    return HealthyLevel(float(np.mean(levels)), low, max(levels), float(np.std(levels, ddof=1)), known_s, len(levels))
 
 
-def _limit_lpm(text: str | None, rig: Rig) -> float | None:
-    """Return the repair limit of a machine [L/min], the default one where none is stated; None without its area."""
-    limit = RepairLimit.of(text)
-    if limit.kind == "flow":
-        return limit.value / LITRE_PER_MINUTE
-    area = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B)
-    return limit.value * area / LITRE_PER_MINUTE if rig.states(*_AREAS) else None
+def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
+    """Fit the leakage conductance [m^3/(s Pa)] to a recording's sums; None if these are not of a single balance."""
+    summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
+    if summary is None or len(balances) != 1:
+        return None
+    roles, gram = ColumnRoles(balances[0]), np.asarray(summary["sums"], dtype=float)[0]
+    if gram.shape != 2 * (roles.left + 1,):
+        return None
+    # without the pump's leakage, which lies in parallel, the leak's column stands for both
+    nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
+    conductance = float(fit_columns(gram, roles, [*nuisance, roles.leak])[-1] * float(summary["scale"]))
+    return conductance if np.isfinite(conductance) else None

@@ -1,4 +1,4 @@
-"""Grounds of a decision: the judging report, rival explanations, healthy recordings, and the questions."""
+"""Grounds of a decision: the judging report, rival explanations, healthy recordings, and the tests of a leak."""
 
 from __future__ import annotations
 
@@ -13,23 +13,21 @@ from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     Explanation,
-    LeakRise,
     explain,
     probability_of,
 )
-from sealscope.diagnosis.decision.null import HealthyNull, key_of
+from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.inference.scatter import RISE
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Cause
 
-_PRIORS = priors("decision")
-#: The question beside WITHIN and AGAINST: is there more than the rig's file allows?
+#: The third test, after WITHIN and AGAINST: whether the leakage is more than the rig's file allows a healthy machine.
 LEVEL = "against the rig's file"
 
 
-class Question(NamedTuple):
-    """A question: its score and threshold, its predictive chance, its share of the false-alarm probability."""
+class LeakTest(NamedTuple):
+    """A test of a leak: its score and threshold, its `chance` in a healthy recording, and the allowed `probability`."""
 
     name: str
     score: float
@@ -39,134 +37,132 @@ class Question(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """An event other than a leak: cause, words, probability, and its rarest observable."""
+    """An event other than a leak, with its probability, the rarest observable that it explains, and its chance."""
 
     cause: Cause
-    words: str
+    description: str
     probability: float
     observable: Observable
     chance: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class DecisionContext:
-    """Conditions of a decision.
-
-    Parameters
-    ----------
-    false_alarm_probability : float
-        Probability of `leak` on a leak-free recording.
-    refusal : str, optional
-        Why the recording cannot be compared with the healthy ones that were given.
-    is_weighed : bool
-        Whether other causes compete; False for a method by its own rule.
-    """
-
-    false_alarm_probability: float
-    refusal: str | None = None
-    is_weighed: bool = True
-
-
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Grounds of a decision: the judging report, all observables, the null, and the context."""
+    """Grounds of a decision: the judging report, all observables, and their chances in healthy recordings (`null`).
+
+    `false_alarm_probability`: that of `leak` on a leak-free recording; `weigh_rivals`: whether other causes compete
+    with a leak, False for a method that decides alone.
+    """
 
     judge: Observed
     observables: Sequence[Observable]
     null: HealthyNull
-    context: DecisionContext
+    false_alarm_probability: float
+    weigh_rivals: bool = True
 
     @property
     def leak(self) -> LeakMeasure | None:
-        """Leak as measured by the judging provider."""
+        """Leak as measured by the judging provider, None if it measures none."""
         return self.judge.leak
+
+    @property
+    def rarest_observable(self) -> Observable:
+        """The judging provider's rarest observable."""
+        return min(self.judge.observables, key=lambda observable: observable.chance)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Sets of events with their probabilities."""
-        rise = None
-        if self.leak is not None and self.leak.rise is not None:
-            step = 0.0 if self.leak.step is None else self.leak.step.fitted[0] * self.leak.share_after
-            rise = LeakRise(self.leak.rise, step)
-        return explain(self.observables, self.null.chance, rise)
+        """Sets of events that explain the observables, with their probabilities."""
+        return explain(self.observables, self.null.chance, None if self.leak is None else self.leak.step_rise)
 
-    def leak_probability(self, alarm: Question) -> float:
-        """Compute the probability of a leak past piston or pump, given a change in the data of the alarm's question.
+    def leak_probability(self, alarm: LeakTest) -> float:
+        """Compute the probability that a leak past piston or pump caused an alarm.
 
-        A level above the rig's file is that of a leak unless a change within the recording, which raised it, is none.
+        A level above the rig's file is a leak, unless another alarm, of a change within the recording, raised it.
         """
-        if not self.context.is_weighed:
+        if not self.weigh_rivals:
             return 1.0
         if alarm.name == LEVEL:
-            within = next((question for question in self.alarms if question.name == WITHIN), None)
-            return 1.0 if within is None else self.leak_probability(within)
+            step_alarm = next((other for other in self.alarms if other.name == WITHIN), None)
+            return 1.0 if step_alarm is None else self.leak_probability(step_alarm)
         data = RISE if alarm.name == AGAINST and self.leak is not None else self.judge.observables[0].data
-        return probability_of(self.explanations, *LEAK_EVENTS, data=data)
+        return probability_of(self.explanations, *LEAK_EVENTS, data_kind=data)
 
     @cached_property
-    def questions(self) -> tuple[Question, ...]:
-        """The questions that can be asked, each with its share of the false-alarm probability."""
-        return _leak_questions(self, self.leak) if self.leak is not None else _change_questions(self)
+    def tests(self) -> tuple[LeakTest, ...]:
+        """The tests that the observations allow; together they have the allowed false-alarm probability."""
+        return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
 
     @property
-    def alarms(self) -> tuple[Question, ...]:
-        """The questions that are answered with yes, whatever explains it."""
-        return tuple(question for question in self.questions if question.chance < question.probability)
+    def alarms(self) -> tuple[LeakTest, ...]:
+        """Tests whose score exceeds the threshold."""
+        return tuple(test for test in self.tests if test.chance < test.probability)
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """The event other than a leak that surely explains the rarest change it can; None where none does."""
-        share: float = _PRIORS["explanation"]["heading"]
-        allowed = share * self.context.false_alarm_probability
+        """The event other than a leak that explains a rare change with sufficient probability, or None.
+
+        Observables are tried from the rarest on, as long as they are too rare for a healthy recording.
+        """
+        allowed = DECISION.explanation.heading * self.false_alarm_probability
         allowed /= max(len({observable.data for observable in self.observables}), 1)
         chances = {id(observable): self.null.chance(observable) for observable in self.observables}
-        for observable in sorted(self.observables, key=lambda candidate: chances[id(candidate)]):
+        for observable in sorted(self.observables, key=lambda other: chances[id(other)]):
             if chances[id(observable)] >= allowed:
                 return None
-            moving_events = [event for event in load_events() if event.does_move(observable)]
-            causes = dict.fromkeys(event.cause for event in moving_events if event.name not in LEAK_EVENTS)
-            for cause in (named for named in causes if named is not None):
-                certainty = probability_of(self.explanations, cause=cause, data=observable.data)
-                if certainty > _PRIORS["explanation"]["named"]:
-                    words = max((e for e in moving_events if e.cause == cause), key=lambda e: e.probability).words
-                    return OtherEvent(cause, words, certainty, observable, chances[id(observable)])
+            candidates = [event for event in load_events() if event.affects(observable)]
+            causes = dict.fromkeys(event.cause for event in candidates if event.name not in LEAK_EVENTS)
+            for cause in (cause for cause in causes if cause is not None):
+                probability = probability_of(self.explanations, cause=cause, data_kind=observable.data)
+                if probability > DECISION.explanation.named:
+                    likeliest = max((e for e in candidates if e.cause == cause), key=lambda e: e.probability)
+                    return OtherEvent(cause, likeliest.description, probability, observable, chances[id(observable)])
         return None
 
 
-def _leak_questions(case: Case, leak: LeakMeasure) -> tuple[Question, ...]:
+def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
+    """Make the tests of a measured leak: a step within the recording, a rise over healthy ones, a level too high.
+
+    The tests share the allowed false-alarm probability. If a step and another test are possible, the fraction
+    `questions.within` is reserved: for the step if the other is a rise, for the level if there is none.
+    """
     from scipy.special import ndtr, ndtri
 
-    allowed, questions = case.context.false_alarm_probability, []
+    allowed, tests = case.false_alarm_probability, []
     step, rise, excess = leak.step, leak.rise, leak.excess
-    shared = step is not None and (rise is not None or excess is not None)
-    second = _PRIORS["questions"]["within"] * allowed if shared else 0.0
+    is_shared = step is not None and (rise is not None or excess is not None)
+    reserved = DECISION.questions.within * allowed if is_shared else 0.0
     if step is not None:
-        share, key = second if rise is not None else allowed - second, step_key(leak.provider)
-        threshold = step.threshold(case.null.law_chance(key, share))
-        questions.append(Question(WITHIN, step.score, threshold, case.null.inflate(key, step.chance), share))
+        probability, key = reserved if rise is not None else allowed - reserved, step_key(leak.provider)
+        threshold = step.threshold(case.null.uncalibrated_chance(key, probability))
+        tests.append(LeakTest(WITHIN, step.score, threshold, case.null.calibrate(key, step.chance), probability))
     if rise is not None:
-        share = allowed - second
-        questions.append(Question(AGAINST, rise.score, rise.threshold(share), rise.chance, share))
+        probability = allowed - reserved
+        tests.append(LeakTest(AGAINST, rise.score, rise.threshold(probability), rise.chance, probability))
     if excess is not None:
-        share = second or allowed
-        questions.append(Question(LEVEL, excess, float(-ndtri(share)), float(ndtr(-excess)), share))
-    return tuple(questions)
+        probability = reserved or allowed
+        tests.append(LeakTest(LEVEL, excess, float(-ndtri(probability)), float(ndtr(-excess)), probability))
+    return tuple(tests)
 
 
 def step_key(provider: str) -> str:
-    """Return the name under which the rarity of a provider's leak within a recording is kept."""
+    """Return the key of the null distribution of the leak's step within a recording, as a provider measures it."""
     return f"{provider}: step"
 
 
-def _change_questions(case: Case) -> tuple[Question, ...]:
-    """Return the question of a provider that measures no leak: the change of the observables that a leak moves."""
+def _change_tests(case: Case) -> tuple[LeakTest, ...]:
+    """Make the test of a provider that measures no leak, by the rarest of its observables that a leak changes.
+
+    The result has one test, or none if no observable is affected by a leak.
+    """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-    moved_observables = [observable for observable in case.judge.observables if leak.does_move(observable)]
-    rarest = min(moved_observables, key=lambda observable: observable.chance, default=None)
+    affected = [observable for observable in case.judge.observables if leak.affects(observable)]
+    rarest = min(affected, key=lambda observable: observable.chance, default=None)
     if rarest is None:
         return ()
-    allowed, chance = case.context.false_alarm_probability, case.null.chance(rarest)
-    law = case.null.law_chance(key_of(rarest), allowed)
-    threshold = rarest.score * np.log(law) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
-    where = WITHIN if rarest.onset is not None else AGAINST
-    return (Question(where, rarest.score, max(float(threshold), 0.0), chance, allowed),)
+    allowed = case.false_alarm_probability
+    # a score is about proportional to the logarithm of its chance: the threshold is the score of the allowed chance
+    allowed_by_law = case.null.uncalibrated_chance(null_key(rarest), allowed)
+    threshold = rarest.score * np.log(allowed_by_law) / np.log(min(max(rarest.chance, 1e-300), 1.0 - 1e-9))
+    name = WITHIN if rarest.onset is not None else AGAINST
+    return (LeakTest(name, rarest.score, max(float(threshold), 0.0), case.null.chance(rarest), allowed),)

@@ -1,7 +1,7 @@
-"""Which detector's decision stands: the first that measures the leak and can tell.
+"""Choose one decision among those of several detectors.
 
-Letting any of several raise the alarm would make the false-alarm probability the sum of theirs. So one judges: the
-first of `ORDER` that decides, then a user's own detectors, last the change of RMS, which states no size.
+If any of several could raise the alarm, their false-alarm probabilities would add up. So one judges: the first of
+`ORDER` that reaches a verdict, then a user's own detectors, last the change of RMS, which states no size.
 """
 
 from __future__ import annotations
@@ -9,60 +9,70 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.diagnosis.decision.case import DecisionContext
 from sealscope.diagnosis.decision.texts import text_of
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RMS_CHANGE, Evidence
+from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.verdict.evidence import (
+    CANNOT_TELL,
+    LEAK,
+    NO_LEAK,
+    PRESSURE_RESPONSE,
+    RMS_CHANGE,
+    VOLUME_BALANCE,
+    Evidence,
+)
 
-#: Detectors that measure the leak: by every litre, then by a model of the pressures.
-ORDER = ("volume balance", "pressure response")
-#: Share of a recording that must be whole for `no leak`.
-WHOLE = 0.95
+#: Detectors that measure the leak, the most accurate first.
+ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return when a detector is asked, 0 first; a user's own are all alike, and the least specific is the last."""
+    """Return the place of a detector in the order in which they judge, 0 first; all plug-ins share one place."""
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
     return ORDER.index(detector) if detector in ORDER else len(ORDER)
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Test whether evidence stands: a verdict, or an unexplained change."""
+    """Test whether a usable detector decides: it states a verdict or a cause, or its score exceeds the threshold."""
     return evidence.usable and not evidence.abstains
 
 
-def combine(decisions: Sequence[Evidence], context: DecisionContext) -> Evidence:
-    """Choose the decision that stands, with all decisions as its `parts`.
+def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
+    """Choose the decision of the first detector that decides, with all decisions as its `parts`.
 
-    A recording that cannot be compared with the healthy ones it was given, or of which a part is missing, is not
-    without a leak.
+    `no leak` becomes `cannot tell` if the recording's end is not judged, or if there is a `refusal`, the reason why it
+    must not be stated.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
-    measuring = any(decision.detector in ORDER for decision in usable)
-    candidates = [decision for decision in usable if not (measuring and decision.detector == RMS_CHANGE)]
+    is_measured = any(decision.detector in ORDER for decision in usable)
+    candidates = [decision for decision in usable if not (is_measured and decision.detector == RMS_CHANGE)]
     judge = next((decision for decision in candidates if not decision.abstains), None)
     if judge is None:
-        return _undecided(ranked, usable)
+        return _explain_undecided(ranked, usable)
     reasons, doubts = [judge.reason], []
     if judge.share < 1.0:
         reasons.append(text_of("doubt", "share", percent=100.0 * judge.share))
     if judge.verdict == NO_LEAK:
-        if context.refusal is not None:
-            doubts.append(f"; {context.refusal}")
-        if judge.share < WHOLE:
+        if refusal is not None:
+            doubts.append(f"; {refusal}")
+        if 1.0 - judge.judged_until > DECISION.worth.unjudged:
             doubts.append(text_of("doubt", "rest"))
     verdict = CANNOT_TELL if doubts else judge.verdict
     other_parts = [decision for decision in ranked if decision is not judge]
-    decision_made = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
-    return decision_made if verdict == LEAK else replace(decision_made, onset_s=None, onset_interval_s=None)
+    combined = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
+    return combined if verdict == LEAK else replace(combined, onset_s=None, onset_interval_s=None)
 
 
-def _undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """State why no detector has a verdict: by the first usable one, else by the one that needs least."""
+def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
+    """State why no detector has a verdict: by the first usable one, else by the one that needs the fewest channels."""
     if usable:
-        decision_made = usable[0]
+        undecided = usable[0]
+        needs = next((decision.reason for decision in ranked if decision.detector == ORDER[0]), "")
+        if undecided.detector == RMS_CHANGE and needs:
+            # a missing channel would help more than a higher sampling rate
+            undecided = replace(undecided, reason=f"the {ORDER[0]} {needs}; {undecided.reason}")
     else:
         built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
-        decision_made = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
-    return replace(decision_made, detector="", parts=tuple(ranked), usable=True)
+        undecided = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
+    return replace(undecided, detector="", parts=tuple(ranked), usable=True)

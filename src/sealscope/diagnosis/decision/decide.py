@@ -1,9 +1,9 @@
 """The one decision: from observations of a recording, and of healthy ones, to a verdict.
 
-`leak` where a question is answered with yes at its share of the false-alarm probability, by the null that healthy
-recordings calibrate, and leaks are the most probable explanation. `no leak` with the 95 % bound of a leak over all
-explanations, where that is worth stating; else `cannot tell`, with the bound and what competes. Nothing else states a
-verdict: `combine` chooses which provider's decision stands.
+`leak` if a test exceeds its threshold, set by the false-alarm probability and calibrated by healthy recordings, and
+leaks are the most probable explanation. Else `no leak`, if the 95 % bound of a leak over all explanations is small
+enough to be worth stating; else `cannot tell`, with the bound and the rival explanation. Nothing else states a verdict:
+`combine` chooses between the decisions of several providers.
 """
 
 from __future__ import annotations
@@ -14,31 +14,39 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import Case, DecisionContext, Question, step_key
+from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
-from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_verdict
+from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_without_leak
 from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, RAREST, WITHIN, Cause, Evidence
+from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
+from sealscope.diagnosis.verdict.evidence import AGAINST, CANNOT_TELL, LEAK, NO_LEAK, RAREST, WITHIN, Cause, Evidence
 
-_PRIORS = priors("decision")
 
-
-def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, context: DecisionContext) -> Evidence:
-    """Decide on a recording by the report of one provider, all others' observables competing.
+def decide(
+    judge: Observed,
+    reports: Sequence[Observed],
+    null: HealthyNull,
+    false_alarm_probability: float,
+    weigh_rivals: bool = True,
+) -> Evidence:
+    """Decide on a recording by the report of one provider.
 
     Parameters
     ----------
     judge : Observed
         The provider that judges.
     reports : sequence of Observed
-        All reports, that of `judge` among them or not.
+        All reports, with or without that of `judge`; their observables are rival explanations.
     null : HealthyNull
-        What healthy recordings of the machine show.
-    context : DecisionContext
+        Chances of the observables in healthy recordings of the machine.
+    false_alarm_probability : float
+        Probability of `leak` on a leak-free recording.
+    weigh_rivals : bool, optional
+        Whether other causes compete with a leak; False for a method that decides alone.
 
     Returns
     -------
@@ -46,115 +54,123 @@ def decide(judge: Observed, reports: Sequence[Observed], null: HealthyNull, cont
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    other_reports = [
-        report for report in reports if report is not judge and context.is_weighed and _describes_else(report, judge)
-    ]
-    observables = [*judge.observables, *(observable for report in other_reports for observable in report.observables)]
-    case = Case(judge, observables, null, context)
-    least: float = _PRIORS["explanation"]["leak"]
-    leak_alarm = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > least), None)
-    if leak_alarm is not None:
-        return _leak_evidence(case, leak_alarm)
-    alarm, leak = next(iter(case.alarms), None), case.leak
-    bound = _bound(case, alarm)
-    verdict = decide_verdict(False, *_bound_and_worth(case, bound))
-    other = case.other_event
-    questions = case.questions
+    # two measures of the leak rest on the same samples, and are no rivals
+    rivals = [report for report in reports if report is not judge and (report.leak is None or judge.leak is None)]
+    observables = [*judge.observables]
+    if weigh_rivals:
+        observables += [observable for report in rivals for observable in report.observables]
+    case = Case(judge, observables, null, false_alarm_probability, weigh_rivals)
+    min_probability = DECISION.explanation.leak
+    alarm = next((alarm for alarm in case.alarms if case.leak_probability(alarm) > min_probability), None)
+    return _evidence_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+
+
+def _evidence_without_leak(case: Case) -> Evidence:
+    """State `no leak` or `cannot tell`, with the bound of a leak and the event that explains what changed."""
+    alarm, leak, other = next(iter(case.alarms), None), case.leak, case.other_event
+    bound = _leak_bound(case, alarm)
+    verdict = decide_without_leak(*_bound_and_limit(case, bound))
     evidence = Evidence(verdict, "", cause=None if other is None else other.cause)
-    evidence = _with_questions(case, evidence, questions[0] if questions else None)
+    evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
     if leak is not None:
-        litres = leak.litres
-        findable = _findable(case)
         evidence = replace(
             evidence,
-            bound_lpm=bound * litres if litres is not None and np.isfinite(bound) else None,
-            total_leakage=leak.total(findable),
-            course=leak.course(None),
+            bound_lpm=bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
+            total_leakage=leak.total(_findable_step(case)),
+            course=leak.history(None),
         )
     return replace(evidence, reason=reason_of(case, evidence, alarm, bound, other))
 
 
-def _describes_else(report: Observed, judge: Observed) -> bool:
-    """Test whether a report rests on other data than the judge's: two leak measures share their samples."""
-    return report.leak is None or judge.leak is None
-
-
-def _leak_evidence(case: Case, alarm: Question) -> Evidence:
-    """State a leak, with its size if the machine's size is known."""
-    leak, onset = case.leak, None
-    cause: Cause = "piston leak"
+def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
+    """State the leak that an alarm is due to: cause, onset and size."""
+    leak, fields = case.leak, dict[str, Any]()
     if leak is None:
-        rarest = min(case.judge.observables, key=lambda observable: observable.chance)
-        onset, flow = rarest.onset, None
+        fields["cause"], onset = "piston leak", case.rarest_observable.onset
     else:
-        pump = probability_of(case.explanations, "pump leak")
-        tells_pump = any(observable.name == "pump leak" for observable in case.observables) and pump < RAREST
-        cause = "piston leak" if tells_pump and leak.cause == "piston or pump leak" else leak.cause
-        onset = leak.step.onset() if alarm.name == WITHIN and leak.step is not None else None
-        flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
-    evidence = Evidence(LEAK, "", cause=cause)
+        if alarm.name == WITHIN and leak.step is not None:
+            onset = leak.step.onset()
+        else:
+            onset = leak.rise_onset if alarm.name == AGAINST else None
+        fields = {
+            "cause": _leak_cause(case, leak),
+            "total_leakage": leak.total(None),
+            "course": leak.history(None if onset is None else onset.value),
+            **_size_fields(leak, leak.step_flow if alarm.name == WITHIN else leak.rise_flow),
+        }
     if onset is not None:
-        evidence = replace(evidence, onset_s=onset.value, onset_interval_s=(onset.low, onset.high))
-    if leak is not None:
-        evidence = replace(
-            evidence,
-            total_leakage=leak.total(None),
-            course=leak.course(evidence.onset_s),
-            **_sizes(leak, flow),
-        )
-    evidence = _with_questions(case, evidence, alarm)
+        fields |= {"onset_s": onset.value, "onset_interval_s": (onset.low, onset.high)}
+    evidence = _add_tests(case, Evidence(LEAK, "", **fields), alarm)
     return replace(evidence, reason=reason_of(case, evidence, alarm, np.inf, None))
 
 
-def _sizes(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Return the leak's figures in L/min and relative to the pump, or the reason to refuse them."""
+def _leak_cause(case: Case, leak: LeakMeasure) -> Cause:
+    """Name the cause of a leak: the piston alone if an observed pump leak is surely no explanation."""
+    is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
+    is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST
+    return "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
+
+
+def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
+    """Compute the fields of `Evidence` on the leak's size: in L/min, unless refused, and relative to the pump."""
     if flow is None:
         return {}
-    sizes: dict[str, Any] = {"relative": leak.relative(flow)}
-    if leak.litres is None:
-        return {**sizes, "refuses": frozenset({"leak_lpm"})}
-    half = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * leak.size_deviation))
-    low, high = max(flow.value - half, 0.0), flow.value + half
-    interval = low * leak.litres, high * leak.litres
-    return {**sizes, "leak_lpm": flow.value * leak.litres, "leak_interval_lpm": interval}
+    fields: dict[str, Any] = {"relative": leak.relative(flow)}
+    if leak.lpm_per_flow is None:
+        return {**fields, "refuses": frozenset({"leak_lpm"})}
+    half_width = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * leak.size_deviation))
+    min_factor, max_factor = leak.flow_factors
+    low, high = min_factor * max(flow.value - half_width, 0.0), max_factor * (flow.value + half_width)
+    interval = low * leak.lpm_per_flow, high * leak.lpm_per_flow
+    return {**fields, "leak_lpm": flow.value * leak.lpm_per_flow, "leak_interval_lpm": interval}
 
 
-def _bound(case: Case, alarm: Question | None) -> float:
-    """Return the 95 % upper bound [m^3/s] of a leak over all explanations; inf where it is more than the pump gives."""
+def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
+    """Compute the 95 % upper bound [m^3/s] of a leak; inf if it exceeds the pump's mean flow, or nothing bounds it.
+
+    If an alarm may be due to a leak, the bound is at least the upper end of that leak's interval.
+    """
     leak = case.leak
     if leak is None:
         return np.inf
-    bound = leak.bound_flow
-    if alarm is not None and case.leak_probability(alarm) > 1.0 - _PRIORS["explanation"]["sure"]:
+    bound, mean_pump_flow = leak.bound_flow, leak.pump_flow[0]
+    if alarm is not None and case.leak_probability(alarm) > 1.0 - DECISION.explanation.sure:
         flow = leak.step_flow if alarm.name == WITHIN else leak.rise_flow
         if flow is not None:
             deviation = np.hypot(flow.deviation, flow.value * leak.size_deviation)
             bound = max(bound, flow.value + WITHIN_95 * float(deviation))
-    return bound if bound < leak.pump_flow[0] or not leak.pump_flow[0] > 0.0 else np.inf
+    return np.inf if mean_pump_flow > 0.0 and not bound < mean_pump_flow else bound
 
 
-def _bound_and_worth(case: Case, bound: float) -> tuple[float, float]:
-    """Return a bound and the largest one worth stating: of the leak's flow, else of the ringing's fall."""
+def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
+    """Return a 95 % bound and the largest one that allows `no leak`, [m^3/s], or of the ringing if no flow is measured.
+
+    The bound of the ringing's fall is infinite if it cannot exclude a leak: after an alarm, or at a low sampling rate.
+    """
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
-    ringing, details = case.judge.ringing, priors("rms_change")
-    if ringing is None or case.alarms or ringing.rate < details["rate"]["ringing"]:
+    ringing = case.judge.ringing
+    if ringing is None or case.alarms or ringing.rate < RMS_PRIORS.rate.ringing:
         return np.inf, 0.0
-    return ringing.bound, details["recordings"]["worth"]
+    return ringing.bound, RMS_PRIORS.recordings.worth
 
 
-def _findable(case: Case) -> float | None:
-    """Return the smallest step within the recording that would have been found [m^3/s]."""
-    within = next((question for question in case.questions if question.name == WITHIN), None)
-    if within is None or case.leak is None or case.leak.step is None:
+def _findable_step(case: Case) -> float | None:
+    """Compute the smallest step within the recording that would have been found [m^3/s]; None if none was tested."""
+    test = next((test for test in case.tests if test.name == WITHIN), None)
+    if test is None or case.leak is None or case.leak.step is None:
         return None
-    law = case.null.law_chance(step_key(case.leak.provider), within.probability)
-    return case.leak.step.findable(law) * case.leak.step_driving
+    chance = case.null.uncalibrated_chance(step_key(case.leak.provider), test.probability)
+    return case.leak.step.detectable_step(chance) * case.leak.flow_per_conductance
 
 
-def _with_questions(case: Case, evidence: Evidence, judging: Question | None) -> Evidence:
-    """Add score, threshold and chance of the judging question, and all questions if there are several."""
-    evidence = replace(evidence, detector=case.judge.provider, share=case.judge.share)
+def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
+    """Add to the evidence what its provider judged, the result of the judging test, and all tests as `parts`.
+
+    A single test is not repeated as a part. Without a judging test only the provider's figures are added.
+    """
+    judge = case.judge
+    evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)
     if case.leak is not None and case.leak.ratio is not None:
         ratio = case.leak.ratio
         evidence = replace(evidence, ratio=ratio.value, ratio_interval=(ratio.low, ratio.high))
@@ -162,14 +178,14 @@ def _with_questions(case: Case, evidence: Evidence, judging: Question | None) ->
         return evidence
     parts = tuple(
         Evidence(
-            LEAK if evidence.verdict == LEAK and question is judging else NO_LEAK,
-            question.name,
-            question.score,
-            question.threshold,
-            detector=question.name,
-            chance=max(question.chance, RAREST),
+            LEAK if evidence.verdict == LEAK and test is judging else NO_LEAK,
+            test.name,
+            test.score,
+            test.threshold,
+            detector=test.name,
+            chance=max(test.chance, RAREST),
         )
-        for question in case.questions
+        for test in case.tests
     )
     return replace(
         evidence,

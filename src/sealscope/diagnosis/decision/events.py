@@ -1,4 +1,4 @@
-"""The table of possible events: their frequency, and the observables they move (`events.toml`)."""
+"""The table of possible events: their frequency, and the observables they change (`events.toml`)."""
 
 from __future__ import annotations
 
@@ -15,46 +15,35 @@ from sealscope.diagnosis.verdict.evidence import Cause
 
 @dataclass(frozen=True)
 class Event:
-    """An event.
+    """An event of `events.toml`, with its prior probability in a recording.
 
-    Parameters
-    ----------
-    name : str
-        Row of `events.toml`.
-    cause : str or None
-        Heading under which it is named; None where it is never named.
-    probability : float
-        Chance that it begins in a recording.
-    moves : tuple of str
-        Patterns of the observables that show it, as "data: name".
-    disturbs : tuple of str
-        Patterns of those that it may move as well.
-    words : str
-        What is said of it.
+    `cause`: heading under which it is named, None if it never is; `affected`, `disturbed`: patterns "data: name" of the
+    observables that it changes, and of those that it may change as a side effect; `description` in a reason.
     """
 
     name: str
     cause: Cause | None
     probability: float
-    moves: tuple[str, ...]
-    disturbs: tuple[str, ...]
-    words: str
+    affected: tuple[str, ...]
+    disturbed: tuple[str, ...]
+    description: str
 
     @property
     def is_sized(self) -> bool:
-        """Test whether the event has a size, judged by the `advantage` of its observables; an unnamed one none."""
+        """True if the sizes of its observables count (`Observable.advantage`): a prior exists for named events only."""
         return self.cause is not None
 
-    def does_move(self, observable: Observable) -> bool:
-        """Test whether the event moves an observable."""
-        return _matches(observable, self.moves)
+    def affects(self, observable: Observable) -> bool:
+        """Test whether the event changes an observable."""
+        return _matches(observable, self.affected)
 
-    def does_disturb(self, observable: Observable) -> bool:
-        """Test whether the event may move an observable as a side effect."""
-        return _matches(observable, self.disturbs)
+    def may_disturb(self, observable: Observable) -> bool:
+        """Test whether the event may change an observable as a side effect."""
+        return _matches(observable, self.disturbed)
 
 
 def _matches(observable: Observable, patterns: Sequence[str]) -> bool:
+    """Test whether the observable's "data: name" matches one of the patterns."""
     key = f"{observable.data}: {observable.name}"
     return any(fnmatchcase(key, pattern) for pattern in patterns)
 

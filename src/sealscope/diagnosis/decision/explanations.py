@@ -1,14 +1,13 @@
 """Explanations of the observations: sets of at most three events, each with its probability.
 
 A set's posterior is the product of its events' probabilities and, for each kind of data, the Bayes factor of the best
-description that an event of the set gives; data that no event of the set moves earn nothing. So noise that steps
-beside a leak is two events, and never takes the leak away. The Bayes factor of a change of chance p under the null is
-at most 1 / (-e p log p), 1 for p > 1/e (Sellke, Bayarri and Berger); p is the predictive chance that healthy
-recordings calibrate (`null`).
+description by an event of the set; data that no event of the set changes contribute a factor of 1. So a step of the
+noise together with a leak is two events, and does not compete with the leak. The Bayes factor of a change of chance p
+under the null is at most 1 / (-e p log p), 1 for p > 1/e (Sellke, Bayarri and Berger); p is the predictive chance that
+healthy recordings calibrate (`null`).
 
 A term describes a change to within a few per cent only: logarithms of Bayes factors of the same data are divided by
-1 + 2 m B, with B the largest and m the misfit (`priors.toml`), so that rivals are told apart no better than the terms
-are known.
+1 + 2 m B, with B the largest and m the misfit (`priors.toml`), so that rivals differ no more than the terms are known.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
 """
@@ -23,28 +22,23 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.decision.events import Event, load_events
-from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import RISE, Rise
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.observable import LeakRise, Observable
+from sealscope.diagnosis.inference.scatter import RISE
+from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import Cause
 
-#: Most events of an explanation, and the least log Bayes factor, of ten to one, of what shows an event beside another:
-#: duty, noise and friction change together often enough that two would leave a leak no place.
-MOST, LEAST = 3, 2.3
+#: Largest number of events in an explanation.
+MAX_EVENTS = 3
+#: Smallest log Bayes factor (ten to one) of the data that make an event part of a set of several: duty, noise and
+#: friction change together so often that sets of events with less evidence would crowd out a leak.
+MIN_LOG_FACTOR = 2.3
 #: Events whose leakage passes the piston or the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
 
 
-class LeakRise(NamedTuple):
-    """The rise of the leakage over healthy recordings, and the rise expected of a leak that begins within."""
-
-    rise: Rise
-    expected: float
-
-
 @dataclass(frozen=True)
 class Explanation:
-    """A set of events with its posterior probability, and the kinds of `data` that it moves."""
+    """A set of events with its posterior probability, and the kinds of `data` that it explains."""
 
     events: tuple[Event, ...]
     probability: float
@@ -55,7 +49,7 @@ class Explanation:
         return any(event.name in names for event in self.events)
 
 
-#: The log likelihood ratios of an event, by the data it moves.
+#: Log Bayes factors of an event by kind of data.
 _Gains = Mapping[str, float]
 
 
@@ -64,81 +58,110 @@ def explain(
     chance: Callable[[Observable], float] = lambda observable: observable.chance,
     rise: LeakRise | None = None,
 ) -> tuple[Explanation, ...]:
-    """Compute the probability of every set of events, given that something happened.
+    """Compute the posterior probability of every set of events, given that something changed; most probable first.
 
-    Parameters
-    ----------
-    observables : sequence of Observable
-    chance : callable
-        Predictive chance of an observable in a healthy recording (`null.HealthyNull.chance`).
-    rise : LeakRise, optional
-        The leakage against healthy recordings: a leak from the start raises it, one from an onset in proportion.
-
-    Returns
-    -------
-    tuple of Explanation
-        The most probable first; their probabilities add up to one.
+    `chance`: predictive chance of an observable in a healthy recording (`null.HealthyNull.chance`); `rise`: of the
+    leakage over healthy recordings, which a leak causes in proportion to its size and the time since its onset.
     """
     events = load_events()
-    factors = [(quantity, log_bayes_factor(chance(quantity))) for quantity in observables]
-    misfit: float = 2.0 * priors("decision")["explanation"]["misfit"]
-    largest: dict[str, float] = {}
-    for observable, factor in factors:
-        largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
-    weighted = [(quantity, factor / (1.0 + misfit * largest[quantity.data])) for quantity, factor in factors]
-    ways = {event.name: _ways_of(event, weighted, rise) for event in events}
-    telling_events = [event for event in events if max(sum(gains.values()) for gains in ways[event.name]) > LEAST]
+    log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
+    factors = _correct_for_misfit(log_factors)
+    gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}
+    supported = [
+        event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
+    ]
     groups: list[tuple[Event, ...]] = [(event,) for event in events]
-    groups += [group for size in range(2, MOST + 1) for group in combinations(telling_events, size)]
-    moved = {
-        name: frozenset(kind for gains in rows for kind, gain in gains.items() if gain > 0.0)
-        for name, rows in ways.items()
-    }
-    logarithms = np.array([_logarithm(group, ways) for group in groups])
+    groups += [group for size in range(2, MAX_EVENTS + 1) for group in combinations(supported, size)]
+    posteriors = [_explain_by_group(group, gains_of) for group in groups]
+    logarithms = np.array([posterior.logarithm for posterior in posteriors])
     weights = np.exp(logarithms - logarithms.max())
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
-    return tuple(
-        Explanation(groups[k], float(weights[k]), frozenset().union(*(moved[event.name] for event in groups[k])))
-        for k in order
-    )
+    return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data) for k in order)
 
 
-def _logarithm(group: Sequence[Event], ways: Mapping[str, Sequence[_Gains]]) -> float:
-    """Compute the logarithm of a set's posterior, up to a constant, by the best way in which its events happen."""
-    prior = float(sum(np.log(event.probability) for event in group))
-    best = -np.inf
-    for chosen in product(*(ways[event.name] for event in group)):
-        data = {kind: max(gains.get(kind, 0.0) for gains in chosen) for gains in chosen for kind in gains}
-        if any(RISE in gains for gains in chosen):
-            data[RISE] = sum(gains.get(RISE, 0.0) for gains in chosen)
-        best = max(best, sum(data.values()))
-    return prior + best
+def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
+    """Divide the log Bayes factors of each kind of data by 1 + 2 m B: B is the largest of them, m the misfit."""
+    max_factor: dict[str, float] = {}
+    for observable, factor in log_factors:
+        max_factor[observable.data] = max(factor, max_factor.get(observable.data, 0.0))
+    misfit = 2.0 * DECISION.explanation.misfit
+    return [(observable, factor / (1.0 + misfit * max_factor[observable.data])) for observable, factor in log_factors]
 
 
-def _ways_of(event: Event, weighted: Sequence[tuple[Observable, float]], rise: LeakRise | None) -> Sequence[_Gains]:
-    """Return the ways an event happens: at the onset that explains most, and for a leak from the start."""
-    moved = [(observable, gain) for observable, gain in weighted if event.does_move(observable)]
+class _Posterior(NamedTuple):
+    """Logarithm of the posterior of a set of events, up to a constant, and the kinds of data that it explains."""
+
+    logarithm: float
+    data: frozenset[str]
+
+
+def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
+    """Maximise the posterior of a set of events over the times at which each of them may have begun."""
+    log_prior = float(sum(np.log(event.probability) for event in group))
+    best, explained = -np.inf, frozenset[str]()
+    for choice in product(*(gains_of[event.name] for event in group)):
+        gains = {data: max(other.get(data, 0.0) for other in choice) for event_gains in choice for data in event_gains}
+        if RISE in gains:
+            # the best description of the rise counts, and each event whose rise contradicts it reduces that
+            rises = [event_gains.get(RISE, 0.0) for event_gains in choice]
+            gains[RISE] = max(*rises, 0.0) + sum(min(rise, 0.0) for rise in rises)
+        if (total := sum(gains.values())) > best:
+            best, explained = total, frozenset(data for data, gain in gains.items() if gain > 0.0)
+    return _Posterior(log_prior + best, explained)
+
+
+def _possible_gains(
+    event: Event, factors: Sequence[tuple[Observable, float]], rise: LeakRise | None
+) -> Sequence[_Gains]:
+    """Compute the log evidence that an event accounts for, by kind of data: one mapping for each possible onset.
+
+    The first onset is within the recording; a leak that began before it accounts for the rise alone.
+    """
+    gains = _gains_at_onset(event, factors)
+    if rise is None or event.name not in LEAK_EVENTS:
+        return [gains]
+    if gains.get("volumes", 0.0) > 0.0:
+        gains[RISE] = rise.step_log_ratio  # of the rise, its step is the part that began within the recording
+    return [gains, {RISE: log_bayes_factor(rise.rise.chance)}]
+
+
+def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
+    """Compute the log Bayes factors that an event explains within the recording, by kind of data.
+
+    It begins with the observable that it explains best, and explains those that may have changed at the same time.
+    """
+    affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
+    if not affected:
+        return {}
+    best_explained, _ = max(affected, key=lambda pair: pair[1])
+    # side effects count only if other data support the event
+    supporting_data = {observable.data for observable, gain in affected if gain > MIN_LOG_FACTOR}
+    side_effects = [
+        (observable, gain)
+        for observable, gain in factors
+        if supporting_data and observable.data not in supporting_data and event.may_disturb(observable)
+    ]
     gains: dict[str, float] = {}
-    if moved:
-        anchor = max(moved, key=lambda pair: pair[1])[0]
-        # an event explains what it disturbs only once other data show it
-        explained_data = {observable.data for observable, gain in moved if gain > LEAST}
-        disturbed = [
-            pair
-            for pair in weighted
-            if explained_data and pair[0].data not in explained_data and event.does_disturb(pair[0])
-        ]
-        for observable, gain in moved + disturbed:
-            if _coincide(observable, anchor):
-                size_gain = gain + (0.5 * observable.advantage if event.is_sized else 0.0)
-                gains[observable.data] = max(size_gain, gains.get(observable.data, 0.0))
-    ways: list[_Gains] = [gains]
-    if rise is not None and event.name in LEAK_EVENTS:
-        if gains.get("volumes", 0.0) > 0.0:
-            gains[RISE] = rise.rise.log_ratio(rise.expected)
-        ways.append({RISE: log_bayes_factor(rise.rise.chance)})
-    return ways
+    for observable, gain in affected + side_effects:
+        if _coincide(observable, best_explained):
+            # advantage: twice the log odds by the prior on the event's size
+            size_log_odds = 0.5 * observable.advantage if event.is_sized else 0.0
+            gains[observable.data] = max(gain + size_log_odds, gains.get(observable.data, 0.0))
+    return gains
+
+
+def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
+    """Compute the log Bayes factor of an observable against no change.
+
+    That of an alternative to the leak is at most the leak's own plus its log likelihood ratio to the leak: where the
+    leakage of healthy recordings rises, the alternative seems to rise as well.
+    """
+    factor = log_bayes_factor(chance)
+    if observable.log_ratio_to_leak is None or rise is None:
+        return factor
+    leak_factor = log_bayes_factor(rise.rise.chance)
+    return min(factor, max(leak_factor + observable.log_ratio_to_leak, 0.0))
 
 
 def log_bayes_factor(chance: float) -> float:
@@ -150,21 +173,21 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Test whether two observables may have changed at the same time."""
+    """Test whether two observables may have changed at the same time, by the 95 % intervals of their onsets."""
     if observable.onset is None or anchor.onset is None:
         return True
-    reach = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
-    return abs(observable.onset.value - anchor.onset.value) <= reach
+    max_distance = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
+    return abs(observable.onset.value - anchor.onset.value) <= max_distance
 
 
 def probability_of(
-    explanations: Sequence[Explanation], *names: str, cause: Cause | None = None, data: str | None = None
+    explanations: Sequence[Explanation], *names: str, cause: Cause | None = None, data_kind: str | None = None
 ) -> float:
-    """Compute the probability that one of the named events, or one of a cause, happened.
+    """Compute the probability that one of the named events, or any event with this cause, happened.
 
-    `data`: given that something happened that moves this kind of data; the chance under the null says whether it did.
+    `data_kind`: use only the explanations that explain this kind of data (`Observable.data`), renormalised.
     """
-    relevant = [explanation for explanation in explanations if data is None or data in explanation.data]
+    relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
     matching = sum(
         explanation.probability

@@ -1,83 +1,87 @@
-"""Healthy recordings as the null of every statistic: how much rarer than it is a law calls a healthy recording.
+"""Calibrate the chances of all statistics by healthy recordings, as a provider's law may state too small ones.
 
-A provider's law gives each statistic a chance P under the null; u = -log P is then exponential. The law may fail, in a
-share of machines (`priors.toml`): then u of healthy recordings is larger, u / lambda exponential, and log lambda
-exponential beforehand. With the u_1 .. u_n of n healthy recordings the predictive chance is
+A provider's law gives each statistic a chance P under the null; its surprisal u = -log P is then exponential. The law
+fails in a fraction of machines (`priors.toml`): there u / lambda is exponential, with an exponential prior on
+log lambda > 0. With the u_1 .. u_n of n healthy recordings the predictive chance is
 
     P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ p_k lambda_k^(-n) exp(-sum_i u_i / lambda_k),
 
-lambda_0 = 1 for the law as it stands.
+lambda_0 = 1 for the law itself.
 
-What every healthy recording shows, a rest, a ramp or a warm-up, is then no alarm. Without healthy recordings the law
-stands as it is.
+A rest, a ramp or a warm-up of every healthy recording is then no alarm. Without healthy recordings the law is not
+changed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Nodes of the inflation.
+#: Values of lambda that the predictive chance sums over, after 1.
 NODES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class HealthyNull:
-    """The rarities of each observable, by its key, in healthy recordings of the machine."""
+    """Predictive chances of observables, from their `surprisals` -log(chance) in healthy recordings, by `null_key`."""
 
-    rarities: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the predictive probability of an observable at least as rare in a healthy recording."""
-        weights, inflations = self._inflation(key_of(observable))
-        return min(float(weights @ np.exp(-observable.rarity / inflations)), 1.0)
+        """Compute the predictive chance that an observable has at least this surprisal in a healthy recording."""
+        weights, inflations = self._inflation(null_key(observable))
+        return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
-    def inflate(self, key: str, chance: float) -> float:
-        """Compute the predictive probability of an event from its chance by the law."""
+    def calibrate(self, key: str, chance: float) -> float:
+        """Compute the predictive chance of a statistic from its chance by the provider's law."""
         weights, inflations = self._inflation(key)
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
 
-    def law_chance(self, key: str, chance: float) -> float:
-        """Compute the chance by the law whose predictive probability is `chance`."""
-        from scipy.optimize import brentq
-
-        low = -np.log(np.finfo(float).tiny)
-        if self.inflate(key, np.exp(-low)) >= chance:
+    def uncalibrated_chance(self, key: str, chance: float) -> float:
+        """Compute the chance by the provider's law that has the predictive chance `chance`: invert `calibrate`."""
+        max_surprisal = -np.log(np.finfo(float).tiny)
+        if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
-        return float(np.exp(-brentq(lambda u: self.inflate(key, np.exp(-u)) - chance, 0.0, low)))
+        return float(np.exp(-find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
+        """Return the posterior weights and values of lambda, the mean of a key's surprisals in healthy recordings."""
         if key not in self._posteriors:
-            self._posteriors[key] = _posterior(self.rarities.get(key, ()))
+            self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
         return self._posteriors[key]
 
-    @cached_property
-    def _posteriors(self) -> dict[str, tuple[Array, Array]]:
-        return {}
 
+def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
+    """Compute the posterior weights and values (NODES + 1,) of lambda, the mean of exponential surprisals.
 
-def _posterior(rarities: Sequence[float]) -> tuple[Array, Array]:
-    """Compute weights and values (NODES + 1,) of the inflation, first that of the unchanged law."""
-    believed = priors("decision")["null"]
-    if not len(rarities):
+    The first value is 1, by the provider's law. n surprisals have the likelihood lambda^-n exp(-sum / lambda).
+    """
+    prior_null = DECISION.null
+    if not len(surprisals):
         return np.ones(1), np.ones(1)
-    logarithm = np.append(0.0, np.linspace(0.0, np.log(believed["largest"]), NODES))
+    logarithm = np.append(0.0, np.linspace(0.0, np.log(prior_null.largest), NODES))
     inflation = np.exp(logarithm)
-    prior = np.exp(-logarithm / believed["inflation"])
-    prior[1:] *= believed["fails"] / prior[1:].sum()
-    prior[0] = 1.0 - believed["fails"]
-    likelihood = np.log(prior) - len(rarities) * logarithm - float(np.sum(rarities)) / inflation
-    weights = np.exp(likelihood - likelihood.max())
+    prior = np.exp(-logarithm / prior_null.inflation)
+    prior[1:] *= prior_null.fails / prior[1:].sum()  # `fails`: fraction of machines in which the law is wrong
+    prior[0] = 1.0 - prior_null.fails
+    log_posterior = np.log(prior) - len(surprisals) * logarithm - float(np.sum(surprisals)) / inflation
+    weights = np.exp(log_posterior - log_posterior.max())
     return weights / weights.sum(), inflation
 
 
-def key_of(observable: Observable) -> str:
-    """Return the name that stores an observable's rarities; comparisons with other recordings share one."""
-    return f"{observable.data}: {observable.name}" if observable.onset is not None else f"{observable.data}: against"
+def null_key(observable: Observable) -> str:
+    """Return the key of an observable's null distribution: of each change, or of all comparisons of a kind of data."""
+    return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
+
+
+def comparison_key(data: str) -> str:
+    """Return the key of the null distribution of comparisons with healthy recordings, of one kind of data."""
+    return f"{data}: against"

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import Case, OtherEvent, Question
+from sealscope.diagnosis.decision.case import Case, LeakTest, OtherEvent
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS
 from sealscope.diagnosis.decision.texts import has_text, text_of
 from sealscope.diagnosis.inference.observable import Observable, Ringing
-from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Evidence
-from sealscope.recordings.formats.columns import listed
+from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
+from sealscope.diagnosis.verdict.evidence import (
+    AGAINST,
+    CANNOT_TELL,
+    LEAK,
+    NO_LEAK,
+    PRESSURE_RESPONSE,
+    WITHIN,
+    Evidence,
+)
+from sealscope.paragraphs import join_names
+
+#: Minimum sampling rate at which the ringing can be judged [Hz].
+_MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
 
 
-def reason_of(case: Case, evidence: Evidence, alarm: Question | None, bound: float, other: OtherEvent | None) -> str:
-    """Return the reason of a verdict."""
+def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
+    """Compose the reason of a verdict: the leak or its bound, then the rival explanation, then remarks."""
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
     text = _bound_text(case, evidence, bound)
@@ -22,24 +33,23 @@ def reason_of(case: Case, evidence: Evidence, alarm: Question | None, bound: flo
         text += text_of(
             "doubt",
             "event",
-            words=other.words,
+            words=other.description,
             onset=_onset_text(other.observable),
-            shown=_shown_text(other),
+            shown=_observable_text(other),
             sure=100.0 * other.probability,
             rarity=_rarity_text(other.chance),
         )
-    elif alarm is not None and case.context.is_weighed:
+    elif alarm is not None and case.weigh_rivals:
         text += _rivals_text(case, alarm)
     return text + _remarks(case)
 
 
-def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
-    key = {"within the recording": "within", "against the baseline": "against"}.get(
-        alarm.name if alarm else "", "level"
-    )
+def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
+    """Describe the leak that an alarm is due to."""
+    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
     total = evidence.total_leakage
     if case.leak is None:
-        rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+        rarest = case.rarest_observable
         if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
         percent = 100.0 * abs(np.expm1(rarest.size))
@@ -47,14 +57,14 @@ def _leak_text(case: Case, evidence: Evidence, alarm: Question | None) -> str:
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
         return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
-    if key != "level" and case.leak.provider == "pressure response":
+    if key != "level" and case.leak.provider == PRESSURE_RESPONSE:
         key = f"conductance_{key}"
     text = text_of("leak", key)
     return f"{text}; {text_of('leak', 'no_size')}" if "leak_lpm" in evidence.refuses else text
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Describe the bound in words, and the way to a closer one."""
+    """Describe the bound of a leak, and what recording would bound it more closely."""
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
@@ -68,27 +78,29 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
         limit = text_of("bound", "share", value=100.0 * bound / pump, average=average)
     if evidence.verdict == NO_LEAK:
         return text_of("bound", "none", limit=limit)
-    closer = "position" if leak.provider == "pressure response" else "longer"
+    closer = "position" if leak.provider == PRESSURE_RESPONSE else "longer"
     return text_of("bound", "hidden", limit=limit) + text_of("doubt", closer)
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
+    """Describe the largest drop of the pressure ringing that the data do not exclude, and what may hide a leak."""
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
-    fast: float = priors("rms_change")["rate"]["ringing"]
     percent = -100.0 * np.expm1(-ringing.bound)
     key = "ringing_hidden" if evidence.verdict == CANNOT_TELL else "ringing"
     text = text_of("bound", key, percent=percent, where=_against_text(ringing))
-    if ringing.rate < fast:
-        # a column that nobody mapped hides more than a slow clock does
-        key, values = ("unused", {"names": listed(ringing.unused, 4)}) if ringing.unused else ("slow", {"fast": fast})
+    if ringing.rate < _MIN_RINGING_RATE:
+        # unused columns are named first: mapping them helps more than a higher rate
+        names = {"names": join_names(ringing.unused, 4)}
+        key, values = ("unused", names) if ringing.unused else ("slow", {"fast": _MIN_RINGING_RATE})
         text = f"{text_of('bound', key, rate=ringing.rate, **values)}; {text}"
+    # without healthy recordings the ringing is compared with that at the start of the recording
     return text if ringing.healthy else text + text_of("bound", "start")
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     """Describe the change of the ringing, and the probability of a leak behind it."""
-    rarest = min(case.judge.observables, key=lambda observable: observable.chance)
+    rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))
     where = _onset_text(rarest) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
@@ -96,50 +108,59 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
+    """Name the healthy recordings that the ringing is compared with."""
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)
     return text if ringing.is_dated else text + text_of("bound", "session")
 
 
-def _rivals_text(case: Case, alarm: Question) -> str:
-    """Name the explanation that competes with a leak, and the recording that would separate them."""
-    leak = case.leak_probability(alarm)
+def _rivals_text(case: Case, alarm: LeakTest) -> str:
+    """Name the most probable explanation other than a leak, and the recording that would distinguish them."""
+    leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:
         return ""
     event = best.events[0]
-    if event.cause is None:
+    if event.cause is None:  # a change of the operating point, not a fault: no cause to name
         onset = None if case.leak is None or case.leak.step is None else case.leak.step.onset()
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
-    highest = max(
-        (observable for observable in case.observables if event.does_move(observable)),
+    clearest = max(
+        (observable for observable in case.observables if event.affects(observable)),
         key=lambda observable: observable.score,
         default=None,
     )
     separates = text_of("separates", event.cause if has_text("separates", event.cause) else "default")
-    onset_text = "" if highest is None else _onset_text(highest)
-    share = 100.0 * (1.0 - leak)
+    onset_text = "" if clearest is None else _onset_text(clearest)
     return text_of(
-        "doubt", "rivals", words=event.words, onset=onset_text, share=share, leak=100.0 * leak, separates=separates
+        "doubt",
+        "rivals",
+        words=event.description,
+        onset=onset_text,
+        share=100.0 * (1.0 - leak_probability),
+        leak=100.0 * leak_probability,
+        separates=separates,
     )
 
 
 def _onset_text(observable: Observable) -> str:
+    """Describe the onset of a change, "" if it has none."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
 
 
-def _shown_text(other: OtherEvent) -> str:
-    """Name the observable of an event, unless its words do."""
+def _observable_text(other: OtherEvent) -> str:
+    """Name the observable by which an event is recognised, unless the event's description contains it."""
     name = other.observable.name
-    return "" if name in other.words else text_of("doubt", "shown", name=name)
+    return "" if name in other.description else text_of("doubt", "shown", name=name)
 
 
 def _rarity_text(chance: float) -> str:
+    """Format a chance as one in so many healthy recordings, at most 10 000."""
     count = f"{float(f'{1.0 / max(chance, 1e-4):.2g}'):,.0f}".replace(",", " ")
     return text_of("doubt", "rarity", count=count)
 
 
 def _remarks(case: Case) -> str:
+    """Format the remarks of the measure of the leak."""
     leak = case.leak
     return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

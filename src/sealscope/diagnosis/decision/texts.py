@@ -11,14 +11,15 @@ from typing import Any
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
+    """Read `texts.toml`."""
     return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
 
 
 def text_of(table: str, key: str, **values: Any) -> str:
-    """Return the text of a key, filled in with its values."""
+    """Format the text of a key with its values."""
     return _texts()[table][key].format(**values)
 
 
 def has_text(table: str, key: str) -> bool:
-    """Test whether a table holds a key."""
+    """Test whether a table has a text of a key."""
     return key in _texts()[table]

@@ -25,11 +25,11 @@ PLUG_IN = "plug-in"
 class Detector(Protocol):
     """A detector: follows numbers over a recording and tests them for a change; it states no verdict.
 
-    The recordings it is given are uniformly sampled, and their chamber pressures and command have no missing sample
-    (what was missing is bridged, and marked in `Recording.bridged`); any other channel may be absent or hold NaN.
+    Its recordings are uniformly sampled, and their chamber pressures and command have no missing sample (missing ones
+    are bridged, and marked in `Recording.bridged`); any other channel may be absent or contain NaN.
 
-    A method `learn(recording)` may return what a healthy recording teaches, as plain values, or None; a detector that
-    has one is also given what was written down of recordings (`learnt.Learnt`), and reads both by `learnt.lessons_of`.
+    A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None; such
+    a detector is also given stored summaries (`healthy.SummarisedRecording`), and reads both by `healthy_summaries`.
     """
 
     name: str
@@ -39,10 +39,10 @@ class Detector(Protocol):
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Return the detector's observations of a `usable` recording: numbers, no verdict.
+        """Observe a `usable` recording: numbers, no verdict.
 
-        `baseline`: leak-free recordings of the same machine, at any duty, no two of them copies; where
-        there is none, changes within the recording are looked for.
+        `baseline`: leak-free recordings of the same machine, at any duty, without copies; if there is none, changes
+        within the recording are looked for.
         """
         ...
 
@@ -51,8 +51,8 @@ class Detector(Protocol):
 Factory = Callable[["Rig"], Detector]
 
 
-def unusable(detector: Detector, recording: Recording) -> str | None:
-    """Return the reason, in one line, why a detector cannot use a recording, None where it can."""
+def unusable_reason(detector: Detector, recording: Recording) -> str | None:
+    """Return the reason, in one line, why a detector cannot use a recording; None if it can."""
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -64,26 +64,26 @@ def unusable(detector: Detector, recording: Recording) -> str | None:
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make the observable of a user's own detector, which a piston leak moves, from its chance alone.
+    """Make the observable of a user's own detector from its chance alone; a piston leak is taken to move it.
 
     Parameters
     ----------
     name : str
         What changed, in plain words.
     chance : float
-        Probability that a healthy recording shows as much; of several tests the rarest one's, times their number.
+        Probability that a healthy recording changes as much; of several tests the rarest one's, times their number.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
         When it changed, with its 95 % interval [s]: (value, low, high).
     """
     score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
-    when = None if onset is None else Interval(*onset)
-    return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=when, size=float(size))
+    interval = None if onset is None else Interval(*onset)
+    return Observable(name=name, data=PLUG_IN, score=score, chance=float(chance), onset=interval, size=float(size))
 
 
-def checked(report: Any, name: str) -> Observed:
-    """Return the report of a detector's `observe`; raise TypeError or ValueError where it is not valid."""
+def validate_report(report: Any, name: str) -> Observed:
+    """Return a detector's report with its name; raise TypeError, ValueError or ArithmeticError if it is not valid."""
     if isinstance(report, Observable):
         report = Observed(name, (report,))
     if not isinstance(report, Observed):
@@ -100,18 +100,18 @@ def checked(report: Any, name: str) -> Observed:
     return replace(report, provider=name)
 
 
-def failure(name: str, distribution: str | None, error: Exception) -> str:
-    """Return one line on a detector that failed, and log it with the traceback, once in a process.
+def log_failure(name: str, distribution: str | None, error: Exception) -> str:
+    """Describe the error of a detector in one line, and log it with the traceback, once in a process.
 
-    `distribution`: that of a plug-in, None for a built-in detector. Numbers that a built-in detector cannot compute
-    with are no machine's readings, and no defect of it: the traceback is at the level of debugging alone.
+    `distribution`: that of a plug-in, None for a built-in detector. An arithmetic error of a built-in detector is
+    due to impossible readings, not to a defect: it is logged at the debug level.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)
         return f"{name} cannot be computed on this recording: {' '.join(str(error).split()).lower()}"
     source = f" of {distribution}" if distribution else ""
-    what = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
-    line = f"detector {name!r}{source} is left out: {what}"
+    reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(": ")
+    line = f"detector {name!r}{source} is left out: {reason}"
     _log_once(line)
     return line
 

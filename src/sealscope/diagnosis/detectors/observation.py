@@ -1,143 +1,178 @@
-"""Run detectors on a recording: observations, reasons for none, and the same for healthy recordings."""
+"""Run detectors on recordings, and collect the surprisal, -log(chance), of their observables in healthy ones."""
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
 
 import numpy as np
 
 from sealscope.diagnosis.decision.case import step_key
-from sealscope.diagnosis.decision.null import HealthyNull, key_of
-from sealscope.diagnosis.detectors.detector import Detector, checked, failure, unusable
+from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_key
+from sealscope.diagnosis.detectors.detector import Detector, log_failure, unusable_reason, validate_report
 from sealscope.diagnosis.detectors.registry import detectors
-from sealscope.diagnosis.inference.changes.signals import observe_signals
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, healthy_summaries
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
+from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.learnt import Healthy, Learnt, lessons_of
-from sealscope.diagnosis.rms_change.detector import RmsChange, compare_lessons
-from sealscope.parameters import Rig, load_rig
-from sealscope.recordings.motion import does_not_move
-from sealscope.recordings.recording import Recording, remembered
+from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
+from sealscope.parameters import Rig
+from sealscope.recordings.motion import describe_hold
+from sealscope.recordings.recording import Recording, compute_once
 
-#: Under this key a recording remembers how rare its own observables are.
-RARITIES = "rarities"
-#: What the keys of a balance begin with whose pump is cut off at rest.
+#: Key of a recording's cache for the surprisals of its observables.
+SURPRISALS = "surprisals"
+#: Prefix of the keys of a balance under the hypothesis that the pump is cut off at rest (`regimes`).
 SHUT = "shut, "
-#: Fewest healthy recordings of which each can be compared with the others.
-FEWEST = 2
-#: Detectors that need no motion: what leaks may show at standstill.
-_AT_REST = ("volume balance",)
+#: Minimum number of healthy recordings to compare each with all others.
+MIN_COMPARED = 3
+#: Lower limit of a chance, so that its logarithm is finite.
+_MIN_CHANCE = 1e-300
+#: Detectors that need no motion, as they measure a leak at standstill, too.
+_AT_REST = (VOLUME_BALANCE,)
 
 
-def run_detector(
-    name: str,
-    recording: Recording,
-    baseline: Sequence[Healthy],
-    rig: Rig | str | os.PathLike[str],
-    distrust: str | None = None,
-) -> Observed:
-    """Run a registered detector on a recording; `distrust`: why its pressures cannot be judged.
+def limit_threads() -> AbstractContextManager[object]:
+    """Limit the loaded libraries of linear algebra to one thread.
 
-    Raises KeyError for a detector that is not registered. A detector that fails is left out with a logged line.
+    Matrices are small: threads would slow the computation down threefold, and their sums do not repeat to the bit.
     """
     from threadpoolctl import threadpool_limits
 
+    return threadpool_limits(limits=1)  # type: ignore[no-any-return]
+
+
+def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
+    """Observe rivals of a leak, changes of duty, noise, hum and mean pressures, in the recording and over healthy ones.
+
+    `distrust`: reason why the pressures cannot be judged, or None.
+    """
+    if distrust:
+        return Observed(SIGNALS, lack=distrust)
+    comparisons = tuple(HealthyLevels().compare(recording, baseline)) if baseline else ()
+    report = observe_signals(recording)
+    return replace(report, observables=(*report.observables, *comparisons))
+
+
+def run_detector(
+    name: str, recording: Recording, baseline: Sequence[Healthy], rig: Rig, distrust: str | None = None
+) -> Observed:
+    """Run a registered detector on a recording; `distrust`: reason why the pressures cannot be judged, or None.
+
+    Raises KeyError if it is not registered. If it fails, the error is logged and reported.
+    """
     factory = detectors()[name]
     try:
-        # small matrices: threads would cost more than they give, and how they share the work may not repeat to the bit
-        with np.errstate(all="ignore"), threadpool_limits(limits=1):
-            detector = factory(load_rig(rig))
+        with np.errstate(all="ignore"), limit_threads():
+            detector = factory(rig)
             if detector.name != name:
                 raise ValueError(f"its name must be that of its entry point, {name!r}, got {detector.name!r}")
             return _observe(detector, recording, baseline, distrust)
     except Exception as error:
-        lack = failure(name, getattr(factory, "distribution", None), error)
+        lack = log_failure(name, getattr(factory, "distribution", None), error)
         return Observed(name, lack=lack, has_failed=True)
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
-    name = detector.name
-    lack = unusable(detector, recording) or distrust
-    if lack is None and name not in _AT_REST and not baseline:
-        lack = does_not_move(recording)
+    """Run a detector on what it can use, or report why it cannot use the recording or any baseline."""
+    lack = unusable_reason(detector, recording) or distrust
+    if lack is None and not baseline and detector.name not in _AT_REST:
+        lack = describe_hold(recording)
     if lack is None and baseline:
-        lacks = [_unusable(detector, healthy) for healthy in baseline]
-        baseline = tuple(healthy for healthy, why in zip(baseline, lacks, strict=True) if why is None)
-        lack = None if baseline else f"no baseline recording can be used: {lacks[0]}"
+        reasons = [_unusable_baseline(detector, entry) for entry in baseline]
+        baseline = tuple(entry for entry, reason in zip(baseline, reasons, strict=True) if reason is None)
+        lack = None if baseline else f"no baseline recording can be used: {reasons[0]}"
     if lack is not None:
-        return Observed(name, lack=lack)
-    return checked(detector.observe(recording, baseline), name)
+        return Observed(detector.name, lack=lack)
+    return validate_report(detector.observe(recording, baseline), detector.name)
 
 
-def _unusable(detector: Detector, healthy: Healthy) -> str | None:
+def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
+    """Return the reason why a detector cannot use a healthy recording, or None if it can."""
     if isinstance(healthy, Recording):
-        return unusable(detector, healthy)
-    return None if detector.name in healthy.lessons else "it has taught this method nothing"
+        return unusable_reason(detector, healthy)
+    has_summary = detector.name in healthy.summaries
+    return None if has_summary else "its samples were not kept, and it has no summary for this method"
 
 
-def rarities_of(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
-    """Compute how rare each change within a healthy recording is, by the key of its observable.
+def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
+    """Compute the surprisal, -log(chance), of each change within a healthy recording, by `null.null_key`.
 
-    Those of a balance whose pump is cut off at rest begin with `SHUT`.
+    Keys of a balance whose pump is cut off at rest have the prefix `SHUT`.
     """
-    key = (RARITIES, rig if isinstance(rig, Rig) else str(rig))
-    return remembered(recording, key, lambda whole: _rarities(whole, rig))
+    return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
-def _rarities(recording: Recording, rig: Rig | str | os.PathLike[str]) -> Mapping[str, float]:
-    rarities = _rarities_in([observe_signals(recording)])
-    balance, response = VolumeBalance(load_rig(rig)), "pressure response"
-    reports: Mapping[bool, Observed] = {}
-    if unusable(balance, recording) is None:
+def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
+    """Compute the surprisals of the signals and of the balance; without a balance, of the pressure response instead."""
+    surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
+    reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
+    if unusable_reason(balance, recording) is None:
         try:
             with np.errstate(all="ignore"):
                 reports = balance.observe_regimes(recording)
         except Exception as error:
-            failure(balance.name, None, error)
-    for shut, report in reports.items():
-        rarities |= {f"{SHUT if shut else ''}{key}": rarity for key, rarity in _rarities_in([report]).items()}
-    if reports or response not in detectors():
-        return rarities
-    return rarities | _rarities_in([run_detector(response, recording, (), rig)])
+            log_failure(balance.name, None, error)
+    for is_shut, report in reports.items():
+        prefix = SHUT if is_shut else ""
+        surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
+    if not reports and PRESSURE_RESPONSE in detectors():
+        surprisals |= _max_surprisals(run_detector(PRESSURE_RESPONSE, recording, (), rig))
+    return surprisals
 
 
-def _rarities_in(reports: Sequence[Observed]) -> dict[str, float]:
-    rarities: dict[str, float] = {}
-    for report in reports:
-        for observable in report.observables:
-            if observable.onset is not None and observable.rarity > rarities.get(key_of(observable), -1.0):
-                rarities[key_of(observable)] = observable.rarity
-        if report.leak is not None and report.leak.step is not None:
-            rarities[step_key(report.provider)] = -float(np.log(max(report.leak.step.chance, 1e-300)))
-    return rarities
+def _max_surprisals(report: Observed) -> dict[str, float]:
+    """Collect the largest surprisal of each observable that changes within the recording, by `null.null_key`.
+
+    The step of the leak is included, by the chance of its own test.
+    """
+    surprisals: dict[str, float] = {}
+    for observable in report.observables:
+        if observable.onset is not None:
+            key = null_key(observable)
+            surprisals[key] = max(observable.surprisal, surprisals.get(key, 0.0))
+    if report.leak is not None and report.leak.step is not None:
+        surprisals[step_key(report.provider)] = -float(np.log(max(report.leak.step.chance, _MIN_CHANCE)))
+    return surprisals
 
 
-def null_of(baseline: Sequence[Healthy], rig: Rig | str | os.PathLike[str], *, shut: bool = False) -> HealthyNull:
-    """Collect the rarities of every observable in healthy recordings; `shut`: the pump is cut off at rest."""
-    known = defaultdict[str, list[float]](list)
+def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
+    """Collect the null distribution of every observable: its surprisals, -log(chance), in the healthy recordings.
+
+    Comparisons between recordings have one distribution for each kind of data: the largest surprisal of each healthy
+    recording against all others. With `shut` the balance's surprisals are those under the hypothesis that the pump is
+    cut off at rest.
+    """
+    surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
-        rarities = healthy.statistics if isinstance(healthy, Learnt) else rarities_of(healthy, rig)
+        surprisals = (
+            healthy.statistics if isinstance(healthy, SummarisedRecording) else healthy_surprisals(healthy, rig)
+        )
         if shut:
-            rarities = {**rarities, **{key.removeprefix(SHUT): value for key, value in rarities.items() if SHUT in key}}
-        for key, rarity in rarities.items():
-            known[key].append(float(rarity))
+            shut_surprisals = {key.removeprefix(SHUT): u for key, u in surprisals.items() if key.startswith(SHUT)}
+            surprisals = {**surprisals, **shut_surprisals}
+        for key, surprisal in surprisals.items():
+            surprisals_by_key[key].append(float(surprisal))
     for observables in compare_healthy(baseline):
         for data in {observable.data for observable in observables}:
-            rarest = max(observable.rarity for observable in observables if observable.data == data)
-            known[f"{data}: against"].append(rarest)
-    return HealthyNull(known)
+            max_surprisal = max(observable.surprisal for observable in observables if observable.data == data)
+            surprisals_by_key[comparison_key(data)].append(max_surprisal)
+    return HealthyNull(surprisals_by_key)
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Yield the comparison of each healthy recording's ringing with all others."""
+    """Compare the ringing of each healthy recording with that of all others; yield the observables of each."""
     detector = RmsChange()
-    lessons = lessons_of(detector, [healthy for healthy in baseline if _unusable(detector, healthy) is None])
+    usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]
+    summaries = healthy_summaries(detector, usable_entries)
     comparable = [
-        lesson
-        for lesson in lessons
-        if lesson["chambers"] == lessons[0]["chambers"] and lesson["rate"] == lessons[0]["rate"]
+        summary
+        for summary in summaries
+        if summary["chambers"] == summaries[0]["chambers"] and summary["rate"] == summaries[0]["rate"]
     ]
-    for k, lesson in enumerate(comparable if len(comparable) > FEWEST else ()):
-        yield compare_lessons(lesson, comparable[:k] + comparable[k + 1 :], lesson["chambers"])[0]
+    for k, summary in enumerate(comparable if len(comparable) >= MIN_COMPARED else ()):
+        yield compare_summaries(summary, comparable[:k] + comparable[k + 1 :], summary["chambers"])[0]

@@ -20,7 +20,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sealscope.diagnosis.detectors.detector import Detector, Factory, failure
+from sealscope.diagnosis.detectors.detector import Detector, Factory, log_failure
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -44,7 +45,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the source file, to tell its results from another version's."""
+        """Hash of the source file, to distinguish its results from another version's."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -53,15 +54,16 @@ class PlugIn:
 
 
 def _make_detector(module: str, name: str, rig: Rig) -> Detector:
+    """Import the class of a built-in detector, and make it for a rig."""
     detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
     return detector
 
 
 #: The built-in detectors by name, loaded when first made; one contract test runs them all.
 DETECTORS: dict[str, Factory] = {
-    "volume balance": partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
-    "pressure response": partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
-    "rms change": partial(_make_detector, "rms_change.detector", "RmsChange"),
+    VOLUME_BALANCE: partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
+    PRESSURE_RESPONSE: partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
+    RMS_CHANGE: partial(_make_detector, "rms_change.detector", "RmsChange"),
 }
 
 
@@ -71,19 +73,19 @@ def detectors() -> Mapping[str, Factory]:
 
 
 @cache
-def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
+def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
     """Return the detectors of installed distributions, in the order of their names.
 
-    One that cannot be loaded, or whose name is `used` by a built-in detector, by another plug-in or by a reserved
-    word, is left out with one line that names its distribution. Looked for once in a process.
+    A detector that cannot be loaded, or whose name is that of a built-in detector, of another plug-in or reserved, is
+    left out with one logged line that names its distribution. The search is made once in a process.
     """
-    found_plug_ins: dict[str, PlugIn] = {}
+    plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
         distribution = point.dist.name if point.dist is not None else point.value
         try:
-            if point.name in found_plug_ins:
-                raise ValueError(f"its name is that of a detector of {found_plug_ins[point.name].distribution}")
-            if point.name in used or point.name in _RESERVED:
+            if point.name in plug_in_of:
+                raise ValueError(f"its name is that of a detector of {plug_in_of[point.name].distribution}")
+            if point.name in built_in_names or point.name in _RESERVED:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
                 raise ValueError("its name must be plain words without ',' and '@'")
@@ -91,7 +93,7 @@ def plug_ins(used: frozenset[str]) -> Mapping[str, PlugIn]:
             if not callable(make):
                 raise TypeError(f"{point.value} must be callable with a rig, got {type(make).__name__}")
         except Exception as error:
-            failure(point.name, distribution, error)
+            log_failure(point.name, distribution, error)
             continue
-        found_plug_ins[point.name] = PlugIn(point.name, distribution, make)
-    return found_plug_ins
+        plug_in_of[point.name] = PlugIn(point.name, distribution, make)
+    return plug_in_of

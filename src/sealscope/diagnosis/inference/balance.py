@@ -1,144 +1,143 @@
-"""Blocks of a balance from samples: of a recording, whole, or of a stream, piece by piece, by the same sums."""
+"""Blocks of a balance from the samples of a recording or a stream, with identical sums."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting, solve
-from sealscope.diagnosis.inference.onset import FEWEST
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS
+from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
-from sealscope.diagnosis.inference.rows.distribution import distribution
+from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     OVERLAP,
     SPAN,
     STRIDE,
-    rows,
     stride_samples,
-    weights_beside_holes,
+    weak_form_rows,
+    weights_near_holes,
 )
 from sealscope.diagnosis.inference.terms import (
-    AVERAGED,
+    AVERAGING_TIME,
     CYLINDER,
     HALF_DIFFERENCE,
-    LEAST_ABSOLUTE,
-    LEAST_REST,
+    MIN_ABSOLUTE_PRESSURE,
+    MIN_REST,
     REST_LEAK,
     START,
     Equation,
+    RestLimits,
     Signals,
     equations,
     shut_at_rest,
     with_rests,
 )
-from sealscope.diagnosis.inference.zero import about_zero
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.corrections.gaps import holes
-from sealscope.recordings.quality import clipped
+from sealscope.recordings.corrections.gaps import flag_holes
+from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.storage.plain_state import plain_array, require_part, restore_array
 from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_BLOCKS = priors("inference")["blocks"]
-LONGEST: float = _BLOCKS["longest"]
-SHORTEST: float = _BLOCKS["shortest"]
-#: Turns by which the terms are taken about a zero of p_A - p_B, and how near to it they are, as a share of what is
-#: believed of one: a root is not linear in it, nor is which side carries.
-TURNS, NEAR = 2, 3.0
-#: The name of the samples that are 1 in a hole that was bridged, else 0; absent where there is none.
+_BLOCKS = INFERENCE.blocks
+#: Maximum and minimum length of a block [s].
+MAX_BLOCK_TIME: float = _BLOCKS.longest
+MIN_BLOCK_TIME: float = _BLOCKS.shortest
+#: Offset of p_A - p_B below which the terms need not be evaluated again about it [standard deviations of its prior]:
+#: the root and the carrying side are not linear in it.
+NEGLIGIBLE_OFFSET = 3.0
+#: Channels that balances read.
+READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
+#: Name of the samples that are 1 in a bridged hole, else 0; absent without holes.
 HOLE = "hole"
-#: Samples whose increments are computed at once: they stay in the processor's cache.
-AT_ONCE = 8192
+#: Number of samples whose increments are computed together, so that they stay in the processor's cache.
+BATCH_SAMPLES = 8192
 
 
 class BlockStream:
-    """Blocks of a stream of samples; the same for pieces of any size.
+    """Close blocks from a stream of samples, identically for pieces of any size.
 
-    Parameters
-    ----------
-    balances : sequence of Equation
-        The machine's balances (`terms.equations`).
-    rate : float
-        Sampling rate [Hz].
-    seconds : float
-        Length of a block [s], rounded to whole strides of the weak form.
-    support : int, optional
-        Blocks at the beginning whose rows are weighted together; None: all that are pushed at first.
-    start : float, optional
-        Time of the first sample [s].
-    zero : float, optional
-        What p_A - p_B reads too much [Pa].
+    `balances`: of the machine (`terms.equations`); `rate` [Hz]; `block_s`: length of a block [s], rounded to whole
+    strides of the weak form; `n_first`: number of first blocks that are weighted together, None for all of the first
+    push; `start`: time of the first sample [s]; `offset`: of the sensors, subtracted from p_A - p_B [Pa]; `on_samples`
+    is called with the clock and the samples of each block before it is closed.
     """
 
     def __init__(
         self,
         balances: Sequence[Equation],
         rate: float,
-        seconds: float = LONGEST,
-        support: int | None = SUPPORT,
+        block_s: float = MAX_BLOCK_TIME,
+        n_first: int | None = SUPPORT,
         start: float = 0.0,
-        zero: float = 0.0,
+        offset: float = 0.0,
+        on_samples: Callable[[float, Mapping[str, Array]], None] | None = None,
     ) -> None:
-        self.columns = tuple(Columns(balance) for balance in balances)
-        self._balances, self._rate, self._zero = balances, rate, zero
+        self._on_samples = on_samples
+        self.columns = tuple(ColumnRoles(balance) for balance in balances)
+        self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
-        self._strides = max(SPAN, round(seconds / STRIDE))
+        self._strides = max(SPAN, round(block_s / STRIDE))
+        # samples on either side of a block that its speeds and rests depend on
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._finds_rests = any(REST_LEAK in columns.names for columns in self.columns)
         if self._finds_rests:
-            self._margin += round(AVERAGED * rate) + round(LEAST_REST * rate)
-        self._still = (-1.0, -1.0)
-        self._weighting, self._support = Weighting(self.columns), support
-        self._zeros: dict[str, float] | None = None
-        self._signs: tuple[float, ...] = ()
+            self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
+        self._rest_limits: RestLimits | None = None  # from the first samples on
+        self._weighting, self._n_first = Weighting(self.columns), n_first
+        self._absolute_offsets: dict[str, float] | None = None  # from gauge to absolute pressure [Pa], by channel
+        self._left_signs: tuple[float, ...] = ()  # of each left side, from the first blocks on
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Take samples from the clock `begin` [s] on, after a gap; what was pushed before it is dropped."""
+        """Continue with samples from the time `begin` [s], after a gap; drop earlier samples without a block."""
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
-        self._first = 0  # index, since `begin`, of the first sample that is kept
-        self._have = 0  # ... and one past the last
-        self._done = 0  # blocks since then that are closed
+        self._first = 0  # index since `begin` of the first stored sample
+        self._end = 0  # index past the last stored sample
+        self._n_closed = 0  # blocks since `begin`
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
-        """Take the next samples, each channel of the same length; return the blocks they complete, None for none.
+        """Add samples, each channel of the same length; return the blocks that they complete, or None.
 
-        A missing sample is NaN. `last`: nothing follows, so that what remains is closed as well.
+        Missing samples are NaN. `last`: no samples follow, so that the remaining ones are closed as well.
         """
         if samples:
             self._pieces.append(samples)
-            self._have += len(next(iter(samples.values())))
+            self._end += len(next(iter(samples.values())))
         length = self._strides * self._stride
+        # samples after a block that its last rows reach over, and that its speeds and rests depend on
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
-        count = max(0, (self._have - tail) // length)
-        waits = 1 if last or self._weighting.has_blocks else self._support or 1
-        if count <= self._done or (self._done == 0 and count < waits):
+        n_complete = max(0, (self._end - tail) // length)
+        min_blocks = 1 if last or self._weighting.has_blocks else self._n_first or 1
+        if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
             return None
-        joined = self._join_pieces()
-        ends = [count]
-        if self._support is not None:  # those that support the stream together, then one by one, whatever the pieces
-            first = self._done + 1 if self._weighting.has_blocks else min(self._support, count)
-            ends = list(range(first, count + 1))
-        parts = [self._close(joined, *pair) for pair in zip([self._done, *ends[:-1]], ends, strict=True)]
-        blocks = parts[0] if len(parts) == 1 else Blocks.join(parts)
-        self._done = count
-        first_kept = max(0, count * length - self._margin)
-        self._pieces = [{name: values[first_kept - self._first :].copy() for name, values in joined.items()}]
-        self._first = first_kept
+        joined, ends = self._join_pieces(), [n_complete]
+        if self._n_first is not None:  # the first together, later ones one by one, for pieces of any size
+            first_end = self._n_closed + 1 if self._weighting.has_blocks else min(self._n_first, n_complete)
+            ends = list(range(first_end, n_complete + 1))
+        starts = [self._n_closed, *ends[:-1]]
+        blocks = Blocks.join([self._build_blocks(joined, *pair) for pair in zip(starts, ends, strict=True)])
+        self._n_closed = n_complete
+        first_stored = max(0, n_complete * length - self._margin)
+        self._pieces = [{name: values[first_stored - self._first :].copy() for name, values in joined.items()}]
+        self._first = first_stored
         return blocks
 
     def _join_pieces(self) -> dict[str, Array]:
-        if len(self._pieces) == 1:
+        """Concatenate the stored samples of each channel."""
+        if len(self._pieces) == 1:  # a whole recording: no copy
             return dict(self._pieces[0])
         names = self._pieces[0] if self._pieces else ()
         return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
@@ -149,100 +148,120 @@ class BlockStream:
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
             "begin": self._begin,
             "first": self._first,
-            "done": self._done,
-            "zeros": self._zeros,
-            "signs": list(self._signs),
+            "done": self._n_closed,
+            "zeros": self._absolute_offsets,
+            "signs": list(self._left_signs),
             "weighting": self._weighting.state(),
         }
 
-    def recall(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
-        samples = part_of(state, "samples", Mapping)
-        self.restart(float(part_of(state, "begin", (float, int))))
-        self._pieces = [{name: array_of(values, name) for name, values in samples.items()}] if samples else []
-        self._first, self._done = (int(part_of(state, name, int)) for name in ("first", "done"))
-        self._have = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
-        zeros = part_of(state, "zeros", (Mapping, type(None)))
-        self._zeros = None if zeros is None else {name: float(value) for name, value in zeros.items()}
-        self._signs = tuple(float(sign) for sign in part_of(state, "signs", Sequence))
-        self._weighting.recall(part_of(state, "weighting", Mapping))
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state` with identical results; raise InputError if it does not fit."""
+        samples = require_part(state, "samples", Mapping)
+        self.restart(float(require_part(state, "begin", (float, int))))
+        self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
+        self._first, self._n_closed = (int(require_part(state, name, int)) for name in ("first", "done"))
+        self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
+        to_absolute = require_part(state, "zeros", (Mapping, type(None)))
+        self._absolute_offsets = (
+            None if to_absolute is None else {name: float(to_absolute[name]) for name in to_absolute}
+        )
+        self._left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
+        self._weighting.load_state(require_part(state, "weighting", Mapping))
 
-    def _oriented(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Return the sign of each left side: an encoder, or the sides, may be connected the other way round.
+    def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
+        """Estimate the sign of each left side, as an encoder or the two sides may be connected in reverse.
 
-        Friction takes work, so that p_A - p_B goes with the flow into A; oil leaks from the higher pressure to the
-        lower; and where x grows with the flow into A, as it should, the sides are seldom exchanged. Each is a number z
-        in its deviations, whose sign is right with probability Phi(z) but for the share of machines where something
-        else makes it.
+        Three symptoms of correct wiring add their log odds: friction dissipates, so that p_A - p_B correlates with the
+        flow into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
+        probability Phi(z) of a correct sign, except for a fraction of machines in which something else causes it.
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
-            pressure, left = values[:, columns.leak], balance.takes * values[:, columns.left]
-            moved = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
-            odds = _odds(_leaks(values.T @ values, columns, len(values)), "leak")
-            odds += _odds(_in_deviations((pressure - pressure.mean()) * left), "work") if len(values) else 0.0
-            if (agreement := _in_deviations(moved * left)) > 0.0:  # else either may be the other way round
-                odds += _odds(agreement, "sides")
+            pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
+            motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
+            odds = _sign_log_odds(_leak_z_score(values.T @ values, columns, len(values)), INFERENCE.sense.leak)
+            if len(values):
+                odds += _sign_log_odds(_z_score((pressure - pressure.mean()) * left), INFERENCE.sense.work)
+            if (agreement := _z_score(motion * left)) > 0.0:  # else either x or the flow may be reversed
+                odds += _sign_log_odds(agreement, INFERENCE.sense.sides)
             signs.append(-1.0 if odds < 0.0 else 1.0)
         return tuple(signs)
 
-    def _close(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
-        """Return blocks `first` to `end`, whose rows are weighted together."""
-        length = self._strides * self._stride
-        if self._zeros is None:
-            early = slice(0, (self._support or end) * length)
-            self._zeros = {name: _gauge_to_absolute(samples[name][early]) for name in ("p_A", "p_B") if name in samples}
-        if self._finds_rests and self._still[0] < 0.0:
-            signals = Signals(samples, self._rate, self._zeros)
-            left, moved = self._balances[0].left(signals), signals.step("x")
-            self._still = still_rate(left, self._rate), still_rate(moved, self._rate)
-        batch = max(1, AT_ONCE // length)
-        cuts = [self._cut_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
-        weights = np.concatenate([cut.weights for cut in cuts])
-        counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
-        values = [np.concatenate(pieces)[counted] * roots for pieces in zip(*(cut.rows for cut in cuts), strict=True)]
-        self._signs = self._signs or self._oriented(values)
-        for equation_rows, columns, sign in zip(values, self.columns, self._signs, strict=True):
+    def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
+        """Build the blocks with the indices `first` to `end` - 1, whose rows are weighted together."""
+        length = self._strides * self._stride  # of a block [samples]
+        self._estimate_stream_constants(samples, (self._n_first or end) * length)
+        if self._on_samples is not None:
+            for k in range(first * length, end * length, length):
+                block = slice(k - self._first, k - self._first + length)
+                self._on_samples(self._begin + k / self._rate, {name: samples[name][block] for name in samples})
+        batch = max(1, BATCH_SAMPLES // length)  # number of blocks
+        batches = [self._compute_rows(samples, k, min(k + batch, end)) for k in range(first, end, batch)]
+        weights, flow, pressures = (
+            np.concatenate([getattr(part, name) for part in batches]) for name in ("weights", "flow", "pressures")
+        )
+        # rows without missing samples, times the root of their weight
+        is_counted, roots = weights > 0.0, np.sqrt(weights[weights > 0.0])[:, None]
+        values = [
+            np.concatenate(parts)[is_counted] * roots for parts in zip(*(part.rows for part in batches), strict=True)
+        ]
+        self._left_signs = self._left_signs or self._left_side_signs(values)
+        for equation_rows, columns, sign in zip(values, self.columns, self._left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
-        gram = self._weighting.close(values, np.cumsum(counted.reshape(-1, self._strides).sum(axis=1)))
-        index = np.arange(first, end, dtype=float)
-        start = self._begin + (index * self._strides + 0.5 * SPAN) * (self._stride / self._rate)
-        last = start + (self._strides - 1) * self._stride / self._rate
-        flow, pressures = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("flow", "pressures"))
-        zeros = np.full(end - first, self._zero)
-        return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, zeros)
+        gram = self._weighting.compute_gram_matrices(
+            values, np.cumsum(is_counted.reshape(-1, self._strides).sum(axis=1))
+        )
+        stride = self._stride / self._rate
+        start = self._begin + (np.arange(first, end, dtype=float) * self._strides + 0.5 * SPAN) * stride
+        last = start + (self._strides - 1) * stride
+        offsets = np.full(end - first, self._offset)
+        return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
-    def _cut_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _Cut:
-        """Return the rows of blocks `first` to `end`."""
+    def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
+        """Estimate the pressures' absolute offsets from the first `n_samples`, and the limits of rests, both once."""
+        if self._absolute_offsets is None:
+            self._absolute_offsets = {
+                name: _absolute_offset(samples[name][:n_samples]) for name in ("p_A", "p_B") if name in samples
+            }
+        if self._finds_rests and self._rest_limits is None:
+            signals = Signals(samples, self._rate)
+            pump, piston = self._balances[0].left(signals), signals.step("x")
+            self._rest_limits = RestLimits(max_rest_rate(pump, self._rate), max_rest_rate(piston, self._rate))
+
+    def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
+        """Compute the rows of the regression in the blocks `first` to `end` - 1, with weights, flows and pressures."""
         length = self._strides * self._stride
-        start = first * length
+        # samples of the blocks; the windows of the last rows extend beyond them, to SPAN strides
+        start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
-        stop = end * length + (SPAN - 1) * self._stride + 1
-        reach = stop + self._margin - self._first
-        cut = {name: values[begin - self._first : reach] for name, values in samples.items()}
-        signals = Signals(cut, self._rate, self._zeros or {}, self._zero, self._still)
-        inner = slice(start - begin, stop - 1 - begin)
-        whole = np.ones((end - first) * self._strides, dtype=bool)
-        cut_rows, lefts = [], [balance.left(signals) for balance in self._balances]
+        piece = {  # with margins
+            name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
+        }
+        signals = Signals(piece, self._rate, self._absolute_offsets, self._offset, self._rest_limits)
+        without_margins = slice(start - begin, stop - 1 - begin)  # of the increments, one fewer than samples
+        is_whole = np.ones((end - first) * self._strides, dtype=bool)
+        rows, lefts = [], [balance.left(signals) for balance in self._balances]
         for balance, left in zip(self._balances, lefts, strict=True):
             columns = [*(term.increments(signals) for term in balance.terms), left]
-            weak_rows = rows([column[inner] for column in columns], self._rate)
-            whole &= weak_rows.whole
-            cut_rows.append(weak_rows.values)
-        within = slice(start - begin, start - begin + (end - first) * length)
-        pressure = (cut["p_A"] - cut["p_B"])[within].reshape(-1, length)
-        rate = np.abs(lefts[0][within].reshape(-1, length)) * self._rate
-        known = np.isfinite(rate)
-        flow = np.where(known, rate, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        parts = np.array([distribution(block, self._rate) for block in pressure])
-        hole_weights = weights_beside_holes(cut[HOLE][inner.start : inner.stop + 1], self._rate) if HOLE in cut else 1.0
-        return _Cut(tuple(cut_rows), np.where(whole, hole_weights, 0.0), flow, parts)
+            weak_rows = weak_form_rows([column[without_margins] for column in columns], self._rate)
+            is_whole &= weak_rows.whole
+            rows.append(weak_rows.values)
+        in_blocks = slice(start - begin, start - begin + (end - first) * length)
+        pressure = (piece["p_A"] - piece["p_B"])[in_blocks].reshape(-1, length)
+        flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate
+        is_known = np.isfinite(flow)
+        mean_flow = np.where(is_known, flow, 0.0).sum(axis=1) / np.maximum(is_known.sum(axis=1), 1)
+        pressures = np.array([sorted_part_means(block, self._rate) for block in pressure])
+        hole_weights = (
+            weights_near_holes(piece[HOLE][start - begin : stop - begin], self._rate) if HOLE in piece else 1.0
+        )
+        return _BlockRows(tuple(rows), np.where(is_whole, hole_weights, 0.0), mean_flow, pressures)
 
 
-class _Cut(NamedTuple):
-    """Rows (r, m) of each equation, the weight of each (r,), and `Blocks.flow` and `Blocks.pressures`.
+class _BlockRows(NamedTuple):
+    """Rows (r, m) of each equation, the weight of each row (r,), and `Blocks.flow` and `Blocks.pressures`.
 
-    A row counts as a share of one that no hole touches, and not at all where a sample is missing.
+    The weight is 1 without holes, a fraction next to a hole, and 0 with a missing sample.
     """
 
     rows: tuple[Array, ...]
@@ -251,78 +270,80 @@ class _Cut(NamedTuple):
     pressures: Array
 
 
-def _in_deviations(products: Array) -> float:
-    """Return the sum of products of two numbers a row over its deviation, were they independent."""
-    size = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
-    return float(products.sum()) / max(size, float(np.finfo(float).tiny))
+def _z_score(products: Array) -> float:
+    """Compute the z score of a sum of products (r,), of overlapping rows, against a mean of zero."""
+    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
+    return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
-def _odds(z: float, what: str) -> float:
-    """Return the logarithm of the odds that a sign is right."""
+def _sign_log_odds(z: float, other_cause: float) -> float:
+    """Compute the log odds that a sign with the score `z` is right; `other_cause`: probability of another cause."""
     from scipy.special import ndtr
 
-    other = 0.5 * priors("inference")["sense"][what]
-    return float(np.log((ndtr(z) + other) / (ndtr(-z) + other)))
+    return float(np.log((ndtr(z) + 0.5 * other_cause) / (ndtr(-z) + 0.5 * other_cause)))
 
 
-def _leaks(gram: Array, columns: Columns, count: int) -> float:
-    """Return the leak's coefficient over its deviation, by least squares over all rows; 0 where nothing tells it."""
-    nuisance = [k for k in columns.nuisance if k != columns.leak]
-    right = gram[np.ix_(nuisance, [columns.leak, columns.left])]
-    solved = solve(gram[np.ix_(nuisance, nuisance)], right)
-    rest = gram[np.ix_([columns.leak, columns.left], [columns.leak, columns.left])] - right.T @ solved
-    energy, lead, square = float(rest[0, 0]), float(rest[0, 1]), float(rest[1, 1])
-    if not energy > RIDGE * float(gram[columns.leak, columns.leak]) or count <= len(nuisance) + 1:
+def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
+    """Compute the z score of the leak's coefficient by least squares from the Gram matrix (m, m); 0 if undetermined."""
+    nuisance = [k for k in roles.nuisance if k != roles.leak]
+    leak_and_left = [roles.leak, roles.left]
+    coupling = gram[np.ix_(nuisance, leak_and_left)]
+    reduced = gram[np.ix_(leak_and_left, leak_and_left)] - coupling.T @ solve(
+        gram[np.ix_(nuisance, nuisance)], coupling
+    )
+    energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
+    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or n_rows <= len(nuisance) + 1:
         return 0.0
-    variance = OVERLAP * max(square - lead * lead / energy, 0.0) / (count - len(nuisance) - 1)
-    return lead / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
+    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / (n_rows - len(nuisance) - 1)
+    return moment / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
-def still_rate(increments: Array, rate: float) -> float:
-    """Compute the largest mean rate at rest of what moves by increments: a share of that in motion, or its noise."""
+def max_rest_rate(increments: Array, rate: float) -> float:
+    """Compute the maximum mean rate at rest from increments (n,): a fraction of the rate in motion, or its noise."""
     flow = increments[np.isfinite(increments)] * rate
-    size = np.abs(flow)
-    moving = float(size @ size) / max(float(size.sum()), np.finfo(float).tiny)
-    sixth = np.abs(np.diff(flow, 6))  # of white noise they have 924 times its variance
-    noise = 1.4826 * float(np.median(sixth)) / math.sqrt(924.0) if len(sixth) else 0.0
-    share: float = priors("inference")["rest"]["share"]
-    return max(share * moving, 3.0 * noise / math.sqrt(max(1.0, AVERAGED * rate)))
+    speed = np.abs(flow)
+    mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
+    differences = np.abs(np.diff(flow, 6))  # of white noise: 924 times its variance
+    # 1.4826: standard deviation of normal values over the median of their magnitudes
+    noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
+    fraction: float = INFERENCE.rest.share
+    return max(fraction * mean_speed, 3.0 * noise / math.sqrt(max(1.0, AVERAGING_TIME * rate)))
 
 
-def _gauge_to_absolute(pressure: Array) -> float:
-    """Compute the offset from gauge to absolute pressure: the atmosphere, or more where the zero is surely too low."""
+def _absolute_offset(pressure: Array) -> float:
+    """Compute absolute minus gauge pressure [Pa]: the atmosphere, or more if readings (n,) are below vacuum."""
     finite = pressure[np.isfinite(pressure)]
-    lowest = float(np.min(finite)) if finite.size else 0.0
-    return max(P_ATM, LEAST_ABSOLUTE - lowest)
+    min_reading = float(np.min(finite)) if finite.size else 0.0
+    return max(P_ATM, MIN_ABSOLUTE_PRESSURE - min_reading)
 
 
-def whole_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels, NaN in `holes` and where a pressure is cut off at an end of its range."""
+def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples of channels by name, NaN in holes (`flag_holes`) and where a pressure is clipped."""
     samples = bridged_samples(recording, names)
-    gaps = samples.pop(HOLE, np.zeros(0)) > 0.0
-    return {name: np.where(gaps, np.nan, values) for name, values in samples.items()} if gaps.any() else samples
+    is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
+    return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels, NaN where a pressure is cut off at an end of its range; `HOLE`: 1 in `holes`."""
-    samples, gaps = {}, holes(recording)
-    if gaps.any():
-        samples[HOLE] = gaps.astype(float)
-    for name in recording.channels:
-        if name not in names:
-            continue
-        values = recording[name]
-        rails = [rail.value for rail in clipped(values[np.isfinite(values)])] if name.startswith("p_") else []
-        samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
+    """Return the samples of channels, NaN where a pressure is clipped; the entry `HOLE`, if any, is 1 in holes."""
+    samples, is_hole = {}, flag_holes(recording)
+    if is_hole.any():
+        samples[HOLE] = is_hole.astype(float)
+    for name, values in recording.channels.items():
+        if name in names:
+            # rails: values at which the transducer clips
+            rails = [rail.value for rail in find_rails(values[np.isfinite(values)])] if name.startswith("p_") else []
+            samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
     return samples
 
 
-def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False) -> dict[str, Array]:
-    """Return the samples of a pump with what fades of its drive's start (`START`), and with the speed if none is there.
+def derive_drive_signals(
+    samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
+) -> dict[str, Array]:
+    """Add the decay of the drive's initial state (`START`) to samples, and the pump's speed if only a command is known.
 
-    The speed is what the drive makes of the command; a missing command is held, and the speed is missing with it.
-    `loaded`: under p_A - p_B, whose sense is that of the command; else what the load costs the drive is in the leak's
-    level.
+    The speed is the drive's response to the command; a missing command is held, and the speed is NaN there. `loaded`:
+    with the load p_A - p_B; otherwise the speed is that without load, and its droop counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -330,6 +351,7 @@ def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bo
         u, load = _hold_missing(samples["u"]), np.zeros(len(samples["u"]))
         if loaded:
             dp = _hold_missing(samples["p_A"] - samples["p_B"])
+            # the order of the pump's ports is unknown: the load has the sign of p_A - p_B that correlates with u
             load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
         speed = drive.flow(u, load, rate) / drive.displacement
         derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
@@ -337,35 +359,34 @@ def commanded(samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bo
 
 
 def _hold_missing(values: Array) -> Array:
-    """Fill each missing value of an array (n,) with the one before it; 0 at the beginning."""
+    """Replace each missing value of an array (n,) by the previous one, by 0 at the beginning."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])
 
 
-def shortest(rate: float) -> int:
-    """Return the fewest samples of a recording from which a step can be told: `FEWEST` blocks."""
+def min_samples_for_step(rate: float) -> int:
+    """Return the minimum number of samples in which a step can be tested: `MIN_BLOCKS` blocks."""
     stride = stride_samples(rate)
-    return FEWEST * max(SPAN, round(SHORTEST / STRIDE)) * stride + (SPAN - 1) * stride + 1
+    return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
 
 class RegimeBlocks(NamedTuple):
-    """Blocks of a recording by one hypothesis of what rests do (`regimes`), with its equations and columns.
+    """Blocks of a recording under one hypothesis of its rests (`regimes`), with equations and columns.
 
-    `blocks` are about the zero of p_A - p_B that a change of the leak needs, `plain` as recorded; `shut`: the pump is
-    cut off at rest.
+    `blocks`: with the offset of p_A - p_B removed; `plain`: as recorded; `shut`: the pump is cut off at rest.
     """
 
     blocks: Blocks
     plain: Blocks
     equations: tuple[Equation, ...]
-    columns: tuple[Columns, ...]
+    columns: tuple[ColumnRoles, ...]
     shut: bool = False
 
 
 class RecordedBlocks(NamedTuple):
-    """Blocks of a recording by either hypothesis, `shut` None where the pump never rests.
+    """Blocks of a recording under both hypotheses of rests; `shut` is None if the pump never rests.
 
-    `odds`: logarithm of those of the pump being cut off at rest.
+    `odds`: log odds that the pump is cut off at rest.
     """
 
     open: RegimeBlocks
@@ -373,79 +394,59 @@ class RecordedBlocks(NamedTuple):
     odds: float
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks by the hypothesis that has the `odds` of all that is known of the machine."""
+        """Return the blocks of the likelier hypothesis, by the log `odds` from all recordings."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
-    """Return the blocks of a recording by either hypothesis of what rests do; None where it allows no balance."""
-    names = frozenset(name for name in recording.channels if name in _READ)
+    """Compute the blocks of a recording under both hypotheses of rests; None if its channels allow no balance."""
+    names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
     if not balances:
         return None
-    pumped = balances[0].name == CYLINDER and not balances[0].by_command
-    streamed = tuple(with_rests(balance) for balance in balances) if pumped else balances
-    needed = {"x", "p_A", "p_B", str(flow_source(names))}
-    needed |= {name for balance in balances for term in balance.terms for name in term.needs}
-    samples = bridged_samples(recording, needed)
+    may_shut = balances[0].name == CYLINDER and not balances[0].by_command
+    stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
+    channels = {"x", "p_A", "p_B", str(flow_source(names))}
+    channels |= {name for balance in balances for term in balance.terms for name in term.needs}
+    samples = bridged_samples(recording, channels)
     if balances[0].by_command:
-        samples = commanded(samples, rig, recording.rate)
-    seconds = min(LONGEST, max(SHORTEST, recording.duration / _BLOCKS["wanted"]))
+        samples = derive_drive_signals(samples, rig, recording.rate)
+    start = float(recording.t[0])
+    block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))
 
-    def close(zero: float) -> tuple[Blocks, tuple[Columns, ...]] | None:
-        stream = BlockStream(streamed, recording.rate, seconds, None, float(recording.t[0]), zero)
-        blocks = stream.push(samples, last=True)
-        return None if blocks is None else (blocks, stream.columns)
+    @cache
+    def blocks_about(offset: float) -> Blocks | None:
+        """Compute the blocks with an offset [Pa] subtracted from p_A - p_B."""
+        stream = BlockStream(stream_balances, recording.rate, block_s, n_first=None, start=start, offset=offset)
+        return stream.push(samples, last=True)
 
-    recorded = close(0.0)
+    recorded = blocks_about(0.0)
     if recorded is None:
         return None
-    if not pumped:
-        return RecordedBlocks(_in_regime(recorded, balances, close, shut=None), None, 0.0)
-    odds = shut_odds(recorded[0], recorded[1][0])
-    return RecordedBlocks(
-        _in_regime(recorded, balances, close, shut=False),
-        _in_regime(recorded, balances, close, shut=True) if has_rests(recorded[0], recorded[1][0]) else None,
-        odds,
-    )
+    columns = ColumnRoles(stream_balances[0])
+
+    def regime_blocks_about(shut: bool, offset: float) -> Blocks:
+        """Compute the blocks about an offset [Pa] for the pump cut off at rest (`shut`) or not."""
+        blocks = blocks_about(offset)
+        assert blocks is not None  # as many samples as for `recorded`
+        return apply_regime(blocks, columns, shut) if may_shut else blocks
+
+    opened = _build_regime(balances, partial(regime_blocks_about, False))
+    if not may_shut or not has_rests(recorded, columns):
+        return RecordedBlocks(opened, None, 0.0)
+    shut_balances = tuple(shut_at_rest(balance) for balance in balances)
+    shut = _build_regime(shut_balances, partial(regime_blocks_about, True))._replace(shut=True)
+    return RecordedBlocks(opened, shut, shut_odds(recorded, columns))
 
 
-def _in_regime(
-    recorded: tuple[Blocks, tuple[Columns, ...]],
-    balances: tuple[Equation, ...],
-    close: Callable[[float], tuple[Blocks, tuple[Columns, ...]] | None],
-    shut: bool | None,
-) -> RegimeBlocks:
-    """Return recorded blocks by a hypothesis, about their zero; None: the only one."""
-    balances = tuple(shut_at_rest(balance) for balance in balances) if shut else balances
-    columns = tuple(Columns(balance) for balance in balances)
+def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
+    """Build the blocks of one hypothesis, with the offset of p_A - p_B removed.
 
-    def turned(blocks: Blocks, streamed: tuple[Columns, ...]) -> Blocks:
-        return blocks if shut is None else apply_regime(blocks, streamed[0], shut)
-
-    plain = turned(*recorded)
-    blocks = about_zero(plain, columns)
-    for _ in range(TURNS - 1):
-        zero = float(blocks.zero[0])
-        if abs(zero) < NEAR * priors("inference")["zero"]["pressure"]:
-            break
-        again = close(zero)
-        if again is None:
-            break
-        blocks = about_zero(turned(*again), columns)
-    return RegimeBlocks(blocks.merged(), plain.merged(), balances, columns, bool(shut))
-
-
-def blocks_of(recording: Recording, rig: Rig) -> tuple[Blocks, Blocks, tuple[Columns, ...]] | None:
-    """Return the blocks of a recording and where their columns stand; None where its channels allow no balance.
-
-    They come twice: about the zero of p_A - p_B that a change of the leak needs, and as recorded.
+    `blocks_about(offset)` computes the blocks with an offset [Pa] subtracted from p_A - p_B.
     """
-    recorded = recorded_blocks(recording, rig)
-    if recorded is None:
-        return None
-    regime = recorded.regime(recorded.odds)
-    return regime.blocks, regime.plain, regime.columns
-
-
-_READ = ("u", "omega", "theta", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
+    columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
+    blocks = remove_pressure_offset(plain, columns)
+    offset = float(blocks.zero[0])
+    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:  # else the terms are linear enough in it
+        blocks = remove_pressure_offset(blocks_about(offset), columns)
+    return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

@@ -1,11 +1,11 @@
-"""Information in blocks: what a stretch of a recording says of the coefficients of a balance, and how it is added up.
+"""Likelihood of a balance's coefficients in blocks of a recording, from sums that add up.
 
-A block keeps, of the rows within it, the Gram matrix of all columns (terms and left side). Blocks add: the sum of their
-matrices is that of their union, so that a stream and a whole recording are handled alike, and a recording of hours
-costs no more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
+A block stores the Gram matrix of its rows over all columns (terms and left side). Gram matrices of blocks add up to
+that of their union, so that a stream and a whole recording are handled alike, and a recording of hours costs no more
+than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
 
-For one coefficient g, a number for each block, everything else is eliminated (`information`). The other coefficients
-are a level with a slow drift, c_j(t) = sum_p c_jp P_p(t), whose size is believed within a width (`priors.toml`):
+To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
+level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its size (`priors.toml`):
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
 
@@ -16,7 +16,8 @@ k (d the column of g, o the others with their drifts, y the left side); its like
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -24,21 +25,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.rows.row_weights import MOST_TURNS, RIDGE, SUPPORT, TOLERANCE, weighted
+from sealscope.diagnosis.inference.rows.row_weights import (
+    MAX_ITERATIONS,
+    RIDGE,
+    SUPPORT,
+    TOLERANCE,
+    block_gram_matrices,
+)
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_LEAK, RESTS, Equation
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import array_of, part_of, plain_array
+from sealscope.storage.plain_state import plain_array, require_part, restore_array
 
-#: Most blocks that are handled at once; neighbours are added up beyond.
-MOST_BLOCKS = 240
-#: Degree of the drifts.
+#: Maximum number of blocks of a fit; neighbouring blocks are added up beyond it.
+MAX_BLOCKS = 240
+#: Degree of the Legendre polynomials of the drifts.
 DRIFT_DEGREE = 2
-#: Priors of the coefficients that are free in each block while its rows are weighted.
+#: Kinds of coefficients (`Term.drift`) that are free in each block while its rows are weighted.
 UNSTEADY = ("leak", "pump", "bias", "outside")
-_TURNS = 3
+#: Maximum number of Gauss-Newton steps to the offset of p_A - p_B.
+_MAX_OFFSET_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +61,13 @@ class Blocks:
         Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left
         side last.
     rows : array of float, shape (K,)
-        Number of rows that no missing sample touches; beside a hole a row counts as a share.
+        Number of rows without missing samples; a row next to a hole counts as a fraction of one.
     flow : array of float, shape (K,)
-        Mean size of the left side's rate [m^3/s].
+        Mean absolute rate of the left side [m^3/s].
     pressures : array of float, shape (K, p)
-        Distribution of p_A - p_B [Pa]: means of p equal parts of it, in rising order (`distribution`).
+        Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
     zero : array of float, shape (K,)
-        What the sums have taken off p_A - p_B [Pa] (`zero.about_zero`); `pressures` are as recorded.
+        Sensor offset that was subtracted from p_A - p_B in `gram` [Pa] (`pressure_offset.remove_pressure_offset`).
     """
 
     start: Array
@@ -73,49 +81,83 @@ class Blocks:
     def __len__(self) -> int:
         return len(self.start)
 
+    def __getitem__(self, index: slice | NDArray[np.bool_]) -> Blocks:
+        """Select blocks by a slice or a mask."""
+        return Blocks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def pack(self) -> Blocks:
+        """Drop the lower triangles of the Gram matrices for storage: `gram` becomes (K, E, m (m + 1) / 2)."""
+        return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
+
+    def unpack(self, size: int) -> Blocks:
+        """Restore the Gram matrices (K, E, size, size) of packed blocks; raise InputError for another shape."""
+        upper, lower = np.triu_indices(size)
+        lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
+        if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
+            raise InputError(f"saved state's gram must have {len(upper)} sums a block, got {self.gram.shape}")
+        gram = np.zeros((*self.gram.shape[:2], size, size))
+        gram[..., upper, lower] = gram[..., lower, upper] = self.gram
+        return replace(self, gram=gram)
+
     @property
     def time(self) -> Array:
         """Middle of each block [s]."""
         return 0.5 * (self.start + self.end)
 
-    def merged(self, most: int = MOST_BLOCKS) -> Blocks:
-        """Return at most so many blocks, neighbours added up."""
-        group = -(-len(self) // most)
+    @property
+    def moving_flow(self) -> float:
+        """Mean flow while the pump delivers [m^3/s], weighted by the flow itself, so that standstills do not count."""
+        return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
+
+    @property
+    def is_moving(self) -> NDArray[np.bool_]:
+        """Flags of the blocks with motion (K,), in which the pump's mean flow is not that of holding a load."""
+        return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
+
+    def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
+        """Add up neighbouring blocks so that at most `max_blocks` remain."""
+        group = -(-len(self) // max_blocks)
         if group <= 1:
             return self
         first = np.arange(0, len(self), group)
-        last = np.append(first[1:], len(self)) - 1
+        end = np.append(first[1:], len(self))
         rows = np.add.reduceat(self.rows, first)
-        shares = self.rows[:, None] / np.maximum(np.repeat(rows, np.diff(np.append(first, len(self)))), 1.0)[:, None]
+        fractions = self.rows[:, None] / np.maximum(np.repeat(rows, end - first), 1.0)[:, None]
         return Blocks(
-            self.start[first],
-            self.end[last],
-            np.add.reduceat(self.gram, first, axis=0),
-            rows,
-            np.add.reduceat(self.flow * shares[:, 0], first),
-            np.add.reduceat(self.pressures * shares, first, axis=0),
-            self.zero[first],
+            start=self.start[first],
+            end=self.end[end - 1],
+            gram=np.add.reduceat(self.gram, first, axis=0),
+            rows=rows,
+            flow=np.add.reduceat(self.flow * fractions[:, 0], first),
+            pressures=np.add.reduceat(self.pressures * fractions, first, axis=0),
+            zero=self.zero[first],
         )
 
-    def driving(self, zero: float | None = None, root: bool = False) -> Array:
-        """Return the mean of abs(p_A - p_B - zero) [Pa] over each block, shape (K,), by default about that of the sums.
+    def mean_pressure(self, offset: float | None = None) -> Array:
+        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, (K,); by default with the offset `zero`.
 
-        With `root` that of the root of p_A - p_B, about the sums' zero and then about `zero` [Pa^0.5]. A leak's
-        coefficient times it is the leak's mean flow (`zero_of`).
+        A laminar leak's coefficient times it is the leak's mean flow.
         """
-        if not root:
-            return np.asarray(np.abs(self.pressures - (self.zero[:, None] if zero is None else zero)).mean(axis=1))
-        difference = self.pressures - self.zero[:, None]
-        return np.asarray(np.abs(np.sign(difference) * np.sqrt(np.abs(difference)) - (zero or 0.0)).mean(axis=1))
+        return np.asarray(np.abs(self.pressures - (self.zero[:, None] if offset is None else offset)).mean(axis=1))
+
+    def mean_root(self) -> Array:
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), as of an orifice's flow."""
+        return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:
-        """Return blocks one after the other."""
+        """Concatenate the blocks of consecutive parts."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
-class Columns:
-    """Where the columns of a balance stand in its Gram matrices, and what is believed of them."""
+class ColumnRoles:
+    """Indices of one equation's columns in its Gram matrices, by role, and the priors on their coefficients.
+
+    `left`: the left side; `nuisance`: coefficients unknown in any machine; `compared`: these, and those that are fitted
+    only where recordings are compared; `motion`: of the piston; `fast`: free in each block while rows are weighted;
+    `slow`: the same in all blocks. Standard deviations (m - 1,): `drift_rate` [1/min] and `between_deviation` between
+    recordings, infinite if they differ freely, both relative; `level_deviation`. `drivers`: `Term.driver`.
+    """
 
     def __init__(self, equation: Equation) -> None:
         self.names = tuple(term.name for term in equation.terms)
@@ -123,331 +165,385 @@ class Columns:
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
         self.leak = self.names.index(LEAK)
-        believed = priors("inference")["drift"]
-        self.drift = np.array([believed[term.drift] if term.nuisance else 0.0 for term in equation.terms])
-        differs = priors("inference")["between"]
-        self.between = np.zeros(len(equation.terms))
-        self.between[list(self.compared)] = [differs[equation.terms[k].drift] for k in self.compared]
-        levels = priors("inference")["level"]
-        self.levels = np.array([levels.get(term.drift, np.inf) for term in equation.terms])
-        self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
-        self.support = tuple(k for k in self.nuisance if equation.terms[k].drift not in UNSTEADY)
-        self.fast = tuple(k for k in self.nuisance if k not in self.support)
-        self.rest = tuple(self.names.index(name) for name in RESTS) if REST_LEAK in self.names else None
-        self.support = (*self.support, *(self.rest or ()))
-        self.bias = self.names.index(BIAS) if BIAS in self.names else None
-        self.driven = tuple(term.driven for term in equation.terms)
-        self.healthy = priors("inference")["healthy"][equation.healthy] if equation.healthy else float("inf")
-
-    def level_deviation(self, test: int, blocks: Blocks) -> float:
-        """Return the standard deviation of a healthy machine's coefficient of a column; infinite for other columns."""
-        driven = self.driven[test] if test < self.left else ""
-        pressure, root = (float(np.mean(blocks.driving(root=of_root))) for of_root in (False, True))
-        return (
-            self.healthy * {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}[driven]
+        drift_priors = vars(INFERENCE.drift)
+        self.drift_rate = np.array([drift_priors[term.drift] if term.nuisance else 0.0 for term in equation.terms])
+        between_priors = vars(INFERENCE.between)
+        self.between_deviation = np.zeros(len(equation.terms))
+        self.between_deviation[list(self.compared)] = [between_priors[equation.terms[k].drift] for k in self.compared]
+        self.level_deviation = np.array(
+            [INFERENCE.level.outside if term.drift == "outside" else np.inf for term in equation.terms]
         )
+        self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
+        self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
+        at_rest = tuple(self.names.index(name) for name in RESTS) if REST_LEAK in self.names else ()
+        self.slow = (*(k for k in self.nuisance if k not in self.fast), *at_rest)
+        self.bias = self.names.index(BIAS) if BIAS in self.names else None
+        self.drivers = tuple(term.driver for term in equation.terms)
+        self.healthy_conductance = equation.healthy
 
-    def zero_deviation(self, test: int, blocks: Blocks) -> float:
-        """Return the standard deviation of the zero of a column's pressure, by its slope; 0 where none drives it.
+    def replace_leak(self, name: str) -> ColumnRoles:
+        """Return the roles of the same columns with another one tested in place of the leak, which is compared."""
+        roles = copy(self)
+        roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
+        roles.between_deviation[self.leak] = INFERENCE.between.pump
+        return roles
 
-        No more than the pressure itself, which may be in counts.
+    def leak_deviation(self, test: int, blocks: Blocks) -> float:
+        """Return the prior standard deviation of a healthy machine's leak coefficient; infinite for other terms.
+
+        `test`: index of the column. For an orifice it gives the same mean flow as the laminar leak's.
         """
-        driven = self.driven[test] if test < self.left and self.bias is not None else ""
-        root = float(np.mean(blocks.driving(root=True)))
-        slope = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}[driven]
-        return float(min(priors("inference")["zero"]["pressure"], np.mean(blocks.driving()))) * slope
+        driver = self.drivers[test] if test < self.left else ""
+        pressure, root = (float(np.mean(values)) for values in (blocks.mean_pressure(), blocks.mean_root()))
+        per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
+        return self.healthy_conductance * per_conductance[driver]
+
+    def offset_deviation(self, test: int, blocks: Blocks) -> float:
+        """Return the prior standard deviation of a sensor offset in the unit of a leak's column; 0 for other columns.
+
+        `test`: index of the column. It is at most the mean pressure itself, since recordings may be in counts.
+        """
+        driver = self.drivers[test] if test < self.left and self.bias is not None else ""
+        root = float(np.mean(blocks.mean_root()))
+        # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))
+        per_pascal = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}
+        return min(INFERENCE.zero.pressure, float(np.mean(blocks.mean_pressure()))) * per_pascal[driver]
 
 
 class Weighting:
-    """Closes blocks: weighs the rows of each by what the block and those before it say, and keeps their sums."""
+    """Weights of the rows of blocks by their residuals in a fit to these and earlier blocks, and sums of products."""
 
-    def __init__(self, columns: Sequence[Columns]) -> None:
+    def __init__(self, columns: Sequence[ColumnRoles]) -> None:
         self._columns = columns
-        self._known = [np.zeros((len(column.support) + 1, len(column.support) + 1)) for column in columns]
+        self._earlier_sums = [np.zeros((len(column.slow) + 1, len(column.slow) + 1)) for column in columns]
         self._count = 0
 
     @property
     def has_blocks(self) -> bool:
-        """True once blocks were closed."""
+        """True if any block has been closed."""
         return self._count > 0
 
     def state(self) -> dict[str, Any]:
-        """Return the learnt sums in plain values for JSON."""
-        return {"count": self._count, "known": [plain_array(sums) for sums in self._known]}
+        """Return the weighted sums over earlier blocks as plain values for JSON."""
+        return {"count": self._count, "known": [plain_array(sums) for sums in self._earlier_sums]}
 
-    def recall(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`; raises InputError where it does not fit."""
-        self._count = int(part_of(state, "count", int))
-        known = [array_of(sums, "known") for sums in part_of(state, "known", list)]
-        shapes = [sums.shape for sums in self._known]
-        if [sums.shape for sums in known] != shapes:
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`; raise InputError if its shapes do not fit."""
+        self._count = int(require_part(state, "count", int))
+        restored = [restore_array(sums, "known") for sums in require_part(state, "known", list)]
+        shapes = [sums.shape for sums in self._earlier_sums]
+        if [sums.shape for sums in restored] != shapes:
             raise InputError(
-                f"saved state's known must be of the shapes {shapes}, got {[sums.shape for sums in known]}"
+                f"saved state's known must be of the shapes {shapes}, got {[sums.shape for sums in restored]}"
             )
-        self._known = known
+        self._earlier_sums = restored
 
-    def close(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
-        """Return the Gram matrices (K, E, m, m) of K blocks that are weighted together.
+    def compute_gram_matrices(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
+        """Compute the Gram matrices (K, E, m, m) of K blocks, outlying rows weighted down; update the earlier sums.
 
-        `values`: of each equation, the rows (r, m) of all of them; `ends`: index past the last row of each block.
+        `values`: rows (r, m) of all blocks, for each equation; `ends`: index past the last row of each block. Huber's
+        weights follow from a fit to these and earlier blocks: coefficients of fast columns are free in each block,
+        those of slow ones common to all.
         """
         self._count += len(ends)
-        share = min(1.0, SUPPORT / self._count)
+        update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
         grams = []
-        for equation_rows, columns, known in zip(values, self._columns, self._known, strict=True):
-            fast, slow = columns.fast, (*columns.support, columns.left)
-            grams.append(weighted(equation_rows, ends, np.array(fast), np.array(slow), known, share))
+        for equation_rows, columns, earlier_sums in zip(values, self._columns, self._earlier_sums, strict=True):
+            fast, slow = columns.fast, (*columns.slow, columns.left)  # the left side is the last slow column
+            grams.append(
+                block_gram_matrices(equation_rows, ends, np.array(fast), np.array(slow), earlier_sums, update_fraction)
+            )
         return np.stack(grams, axis=1)
 
 
 def solve(matrix: Array, right: Array) -> Array:
-    """Return matrix^-1 right of a symmetric matrix >= 0; directions that nothing is known of are left at zero."""
-    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    size[~(size > 0.0)] = 1.0
-    column = size[:, None]
-    scaled = matrix / column / size
-    scaled.flat[:: len(size) + 1] += RIDGE
-    shaped = right / (size if right.ndim == 1 else column)
-    _, solved, failed = _cholesky()(scaled, shaped) if shaped.size else (None, shaped, 0)
-    if failed:  # rounding made it no longer positive
-        solved = np.asarray(np.linalg.solve(scaled, shaped))
-    return np.asarray(solved / (size if right.ndim == 1 else column))
+    """Solve matrix x = right for a positive semidefinite matrix; components in its null space are zero."""
+    scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
+    scale[~(scale > 0.0)] = 1.0
+    column = scale[:, None]
+    scaled = matrix / column / scale
+    scaled.flat[:: len(scale) + 1] += RIDGE
+    scaled_right = right / (scale if right.ndim == 1 else column)
+    dposv = _positive_definite_solver()
+    _, solution, failed = dposv(scaled, scaled_right) if scaled_right.size else (None, scaled_right, 0)
+    if failed:  # not positive definite, by rounding
+        solution = np.asarray(np.linalg.solve(scaled, scaled_right))
+    return np.asarray(solution / (scale if right.ndim == 1 else column))
 
 
 @cache
-def _cholesky() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """Return LAPACK's solution of a positive definite system: a third of the time of NumPy's for a few columns."""
+def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, int]]:
+    """Import LAPACK's positive definite solver, which takes a third of NumPy's time for a few columns."""
     from scipy.linalg.lapack import dposv
 
     return dposv  # type: ignore[no-any-return]
 
 
-def information(blocks: Blocks, columns: Sequence[Columns], test: int, replaces: int | None = None) -> Information:
-    """Estimate the coefficient of one column in each block, all other coefficients eliminated.
+def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
+    """Compute the likelihood of one column's coefficient in each block, with all other coefficients eliminated.
 
-    `test`: index of the column, the left side's for a change of scale; `replaces`: a column that is left out for it.
+    `test`: index of the column; that of the left side tests a change of scale. `replaces`: index of a column to omit.
+    `columns`: of each equation; their likelihoods are multiplied.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
-    for e, equation in enumerate(columns):
-        nuisance = [k for k in equation.nuisance if k not in (test, replaces)]
-        part, lead = _eliminated(blocks.gram[:, e], blocks, equation, test, nuisance)
-        precision += part
-        vector += lead
-    return Information(blocks.time, precision, vector, columns[0].level_deviation(test, blocks))
+    for e, roles in enumerate(columns):
+        nuisance = [k for k in roles.nuisance if k not in (test, replaces)]
+        equation_precision, equation_vector = _eliminate_nuisance(blocks.gram[:, e], blocks, roles, test, nuisance)
+        precision += equation_precision
+        vector += equation_vector
+    return Information(blocks.time, precision, vector, columns[0].leak_deviation(test, blocks))
 
 
-def _drifts(blocks: Blocks) -> tuple[Array, float]:
-    """Return the drifts' shapes over the blocks, shape (K, DRIFT_DEGREE + 1), and the recording's length in minutes."""
+def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
+    """Compute Legendre polynomials over the blocks, (K, DRIFT_DEGREE + 1), and the recording's length [min]."""
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
-    tau = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0
-    return np.polynomial.legendre.legvander(tau, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
+    position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0
+    return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
-class _Normal(NamedTuple):
-    """Sums over the blocks of the other columns, each with its drifts in turn (c in all).
+class _NormalEquations(NamedTuple):
+    """Sums of a regression on the nuisance columns times their drift polynomials (c in all) and on a tested column.
 
-    `cross` (c, c), `left` (c,) with the left side, `along` (K, c) with the tested column in each block; of that column
-    `energy` (K,) and `lead` (K,), its product with the left side; `square`: of the left side.
+    `gram` (c, c) and `moment` (c,), products of the nuisance columns with themselves and with the left side. Of the
+    tested column in each block: `coupling` (K, c) to the nuisance columns, `energy` (K,), its sum of squares, and
+    `tested_moment` (K,), its product with the left side. `left_square`: sum of squares of the left side.
     """
 
-    cross: Array
-    left: Array
-    along: Array
+    gram: Array
+    moment: Array
+    coupling: Array
     energy: Array
-    lead: Array
-    square: float
+    tested_moment: Array
+    left_square: float
+
+    def eliminate_tested(self) -> tuple[Array, Array, float]:
+        """Return `gram`, `moment` and `left_square` with the tested coefficient, free in each block, eliminated."""
+        energy = np.maximum(self.energy, np.finfo(float).tiny)
+        gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
+        moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
+        return gram, moment, self.left_square - float((self.tested_moment**2 / energy).sum())
 
 
-def _normal(gram: Array, powers: Array, nuisance: list[int], test: int, left: int) -> _Normal:
-    n, degrees = len(nuisance), powers.shape[1]
+def _build_normal_equations(
+    gram: Array, polynomials: Array, nuisance: list[int], test: int, left: int
+) -> _NormalEquations:
+    """Sum the blocks' Gram matrices (K, m, m), the nuisance columns times the drift `polynomials` (K, degrees)."""
+    n, degrees = len(nuisance), polynomials.shape[1]
     size = n * degrees
-    squares = (powers[:, :, None] * powers[:, None, :]).reshape(len(gram), degrees**2)
-    cross = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ squares
-    return _Normal(
-        cross.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
-        np.einsum("ki,kp->ip", gram[:, nuisance, left], powers).ravel(),
-        np.einsum("ki,kp->kip", gram[:, nuisance, test], powers).reshape(len(gram), size),
-        gram[:, test, test],
-        gram[:, test, left],
-        float(gram[:, left, left].sum()),
+    # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
+    products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), degrees**2)
+    sums = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ products
+    return _NormalEquations(
+        gram=sums.reshape(n, n, degrees, degrees).transpose(0, 2, 1, 3).reshape(size, size),
+        moment=np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel(),
+        coupling=np.einsum("ki,kp->kip", gram[:, nuisance, test], polynomials).reshape(len(gram), size),
+        energy=gram[:, test, test],
+        tested_moment=gram[:, test, left],
+        left_square=float(gram[:, left, left].sum()),
     )
 
 
 class _Prior(NamedTuple):
-    """Prior on the other coefficients.
+    """Standard deviations of the nuisance coefficients' `level` and `drift` (c,) and of the last one, the `offset`.
 
-    Standard deviations of each one's `level` and of its `drift`, (c,); `zero`, that of the last one; `at`: what it is
-    counted from.
+    `current_offset`: the offset about which the sums were taken; its correction has the mean -`current_offset`.
     """
 
     level: Array
     drift: Array
-    zero: float
-    at: float = 0.0
+    offset: float
+    current_offset: float = 0.0
 
 
-class _Fitted(NamedTuple):
-    """The other coefficients with their drifts, and what is believed of them, (c,) each.
+class _NuisanceFit(NamedTuple):
+    """Fitted nuisance coefficients, their prior precision, and its product with their prior mean, (c,) each.
 
-    `precision` and `lead`, its product with the mean; `variance` of a row, inflated for the overlap of the rows.
+    `variance` of a row, inflated for the overlap of the rows.
     """
 
     coefficients: Array
-    precision: Array
-    lead: Array
+    prior_precision: Array
+    prior_moment: Array
     variance: float
 
 
-def _fitted(normal: _Normal, believed: _Prior, degrees: int, rows: float) -> _Fitted:
-    """Return the fit of the other coefficients; the tested column's coefficient is free in each block."""
-    energy = np.maximum(normal.energy, np.finfo(float).tiny)
-    cross = normal.cross - (normal.along / energy[:, None]).T @ normal.along
-    left = normal.left - normal.along.T @ (normal.lead / energy)
-    square = normal.square - float((normal.lead**2 / energy).sum())
-    least = 1e-14 * normal.square / rows
-    variance = max(square / rows, least)
-    for _ in range(MOST_TURNS):
-        prior, mean = np.zeros((2, len(believed.drift), degrees))
-        with np.errstate(divide="ignore", over="ignore"):
-            prior[:, 0] = OVERLAP * variance / believed.level**2
-            prior[:, 1:] = (OVERLAP * variance / believed.drift**2)[:, None]
-        if believed.zero > 0.0:
-            prior[-1, 0], mean[-1, 0] = OVERLAP * variance / believed.zero**2, -believed.at
-        # a coefficient that is zero drifts by nothing
-        precision = np.minimum(prior.ravel(), 1e9 * np.diag(normal.cross))
-        lead = precision * mean.ravel()
-        coefficients = solve(cross + np.diag(precision), left + lead)
-        before, variance = variance, max(square - float(left @ coefficients), least) / rows
-        if abs(variance - before) <= TOLERANCE * before:
-            break
-    return _Fitted(coefficients, precision, lead, max(OVERLAP * variance, np.finfo(float).tiny))
+def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
+    """Fit the nuisance coefficients and the variance of a row; the tested coefficient is free in each block.
 
-
-class _Fit(NamedTuple):
-    """The sums that a fit is to, the fit, its last coefficient that of the zero's error, and the zero [Pa]."""
-
-    normal: _Normal
-    fitted: _Fitted
-    zero: float
-
-
-def _fit(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: list[int]) -> _Fit:
-    """Return the fit of one equation, the tested column's coefficient free in each block.
-
-    A leak g (p_A - p_B - z) has a zero z of the pressures' difference, one number: beside a change of g there is one of
-    the bias, by -g z. About the zero of the sums (`zero.about_zero`) it is small, and found by Gauss's and Newton's
-    steps.
+    Each nuisance has `degrees` coefficients: a constant part and polynomials of its drift.
     """
-    zero, width = 0.0, columns.zero_deviation(test, blocks)
-    powers, minutes = _drifts(blocks)
-    rows, degrees = max(float(blocks.rows.sum()), 1.0), powers.shape[1]
-    total = gram.sum(axis=0)
-    level = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, columns.left])
-    size = np.append(np.minimum(np.abs(level), columns.levels[nuisance]) * columns.drift[nuisance] * minutes, 0.0)
-    believed = _Prior(np.append(columns.levels[nuisance], np.inf), size, width)
-    chosen, slope = [*nuisance, gram.shape[1]], np.zeros(len(blocks))
-    for turn in range(_TURNS + 1):
-        normal = _normal(_shift_zero(gram, columns, test, slope, zero), powers, chosen, test, columns.left)
-        fitted = _fitted(normal, believed._replace(at=zero), degrees, rows)
-        step = float(fitted.coefficients[-degrees])
-        if turn == _TURNS or not width > 0.0 or (turn > 0 and abs(step) <= TOLERANCE * width):
+    gram, moment, left_square = normal.eliminate_tested()
+    min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
+    variance = max(left_square / n_rows, min_variance)
+    for _ in range(MAX_ITERATIONS):  # the variance scales the prior against the sums
+        precision, mean = np.zeros((2, len(prior.drift), degrees))
+        with np.errstate(divide="ignore", over="ignore"):
+            precision[:, 0] = OVERLAP * variance / prior.level**2
+            precision[:, 1:] = (OVERLAP * variance / prior.drift**2)[:, None]
+        if prior.offset > 0.0:
+            precision[-1, 0], mean[-1, 0] = OVERLAP * variance / prior.offset**2, -prior.current_offset
+        # the drift is relative, so that a zero coefficient has an infinite precision
+        prior_precision = np.minimum(precision.ravel(), 1e9 * np.diag(normal.gram))
+        prior_moment = prior_precision * mean.ravel()
+        coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
+        previous, variance = variance, max(left_square - float(moment @ coefficients), min_variance) / n_rows
+        if abs(variance - previous) <= TOLERANCE * previous:
             break
-        zero += step
-        slope = (normal.lead - normal.along @ fitted.coefficients) / np.maximum(normal.energy, np.finfo(float).tiny)
-    return _Fit(normal, fitted, zero)
+    return _NuisanceFit(coefficients, prior_precision, prior_moment, max(OVERLAP * variance, np.finfo(float).tiny))
 
 
-def _shift_zero(gram: Array, columns: Columns, test: int, slope: Array, zero: float) -> Array:
-    """Return the sums with the tested column taken about a zero of the pressures.
+class _EquationFit(NamedTuple):
+    """Fit of one equation: the sums about the fitted `offset` of p_A - p_B [Pa], and the nuisance coefficients.
 
-    Last the column of the zero's error: -slope dt, of each block.
+    The last nuisance coefficient is the remaining error of the offset.
+    """
+
+    normal: _NormalEquations
+    nuisance: _NuisanceFit
+    offset: float
+
+
+def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
+    """Fit one equation's nuisance coefficients and the offset z of p_A - p_B; the tested one is free in each block.
+
+    The leakage is g (p_A - p_B - z), so that a change of g changes the bias by -g z. About the offset of the sums
+    (`pressure_offset.remove_pressure_offset`) z is small, and Gauss-Newton steps find it.
+    """
+    offset, deviation = 0.0, roles.offset_deviation(test, blocks)
+    polynomials, minutes = _drift_polynomials(blocks)
+    n_rows, degrees = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
+    total = gram.sum(axis=0)
+    constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
+    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])
+    drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
+    prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, deviation)
+    with_offset, coefficients = [*nuisance, gram.shape[1]], np.zeros(len(blocks))
+    for iteration in range(_MAX_OFFSET_STEPS + 1):
+        shifted = _shift_offset(gram, roles, test, coefficients, offset)
+        normal = _build_normal_equations(shifted, polynomials, with_offset, test, roles.left)
+        fit = _fit_nuisance(normal, prior._replace(current_offset=offset), degrees, n_rows)
+        step = float(fit.coefficients[-degrees])  # constant part of the last coefficient, the offset's error
+        is_last = iteration == _MAX_OFFSET_STEPS or not deviation > 0.0
+        if is_last or (iteration > 0 and abs(step) <= TOLERANCE * deviation):
+            break
+        offset += step
+        tested_residual = normal.tested_moment - normal.coupling @ fit.coefficients
+        coefficients = tested_residual / np.maximum(normal.energy, np.finfo(float).tiny)
+    return _EquationFit(normal, fit, offset)
+
+
+def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
+    """Subtract an offset from the pressure of the tested column in Gram matrices (K, m, m), and append its derivative.
+
+    The appended column is that of the offset's error: -g dt, with the tested coefficient g (K,) of each block.
     """
     size = gram.shape[1]
-    turned = np.zeros((len(gram), size, size + 1))
-    turned[:, :, :size] = np.eye(size)
-    if columns.bias is not None:
-        turned[:, columns.bias, test] -= zero
-        turned[:, columns.bias, size] -= slope
-    return np.asarray(turned.transpose(0, 2, 1) @ gram @ turned)
+    transform = np.zeros((len(gram), size, size + 1))
+    transform[:, :, :size] = np.eye(size)
+    if roles.bias is not None:
+        transform[:, roles.bias, test] -= offset
+        transform[:, roles.bias, size] -= coefficients
+    return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
 
 
-def _eliminated(gram: Array, blocks: Blocks, columns: Columns, test: int, nuisance: list[int]) -> tuple[Array, Array]:
-    """Return precision (K, K) and vector (K,) of one equation."""
-    normal, fitted, _ = _fit(gram, blocks, columns, test, nuisance)
-    right = np.column_stack([normal.along.T, normal.left + fitted.lead])
-    solved = solve(normal.cross + np.diag(fitted.precision), right)
-    precision = (np.diag(normal.energy) - normal.along @ solved[:, :-1]) / fitted.variance
-    vector = (normal.lead - normal.along @ solved[:, -1]) / fitted.variance
+def _eliminate_nuisance(
+    gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]
+) -> tuple[Array, Array]:
+    """Compute precision (K, K) and vector (K,) of the tested coefficient by one equation's Gram matrices (K, m, m).
+
+    Schur complement of the nuisance coefficients with their prior precision P: (energy - C (G + P)^-1 C') / variance,
+    G the Gram matrix of the nuisance columns and C their coupling to the tested one.
+    """
+    normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
+    right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
+    solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
+    precision = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
+    vector = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
     return 0.5 * (precision + precision.T), vector
 
 
-def _nuisance_columns(columns: Columns) -> list[int]:
-    """Return the columns whose coefficients are unknown beside the leak's."""
-    return [k for k in columns.nuisance if k != columns.leak]
+def _nuisance_columns(roles: ColumnRoles) -> list[int]:
+    """Return the indices of the nuisance columns other than the leak's."""
+    return [k for k in roles.nuisance if k != roles.leak]
 
 
-def cost_of_zero(zero: float) -> float:
-    """Return minus twice the logarithm of what is believed of a zero of the pressures [Pa], over that of none."""
-    usual, far, odds = (priors("inference")["zero"][name] for name in ("pressure", "far", "odds"))
-    return float(min((zero / usual) ** 2, (zero / far) ** 2 + 2.0 * np.log(far / usual / odds)))
+def offset_cost(offset: float) -> float:
+    """Compute -2 log of the prior density of an offset of p_A - p_B [Pa], relative to that of no offset.
 
-
-def zero_of(blocks: Blocks, columns: Sequence[Columns], test: int | None = None) -> float:
-    """Return the zero of p_A - p_B [Pa] that a change of the leak shows, the equations' mean; near 0 without one.
-
-    `test`: the column of the leak through an orifice, then the zero is that of its root [Pa^0.5], beside the sums'.
+    The prior is a normal density for good sensors, with small odds of a wide one for sensors far off.
     """
+    usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
+    return float(min((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds)))
+
+
+def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
+    """Estimate the offset of p_A - p_B [Pa], averaged over the equations; near 0 if the leak does not change."""
     fits = [
-        _fit(blocks.gram[:, e], blocks, equation, equation.leak if test is None else test, _nuisance_columns(equation))
-        for e, equation in enumerate(columns)
+        _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
+        for e, roles in enumerate(columns)
     ]
-    zero = float(np.mean([fit.zero for fit in fits]))
-    return zero if test is not None else float(np.mean(blocks.zero)) + zero
+    return float(np.mean(blocks.zero)) + float(np.mean([fit.offset for fit in fits]))
 
 
-def pair(blocks: Blocks, columns: Columns) -> tuple[Array, Array, Array]:
-    """Return precision (2 K, 2 K) and vector (2 K,) of leak and offset of the flow, and where offsets are taken (K,).
+class LeakAndBias(NamedTuple):
+    """Likelihood of leak and flow offset in K blocks: `precision` (2 K, 2 K) and `vector` (2 K,), the leaks first.
 
-    They are two numbers a block, uncorrelated within it: the offset is that at the block's mean pressure difference.
+    The flow offset is that at the mean pressure difference `pressure` (K,) [Pa] of each block, where both are
+    uncorrelated within the block.
     """
-    leak, bias = columns.leak, columns.bias
+
+    precision: Array
+    vector: Array
+    pressure: Array
+
+
+def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
+    """Estimate the leak's coefficient and the flow's offset in each block, with all other coefficients eliminated."""
+    leak, bias = roles.leak, roles.bias
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
-    middle = gram[:, leak, bias] / np.maximum(gram[:, bias, bias], np.finfo(float).tiny)
-    fit = _fit(gram, blocks, columns, leak, _nuisance_columns(columns))
-    gram[:, leak] -= middle[:, None] * gram[:, bias]
-    gram[:, :, leak] -= middle[:, None] * gram[:, :, bias]
-    nuisance = [k for k in columns.nuisance if k not in (leak, bias)]
-    position = _nuisance_columns(columns).index(bias)
-    powers, _ = _drifts(blocks)
-    prior = np.delete(fit.fitted.precision.reshape(-1, powers.shape[1])[:-1], position, axis=0).ravel()
-    of_leak, of_bias = (_normal(gram, powers, nuisance, k, columns.left) for k in (leak, bias))
-    coupling = np.vstack([of_leak.along, of_bias.along])
-    solved = solve(of_leak.cross + np.diag(prior), np.column_stack([coupling.T, of_leak.left]))
-    precision = np.diag(np.concatenate([of_leak.energy, of_bias.energy])) - coupling @ solved[:, :-1]
-    vector = np.concatenate([of_leak.lead, of_bias.lead]) - coupling @ solved[:, -1]
-    return 0.5 * (precision + precision.T) / fit.fitted.variance, vector / fit.fitted.variance, middle
+    bias_energy = gram[:, bias, bias]
+    has_bias = bias_energy > RIDGE * bias_energy.max()  # false in a block at rest, but for rounding errors
+    pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
+    fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
+    # the leak's column about its mean in the block, so that leak and bias are uncorrelated there
+    gram[:, leak] -= pressure[:, None] * gram[:, bias]
+    gram[:, :, leak] -= pressure[:, None] * gram[:, :, bias]
+    nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
+    position = _nuisance_columns(roles).index(bias)
+    polynomials, _ = _drift_polynomials(blocks)
+    prior = fit.nuisance.prior_precision.reshape(-1, polynomials.shape[1])[:-1]  # without the offset's error
+    prior = np.delete(prior, position, axis=0).ravel()
+    leaks, biases = (_build_normal_equations(gram, polynomials, nuisance, k, roles.left) for k in (leak, bias))
+    coupling = np.vstack([leaks.coupling, biases.coupling])
+    solution = solve(leaks.gram + np.diag(prior), np.column_stack([coupling.T, leaks.moment]))
+    precision = np.diag(np.concatenate([leaks.energy, biases.energy])) - coupling @ solution[:, :-1]
+    vector = np.concatenate([leaks.tested_moment, biases.tested_moment]) - coupling @ solution[:, -1]
+    variance = fit.nuisance.variance
+    return LeakAndBias(0.5 * (precision + precision.T) / variance, vector / variance, pressure)
 
 
-def mean_of(blocks: Blocks, columns: Columns, shares: Mapping[int, float]) -> tuple[float, float]:
-    """Return a mean of coefficients, by their columns' `shares`, and its deviation; the leak is free in each block."""
-    nuisance = _nuisance_columns(columns)
-    normal, fitted, _ = _fit(blocks.gram[:, 0], blocks, columns, columns.leak, nuisance)
-    weights = np.zeros((len(nuisance) + 1, len(fitted.coefficients) // (len(nuisance) + 1)))
-    for column, share in shares.items():
-        weights[nuisance.index(column), 0] = share
-    energy = np.maximum(normal.energy, np.finfo(float).tiny)
-    matrix = normal.cross - (normal.along / energy[:, None]).T @ normal.along + np.diag(fitted.precision)
-    variance = float(weights.ravel() @ solve(matrix, weights.ravel())) * fitted.variance
-    return float(weights.ravel() @ fitted.coefficients), float(np.sqrt(max(variance, 0.0)))
+def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
+    """Estimate a weighted mean of nuisance coefficients and its standard error.
+
+    `weights`: by column index, of sum 1; they apply to the constant parts of the coefficients, without drift.
+    """
+    nuisance = _nuisance_columns(roles)
+    normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
+    degrees = len(fit.coefficients) // (len(nuisance) + 1)  # the last coefficient is the offset's error
+    contrast = np.zeros(len(fit.coefficients))
+    for column, weight in weights.items():
+        contrast[nuisance.index(column) * degrees] = weight
+    precision = normal.eliminate_tested()[0] + np.diag(fit.prior_precision)
+    variance = float(contrast @ solve(precision, contrast)) * fit.variance
+    return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
 
 
-def total(blocks: Blocks, columns: Sequence[Columns]) -> Array:
-    """Return a recording's sums (E, m, m), over the rows' variance."""
-    sums = []
-    for e, equation in enumerate(columns):
-        nuisance = _nuisance_columns(equation)
-        fit = _fit(blocks.gram[:, e], blocks, equation, equation.leak, nuisance)
-        sums.append(blocks.gram[:, e].sum(axis=0) / fit.fitted.variance)
-    return np.array(sums)
+def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
+    """Sum the Gram matrices of a recording's blocks for each equation, (E, m, m), divided by the variance of a row."""
+    grams = []
+    for e, roles in enumerate(columns):
+        fit = _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
+        grams.append(blocks.gram[:, e].sum(axis=0) / fit.nuisance.variance)
+    return np.array(grams)

@@ -1,7 +1,7 @@
-"""What a provider reports of a recording: observables, each with a test, and what it measures of the leak.
+"""Report of a provider on a recording: observables, each with a test, and measurements of the leak.
 
-A provider (`detector.Detector`) follows numbers over a recording. It states neither a verdict nor a threshold; what
-the numbers mean stands in `decision/events.toml`, and `decision.decide` weighs them.
+A provider (`detector.Detector`) estimates numbers over a recording, without a verdict or a threshold. The meaning of
+the numbers is in `decision/events.toml`, and `decision.decide` weighs them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 
 @dataclass(frozen=True, kw_only=True)
 class Observable:
-    """The test of a change of one number that a provider follows.
+    """Test of a change of one number that a provider estimates.
 
     Parameters
     ----------
@@ -33,11 +33,13 @@ class Observable:
     chance : float
         Probability that a healthy recording scores as high, by the provider's own law.
     onset : Interval, optional
-        When it changed [s], None against other recordings.
+        Time of the change [s]; None for a comparison with other recordings.
     size : float
         The change, in the observable's own unit; negative for a fall.
     advantage : float
-        Twice the logarithm of what else speaks for this description, over that of its rivals.
+        Twice the log odds of this description over its rivals from other sources, such as priors on its size.
+    log_ratio_to_leak : float, optional
+        Log likelihood ratio of a rise described by this number to one of the leak.
     """
 
     name: str
@@ -47,31 +49,34 @@ class Observable:
     onset: Interval | None = None
     size: float = 0.0
     advantage: float = 0.0
+    log_ratio_to_leak: float | None = None
 
     @property
-    def rarity(self) -> float:
-        """Minus the logarithm of the chance."""
+    def surprisal(self) -> float:
+        """Minus the natural logarithm of the chance, exponential in a healthy machine if the law is right."""
         return float(-np.log(max(self.chance, np.finfo(float).tiny)))
 
     @classmethod
-    def of_test(
-        cls, name: str, data: str, test: StepTest, *, looks: float = 1.0, sign: float = 1.0, advantage: float = 0.0
+    def from_test(
+        cls, name: str, data: str, test: StepTest, *, n_tests: float = 1.0, sign: float = 1.0, advantage: float = 0.0
     ) -> Observable:
-        """Return the observable of a step within the recording; `looks`: tests of which it is the likeliest one."""
-        chance = min(1.0, looks * test.chance)
+        """Make the observable of a step within the recording, whose `test` is the best of `n_tests` (Bonferroni).
+
+        `sign`: -1 for a step down, whose size the test states as positive.
+        """
         return cls(
             name=name,
             data=data,
             score=test.score,
-            chance=chance,
+            chance=min(1.0, n_tests * test.chance),
             onset=test.onset(),
-            size=sign * test.fitted[0],
+            size=sign * test.fitted.size,
             advantage=advantage,
         )
 
 
 class Flow(NamedTuple):
-    """A leakage flow [m^3/s] and its standard deviation, that of the machine's size left out."""
+    """A leakage flow [m^3/s] and its standard error, without the uncertainty of the machine's size."""
 
     value: float
     deviation: float
@@ -84,6 +89,41 @@ class Remark(NamedTuple):
     values: Mapping[str, float]
 
 
+class LeakRise(NamedTuple):
+    """Rise of the leakage over healthy recordings.
+
+    `step_log_ratio`: log likelihood ratio of the contribution of the step within the recording to no rise.
+    """
+
+    rise: Rise
+    step_log_ratio: float = 0.0
+
+
+class RiseTest(Protocol):
+    """Test of a rise of the leakage, with its distribution in a healthy machine."""
+
+    @property
+    def score(self) -> float:
+        """Statistic of the test."""
+
+    @property
+    def chance(self) -> float:
+        """Probability that a healthy machine scores as high."""
+
+    def threshold(self, chance: float) -> float:
+        """Return the score that a healthy machine exceeds with a probability."""
+
+
+class DatedTest(RiseTest, Protocol):
+    """Test of a step of the leakage at an unknown instant."""
+
+    def onset(self) -> Interval:
+        """Return the most likely onset [s] with its 95 % interval."""
+
+    def detectable_step(self, chance: float) -> float:
+        """Return the conductance of a step that is detected at a false-alarm probability `chance`."""
+
+
 class LeakMeasure(Protocol):
     """The leakage of a recording as one provider measures it: tests, flows and sizes, no verdict."""
 
@@ -93,10 +133,10 @@ class LeakMeasure(Protocol):
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak, as far as the channels tell."""
+        """Cause of a leak, as far as the channels separate causes."""
 
     @property
-    def step(self) -> StepTest | None:
+    def step(self) -> DatedTest | None:
         """Test of a step of the leakage within the recording."""
 
     @property
@@ -104,20 +144,28 @@ class LeakMeasure(Protocol):
         """Mean flow of the step while it lasts."""
 
     @property
-    def step_driving(self) -> float:
-        """Mean flow [m^3/s] of a step of one."""
+    def flow_factors(self) -> tuple[float, float]:
+        """Smallest and largest ratio of the leak's flow to the stated one, by other paths and laws of the leak."""
 
     @property
-    def rise(self) -> Rise | None:
-        """Rise of the mean leakage beyond the healthy recordings, None without any."""
+    def flow_per_conductance(self) -> float:
+        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa)."""
+
+    @property
+    def rise(self) -> RiseTest | None:
+        """Rise of the mean leakage beyond the healthy recordings; None without any."""
 
     @property
     def rise_flow(self) -> Flow | None:
-        """The rise, or without one the leakage in all, as a mean flow; None where it cannot be stated."""
+        """Mean flow of the rise, or of the total leakage without one; None if unknown."""
+
+    @property
+    def rise_onset(self) -> Interval | None:
+        """Onset of the rise if it began within the recording; None if nothing dates it."""
 
     @property
     def excess(self) -> float | None:
-        """Leakage in all beyond a healthy machine's by the rig's file, in deviations; None where not stated."""
+        """Total leakage above the limit of the rig's file, in standard deviations; None if not stated."""
 
     @property
     def bound_flow(self) -> float:
@@ -125,14 +173,14 @@ class LeakMeasure(Protocol):
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s], and that while it flows."""
+        """Mean flow of the pump [m^3/s], over the recording and while it delivers."""
 
     @property
-    def share_after(self) -> float:
-        """Share of what the recording tells of its mean leakage that lies after the step's onset."""
+    def step_rise(self) -> LeakRise | None:
+        """Rise over healthy recordings, with the step's contribution; None without recordings."""
 
     @property
-    def litres(self) -> float | None:
+    def lpm_per_flow(self) -> float | None:
         """L/min of a flow of 1 m^3/s, None where the machine's size is not stated."""
 
     @property
@@ -145,23 +193,23 @@ class LeakMeasure(Protocol):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks of the provider on sizes, zeros and delays."""
+        """Notes on sizes, sensor offsets and delays."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return a flow beside the pump's flow and the piston's area."""
+        """Return a flow relative to the pump's flow and the piston's area."""
 
-    def total(self, findable: float | None) -> TotalLeakage | None:
-        """Return the total leakage; `findable`: the smallest step that would have been found [m^3/s]."""
+    def total(self, detectable_flow: float | None) -> TotalLeakage | None:
+        """Return the total leakage; `detectable_flow`: the smallest step that would have been found [m^3/s]."""
 
-    def course(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over the recording; since an onset what came with it."""
+    def history(self, onset_s: float | None) -> LeakCourse | None:
+        """Return the history of the leakage: its growth since an onset, else the total leakage."""
 
 
 class Ringing(NamedTuple):
-    """Precision of the measured ringing of the pressures, where nothing measures the leak itself.
+    """Precision of the measured ringing of the pressures, if the leak itself is not measured.
 
-    `bound`: 95 % bound of the size of a change of its log RMS; `rate` [Hz]; `healthy`: recordings it was compared with,
-    0 for none; `is_dated`: whether their dates are known; `unused`: recorded columns that no channel is made of.
+    `bound`: 95 % bound of the size of a change of its log RMS; `rate` [Hz]; `healthy`: number of recordings it was
+    compared with; `is_dated`: whether their dates are known; `unused`: recorded columns without a channel.
     """
 
     bound: float
@@ -178,18 +226,18 @@ class Observed:
     Parameters
     ----------
     provider : str
-        Its name.
+        Name of the detector.
     observables : tuple of Observable
     leak : LeakMeasure, optional
-        What it measures of the leak.
     ringing : Ringing, optional
-        How far it knows the ringing of the pressures.
     lack : str
-        Why it reports nothing, empty where it reports something.
+        Reason for an empty report, else empty.
     share : float
-        Share of the recording, 0 to 1, that the report rests on.
+        Fraction of the recording's samples that were used.
+    judged_until : float
+        Time of the last judged sample, as a fraction of the recording.
     has_failed : bool
-        Whether it raised an error where it should have reported.
+        Whether it raised an error.
     """
 
     provider: str
@@ -198,4 +246,5 @@ class Observed:
     ringing: Ringing | None = None
     lack: str = ""
     share: float = 1.0
+    judged_until: float = 1.0
     has_failed: bool = False

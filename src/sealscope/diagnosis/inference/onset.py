@@ -1,11 +1,11 @@
-"""Did a coefficient step within a recording? The likelihood ratio over all onsets, beside a random walk.
+"""Test of a step of a coefficient within a recording: likelihood ratio over all onsets, with a random walk.
 
-Of one coefficient g, a number for each of K blocks, the blocks say `Information`(Lambda, eta). In any healthy machine g
-has a level, a slope and a random walk; with a leak also a step from its onset on:
+The likelihood of one coefficient g in K blocks is `Information`(Lambda, eta). In a healthy machine g has a level, a
+slope and a random walk; with a leak also a step from its onset on:
 
     g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
 
-kappa the inflation of the noise for what the rows' correlation adds. F is projected out; (q, kappa) are estimated with
+kappa the inflation of the noise by the correlation of the rows. F is projected out; (q, kappa) are estimated with
 the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm of the ratio of
 the likelihoods, for steps > 0. An onset within a block is a part of a step there.
 
@@ -47,28 +47,29 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Standard deviations of a normal law within which 95 % lies, and below which 95 % lies.
-WITHIN_95, BELOW_95 = 1.96, 1.645
-#: Fewest blocks: a level, a slope, a step and its deviation leave nothing below.
-FEWEST = 5
-#: Parts of a block in which an onset is looked for, and blocks at either end in which none is.
+#: Quantiles of the standard normal law for a 95 % interval and for a 95 % upper bound.
+WITHIN_95, UPPER_95 = 1.96, 1.645
+#: Minimum number of blocks, for a level, a slope, a step and its standard error.
+MIN_BLOCKS = 5
+#: Number of possible onsets per block, and blocks at either end without one.
 PARTS, EDGE = 5, 2
-#: Sizes of the random walk that are tried: q over the noise, and none.
+#: Grid of the variance q of the random walk over that of the noise, from none.
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
-#: How far below the largest a walk's log-likelihood may be for the null law to count with it: 99.7 % of chi square(1).
+#: Maximum log-likelihood ratio of the walks over which the null law is the largest: 99.7 % of chi square(1).
 ALLOWED = 4.5
-#: Directions that carry less of what the largest carries carry nothing.
-RANK = 1e-9
+#: Eigenvalues below this fraction of the largest count as zero.
+RANK_TOLERANCE = 1e-9
 
 
 class Information(NamedTuple):
-    """Likelihood of one coefficient in K blocks, one number g_k a block: exp(vector g - g precision g / 2).
+    """Likelihood of one coefficient g_k in K blocks: exp(vector g - g precision g / 2).
 
-    `time` (K,) [s], `precision` (K, K), `vector` (K,). What is believed of the coefficient, infinite where nothing is:
-    `level`, its standard deviation before the first block; `slope`, that of an even change over all blocks; `walk`,
-    the scale of a half-Cauchy distribution of the deviation that a random walk reaches over all blocks.
+    `time` (K,) [s], `precision` (K, K), `vector` (K,). Priors, infinite if there is none: `level`, standard deviation
+    before the first block; `slope`, that of a linear change over all blocks; `walk`, scale of a half-Cauchy law of the
+    standard deviation that a random walk reaches over all blocks.
     """
 
     time: Array
@@ -80,16 +81,23 @@ class Information(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate with its interval."""
+    """An estimate with its 95 % interval."""
 
     value: float
     low: float
     high: float
 
 
+class FittedStep(NamedTuple):
+    """A step of a coefficient and its standard error."""
+
+    size: float
+    deviation: float
+
+
 @dataclass(frozen=True, eq=False)
 class StepTest:
-    """The test of a step of one coefficient over all onsets; made by `step_test`.
+    """Test of a step of one coefficient over all onsets, from `step_test`.
 
     Parameters
     ----------
@@ -102,13 +110,13 @@ class StepTest:
     onsets : array of float, shape (o,)
         Onsets that were tried [s].
     likelihood : array of float, shape (o,)
-        Log-likelihood of a step at each, its size and the walk's fitted.
+        Log likelihood of a step at each onset, with fitted size and walk.
     size, deviation : array of float, shape (o,)
-        Step at each onset and its standard deviation, for the walk without a step.
-    fitted : tuple of two floats
-        Step at the best onset and its standard deviation, for the walk beside it.
+        Step at each onset and its standard error, with the walk fitted without a step.
+    fitted : FittedStep
+        Step at the best onset and its standard error, with the walk fitted together with it.
     walk, noise : tuple of two floats
-        q and kappa without a step and with the best one.
+        Variance q of the walk and variance kappa of the noise, each without a step and with the best one.
     law : NullLaw
         Distribution of the score under the null.
     """
@@ -120,7 +128,7 @@ class StepTest:
     likelihood: Array
     size: Array
     deviation: Array
-    fitted: tuple[float, float]
+    fitted: FittedStep
     walk: tuple[float, float]
     noise: tuple[float, float]
     law: NullLaw
@@ -132,126 +140,131 @@ class StepTest:
         return np.asarray(weights / weights.sum())
 
     def onset(self, probability: float = 0.95) -> Interval:
-        """Return the most likely onset [s] and the interval that holds it with a probability.
+        """Return the most likely onset [s] and the interval that contains it with a probability.
 
-        Rows of the block in which the leak begins are weighed as if it leaked throughout or not at all, so that an
-        onset is known to half a block at best.
+        Rows of the block of the onset are weighted as if it leaked throughout or not at all: the resolution is half a
+        block.
         """
-        ends = np.interp([0.5 - 0.5 * probability, 0.5 + 0.5 * probability], np.cumsum(self.weights), self.onsets)
+        tail = 0.5 - 0.5 * probability
+        low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)
         best = float(self.onsets[self.best])
-        step = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
-        half = 0.5 * PARTS * step
-        return Interval(best, min(float(ends[0]), best) - half, max(float(ends[1]), best) + half)
+        spacing = float(self.onsets[1] - self.onsets[0]) if len(self.onsets) > 1 else 0.0
+        half_block = 0.5 * PARTS * spacing
+        return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the step that is exceeded with probability 1 - `probability`, given that there is a step > 0."""
-        from scipy.optimize import brentq
-        from scipy.special import ndtr
+        """Return the step that is exceeded with the probability 1 - `probability`, given that there is a step > 0."""
+        return bound_steps(self.weights, self.size, self.deviation, probability)
 
-        deviation = np.maximum(self.deviation, np.finfo(float).tiny)
-        above = float(self.weights @ ndtr(self.size / deviation))
-        high = float(np.max(self.size + 12.0 * deviation))
-        if not above > 0.0 or not high > 0.0:
-            return max(high, 0.0)
-
-        def excess_chance(share: float) -> float:
-            return float(self.weights @ ndtr((self.size - share * high) / deviation)) - (1.0 - probability) * above
-
-        return high * float(brentq(excess_chance, 0.0, 1.0)) if excess_chance(1.0) < 0.0 else high
-
-    def findable(self, chance: float, power: float = 0.9) -> float:
-        """Return the step that is found with probability `power` at a false-alarm probability, at the median onset."""
+    def detectable_step(self, chance: float, power: float = 0.9) -> float:
+        """Return the size of a step that is detected with probability `power` at a false-alarm probability `chance`."""
         from scipy.special import ndtri
 
-        return float((np.sqrt(self.threshold(chance)) + ndtri(power)) * np.median(self.deviation))
+        threshold_z = np.sqrt(self.threshold(chance))  # the score is about the square of a z score
+        return float((threshold_z + ndtri(power)) * np.median(self.deviation))
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a coefficient without a step exceeds with a probability."""
-        from scipy.optimize import brentq
-
-        most = 1e4
-        if not self.law.chance(0.0) > chance > self.law.chance(most):
-            return 0.0 if self.law.chance(0.0) <= chance else most
-        return float(brentq(lambda score: self.law.chance(score) - chance, 0.0, most))
+        """Return the score that a coefficient without a step exceeds with the probability `chance`."""
+        max_score = 1e4  # upper end of the search, with a probability of practically zero
+        if not self.law.chance(0.0) > chance > self.law.chance(max_score):
+            return 0.0 if self.law.chance(0.0) <= chance else max_score
+        return find_root(lambda score: self.law.chance(score) - chance, 0.0, max_score)
 
 
-class Course(NamedTuple):
-    """A coefficient over the blocks, given the blocks and the model of the test: `mean` (K,), `covariance` (K, K)."""
+def bound_steps(weights: Array, size: Array, deviation: Array, probability: float) -> float:
+    """Compute the step that is exceeded with the probability 1 - `probability`, given that there is a step > 0.
+
+    `weights`, `size`, `deviation` (k,): probability, step and its standard error for each onset.
+    """
+    from scipy.special import ndtr
+
+    deviation = np.maximum(deviation, np.finfo(float).tiny)
+    probability_up = float(weights @ ndtr(size / deviation))
+    max_step = float(np.max(size + 12.0 * deviation))  # beyond it the normal law has no probability
+    if not probability_up > 0.0 or not max_step > 0.0:
+        return max(max_step, 0.0)
+
+    def excess_chance(fraction: float) -> float:
+        """Compute the probability of a step above a fraction of `max_step`, minus that wanted."""
+        return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
+
+    return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
+
+
+class History(NamedTuple):
+    """A coefficient over the blocks under the model of the test: `mean` (K,) and `covariance` (K, K)."""
 
     mean: Array
     covariance: Array
 
-    def over(self, weights: Array) -> Interval:
-        """Return the weighted mean of the coefficient with its 95 % interval, weights (K,) of sum 1."""
+    def average(self, weights: Array) -> Interval:
+        """Average the coefficient with `weights` (K,) of sum 1; return the mean with its 95 % interval."""
         value = float(weights @ self.mean)
-        half = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
-        return Interval(value, value - half, value + half)
+        half_width = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
+        return Interval(value, value - half_width, value + half_width)
 
-    def relative_to(self, before: NDArray[np.bool_]) -> Course:
-        """Return the coefficient beyond its mean over some blocks (K,)."""
-        turn = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
-        return Course(turn @ self.mean, turn @ self.covariance @ turn.T)
+    def relative_to(self, before: NDArray[np.bool_]) -> History:
+        """Subtract the mean of the coefficient over the blocks flagged in `before` (K,)."""
+        transform = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
+        return History(transform @ self.mean, transform @ self.covariance @ transform.T)
 
 
-def course(information: Information, test: StepTest | None, step: bool) -> Course:
-    """Return the coefficient over the blocks: level, slope and random walk, with the best step or without one."""
-    count = len(information.time)
-    index = np.arange(count) - 0.5 * (count - 1)
-    noise = 1.0 if test is None else test.noise[step]
-    design = [np.ones(count)]
-    if count >= FEWEST:
-        design.append(index / max(count, 1))
-    if step and test is not None:
-        design.append(np.clip((information.time - test.onsets[test.best]) / _spacing(information.time) + 0.5, 0.0, 1.0))
-    fixed = len(design)
-    walk = 0.0 if test is None else test.walk[step]
-    if walk > 0.0:
-        design += list(np.sqrt(walk) * np.tril(np.ones((count, count))).T)
-    basis = np.column_stack(design)
+def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
+    """Estimate the coefficient in each block: level, slope and random walk, `with_step` also the step of `test`."""
+    count, time = len(information.time), information.time
+    noise = 1.0 if test is None else test.noise[with_step]  # indexed by False or True
+    columns = [np.ones(count)]
+    if count >= MIN_BLOCKS:
+        columns.append((np.arange(count) - 0.5 * (count - 1)) / max(count, 1))
+    if with_step and test is not None:
+        block_s = float(time[1] - time[0]) if count > 1 else 1.0
+        columns.append(np.clip((time - test.onsets[test.best]) / block_s + 0.5, 0.0, 1.0))
+    n_fixed = len(columns)
+    walk = 0.0 if test is None else test.walk[with_step]
+    if walk > 0.0:  # a walk is a step of normal size in each block, of variance `walk`
+        columns += list(np.sqrt(walk) * np.tril(np.ones((count, count))).T)
+    basis = np.column_stack(columns)
     precision = basis.T @ information.precision @ basis / noise
-    precision[np.arange(fixed, basis.shape[1]), np.arange(fixed, basis.shape[1])] += 1.0 / noise
-    if count >= FEWEST:
-        precision[1, 1] += 1.0 / noise / information.slope**2
+    precision[np.arange(n_fixed, basis.shape[1]), np.arange(n_fixed, basis.shape[1])] += 1.0 / noise
+    if count >= MIN_BLOCKS:
+        precision[1, 1] += 1.0 / noise / information.slope**2  # prior on the slope
     inverse = _inverse(precision)
     mean = basis @ (inverse @ (basis.T @ information.vector / noise))
-    return Course(mean, basis @ inverse @ basis.T)
-
-
-def _spacing(time: Array) -> float:
-    return float(time[1] - time[0]) if len(time) > 1 else 1.0
+    return History(mean, basis @ inverse @ basis.T)
 
 
 def _inverse(matrix: Array) -> Array:
-    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    return np.asarray(np.linalg.pinv(matrix / np.outer(size, size), hermitian=True) / np.outer(size, size))
+    """Invert a positive semidefinite matrix, scaled to a unit diagonal."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    return np.asarray(np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale))
 
 
 class NullLaw(NamedTuple):
-    """The null distribution of the score: degrees of freedom m and the curve's length."""
+    """Null distribution of the score: degrees of freedom m, and length L of the curve of steps on the unit sphere."""
 
     dimensions: float
     length: float
 
     def chance(self, score: float) -> float:
-        """Return the probability of a higher score."""
+        """Compute the probability of a higher score: that of a cap of the sphere, and of the tube about the curve."""
         from scipy.special import betainc
 
-        n = self.dimensions
-        away = float(np.exp(-max(score, 0.0) / n))  # 1 - cos^2
-        tube = self.length / (2.0 * np.pi) * float(away ** (0.5 * (n - 2)))
-        return min(1.0, 0.5 * float(betainc(0.5 * (n - 1), 0.5, away)) + tube)
+        m = self.dimensions
+        sine_squared = float(np.exp(-max(score, 0.0) / m))  # 1 - c^2 of the module
+        tube = self.length / (2.0 * np.pi) * float(sine_squared ** (0.5 * (m - 2)))
+        return min(1.0, 0.5 * float(betainc(0.5 * (m - 1), 0.5, sine_squared)) + tube)
 
 
 def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None) -> StepTest | None:
-    """Return the likeliest test of a step of one of the `signs`; None where too few blocks say anything.
+    """Return the test with the highest score among `step_tests`; None if too few blocks have information.
 
-    The chance of one of two is twice that stated.
+    With two signs the probability of a false alarm is twice the `chance` of the test.
     """
     return max(step_tests(information, signs, shape), key=lambda test: test.score, default=None)
 
 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
-    """Return the tests of a step of each of the `signs`; none where too few blocks say anything.
+    """Test for a step with each of the `signs`; return no test if too few blocks have information.
 
     Parameters
     ----------
@@ -259,20 +272,17 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     signs : sequence of float
         1 for steps up, -1 for steps down.
     shape : array of float, shape (K,), optional
-        What a step of one adds to the coefficient in each block while it lasts, by default one.
+        Change of the coefficient in each block by a unit step, by default one.
     """
-    readings = _whiten(information)
-    if readings is None:
+    whitened = _whiten_blocks(information)
+    if whitened is None:
         return []
-    steps = readings.turn @ readings.step_shapes(readings.positions, shape)
-    return [
-        _scan(sign * readings.z, steps, readings.eigen, readings.onsets, readings.unit, readings.believed)
-        for sign in signs
-    ]
+    steps = whitened.transform @ whitened.step_shapes(whitened.positions, shape)
+    return [_test_step_up(whitened._replace(z=sign * whitened.z), steps) for sign in signs]
 
 
 class StepSizes(NamedTuple):
-    """Steps at given onsets (o,): log-likelihood of each, its size and the size's standard deviation."""
+    """Steps at given onsets (o,): log likelihood, size and its standard error."""
 
     likelihood: Array
     size: Array
@@ -280,160 +290,192 @@ class StepSizes(NamedTuple):
 
 
 def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
-    """Fit steps up at some of the onsets that a test tried, each with the walk that is likeliest beside it.
+    """Fit an upward step of a coefficient at each onset, with the likeliest variance of its random walk.
 
     Parameters
     ----------
     information : Information
+        Likelihood of the coefficient in K blocks.
     onsets : array of int, shape (o,)
         Indices of `StepTest.onsets`.
     shape : array of float, shape (K,)
-        What a step of one adds to the coefficient in each block while it lasts.
+        Change of the coefficient in each block by a unit step.
     growth : float
-        How much larger, as a share, the step is at the end than at its onset.
+        Relative growth of the step from its onset to the end.
     """
-    readings = _whiten(information)
-    assert readings is not None
-    z, n = readings.z, len(readings.z)
-    steps = readings.turn @ readings.step_shapes(readings.positions[onsets], shape, growth)
-    weight = 1.0 / (1.0 + WALKS[:, None] * readings.eigen)
+    whitened = _whiten_blocks(information)
+    assert whitened is not None
+    n = len(whitened.z)
+    steps = whitened.transform @ whitened.step_shapes(whitened.positions[onsets], shape, growth)
+    fit = _fit_steps(whitened.z, steps, whitened.eigen)
+    likelihoods = (
+        0.5 * np.log(fit.weight).sum(axis=1)[:, None]
+        + whitened.walk_log_priors[:, None]
+        - 0.5 * n * np.log(fit.residual_squares / n)
+    )
+    best = likelihoods.argmax(axis=0), np.arange(len(onsets))  # the likeliest walk at each onset
+    variances = fit.residual_squares / n / fit.energies
+    return StepSizes(likelihoods[best], (fit.moments / fit.energies)[best], np.sqrt(variances)[best])
+
+
+class _StepFits(NamedTuple):
+    """Least-squares fits of a step up at each of o onsets, for each of the w `WALKS`.
+
+    `weight` (w, n): inverse variances of z, times that of the noise; `total` (w,): weighted sum of squares of z;
+    `moments`, `energies` (w, o): products of the steps with z and with themselves; `residual_squares` (w, o).
+    """
+
+    weight: Array
+    total: Array
+    moments: Array
+    energies: Array
+    residual_squares: Array
+
+
+def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
+    """Fit a step up to z (n,) at each onset, by whitened unit steps (n, o) and the walk's eigenvalues (n,)."""
+    weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
-    lead, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
-    rest = np.maximum(total[:, None] - np.maximum(lead, 0.0) ** 2 / square, 1e-12 * total[:, None])
-    likelihoods = 0.5 * np.log(weight).sum(axis=1)[:, None] + readings.believed[:, None] - 0.5 * n * np.log(rest / n)
-    chosen = likelihoods.argmax(axis=0), np.arange(len(onsets))
-    return StepSizes(likelihoods[chosen], (lead / square)[chosen], np.sqrt(rest / n / square)[chosen])
+    moments, energies = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
+    residual_squares = np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None])
+    return _StepFits(weight, total, moments, energies, residual_squares)
 
 
 class _Whitened(NamedTuple):
-    """Readings z (n,) of a coefficient, its level and slope set aside, in the walk's eigenvectors.
+    """Readings z (n,) of a coefficient without level and slope, in the eigenvectors of the walk.
 
-    `turn` (n, K) makes of a coefficient's blocks what it adds to z; `eigen` (n,) of the walk, times `unit`;
-    `positions` (o,) of onsets in blocks, at times `onsets` (o,); `believed`: logarithm of the density of each of
+    `transform` (n, K): from the coefficient in blocks to z; `eigen` (n,): eigenvalues of the walk, times `unit`;
+    `positions` (o,) of onsets in blocks, and their times `onsets` (o,) [s]; `walk_log_priors`: log prior of each of
     `WALKS`.
     """
 
     z: Array
-    turn: Array
+    transform: Array
     eigen: Array
     unit: float
     positions: Array
     onsets: Array
-    believed: Array
+    walk_log_priors: Array
 
     def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
-        """Compute steps at positions (o,) over the blocks, (K, o), times a `shape` (K,)."""
-        count = self.turn.shape[1]
+        """Build unit steps at positions (o,) over the blocks, (K, o), times a `shape` (K,)."""
+        count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
         if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]
+            steps[count - len(shape) :] *= shape[:, None]  # a prior on the level may precede the blocks
         return steps
 
 
 def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
-    """Compute steps of one at positions (o,) over K blocks, (K, o), that grow evenly by a share up to the end.
+    """Build unit steps (K, o) over `count` = K blocks, with onsets at `positions` (o,) in blocks from the start.
 
-    An onset within a block is a part of a step there.
+    The block of an onset contains the fraction of it after the onset. From there the step grows linearly, to
+    1 + `growth` at the end of the last block.
     """
-    since = np.arange(count)[:, None] + 1.0 - positions
-    steps = np.clip(since, 0.0, 1.0)
-    return np.asarray(steps * (1.0 + growth * np.clip((since - 0.5) / np.maximum(count - positions, 1.0), 0.0, 1.0)))
+    end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # of each block
+    steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
+    grown_fraction = np.clip(middle_since_onset / np.maximum(count - positions, 1.0), 0.0, 1.0)
+    return np.asarray(steps * (1.0 + growth * grown_fraction))
 
 
-def _whiten(information: Information) -> _Whitened | None:
-    """Return readings of a coefficient with its level and slope set aside; None where too few blocks say anything."""
-    time, precision, vector = _with_level(information)
+def _whiten_blocks(information: Information) -> _Whitened | None:
+    """Whiten the blocks of a coefficient and project out level and slope; None if too few blocks have information."""
+    time, precision, vector = _prepend_level_prior(information)
     count = len(time)
-    values, vectors = np.linalg.eigh(precision)
-    kept = values > RANK * max(float(values[-1]), 0.0)
-    if count < FEWEST or np.count_nonzero(kept) < FEWEST:
+    if not np.isfinite(precision).all():
         return None
-    root = np.sqrt(values[kept])
-    design = (vectors[:, kept] * root).T
-    z = (vectors[:, kept].T @ vector) / root
+    # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
+    values, vectors = np.linalg.eigh(precision)
+    is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
+    if count < MIN_BLOCKS or np.count_nonzero(is_informative) < MIN_BLOCKS:
+        return None
+    root = np.sqrt(values[is_informative])
+    design = (vectors[:, is_informative] * root).T
+    z = (vectors[:, is_informative].T @ vector) / root
     index = np.arange(count)
     fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])
-    if np.isfinite(information.slope):  # what is believed of the slope is a reading of it
+    if np.isfinite(information.slope):  # the prior on the slope is one more reading
         fixed = np.vstack([fixed, [0.0, 1.0 / information.slope]])
         design, z = np.vstack([design, np.zeros(count)]), np.append(z, 0.0)
-    free = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T
-    inner, outer = free @ design, np.minimum.outer(index, index) + 1.0
-    covariance = inner @ outer @ inner.T
-    unit = len(free) / max(float(np.trace(covariance)), np.finfo(float).tiny)
+    complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T  # orthogonal to level and slope
+    transform = complement @ design
+    covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T  # of the walk: min(k, l)
+    # in this unit of its variance the walk changes z as much as the noise does, on average
+    unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
     positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
-    believed = -np.log1p(WALKS * unit * count / information.walk**2)
+    walk_log_priors = -np.log1p(WALKS * unit * count / information.walk**2)
     return _Whitened(
-        basis.T @ (free @ z),
-        basis.T @ inner,
-        np.maximum(eigen, 0.0),
-        unit,
-        positions,
-        _onset_times(time, positions),
-        believed,
+        z=basis.T @ (complement @ z),
+        transform=basis.T @ transform,
+        eigen=np.maximum(eigen, 0.0),
+        unit=unit,
+        positions=positions,
+        onsets=_onset_times(time, positions),
+        walk_log_priors=walk_log_priors,
     )
 
 
-def two_sided(information: Information) -> StepTest | None:
-    """Return the likelier test of a step up or down (`step_test`)."""
+def two_sided_step_test(information: Information) -> StepTest | None:
+    """Return the test of a step up or that of a step down, whichever has the higher score (`step_test`)."""
     return step_test(information, (1.0, -1.0))
 
 
-def _with_level(information: Information) -> tuple[Array, Array, Array]:
-    """Return time, precision and vector with what is believed of the level as a block before the first."""
+def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
+    """Return time, precision and vector of the blocks, with the prior on the level as one more before the first."""
     time, precision, vector, level = information[:4]
-    if not np.isfinite(level) or len(time) < FEWEST:
+    if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
-    before = np.zeros((len(time) + 1, len(time) + 1))
-    before[0, 0], before[1:, 1:] = 1.0 / level**2, precision
-    return np.concatenate([[2.0 * time[0] - time[1]], time]), before, np.concatenate([[0.0], vector])
+    with_prior = np.zeros((len(time) + 1, len(time) + 1))
+    with_prior[0, 0], with_prior[1:, 1:] = 1.0 / level**2, precision
+    return np.concatenate([[2.0 * time[0] - time[1]], time]), with_prior, np.concatenate([[0.0], vector])
 
 
 def _onset_times(time: Array, positions: Array) -> Array:
-    """Return the times of onsets given in blocks from the beginning of the first."""
-    edges = np.concatenate(
-        [[1.5 * time[0] - 0.5 * time[1]], 0.5 * (time[1:] + time[:-1]), [1.5 * time[-1] - 0.5 * time[-2]]]
-    )
+    """Convert positions (o,), counted in blocks from the start of the first block, to times [s].
+
+    `time` (K,): middles of the blocks [s].
+    """
+    first_edge, last_edge = 1.5 * time[0] - 0.5 * time[1], 1.5 * time[-1] - 0.5 * time[-2]
+    edges = np.concatenate([[first_edge], 0.5 * (time[1:] + time[:-1]), [last_edge]])
     return np.asarray(np.interp(positions, np.arange(len(edges)), edges))
 
 
-def _scan(z: Array, steps: Array, eigen: Array, onsets: Array, unit: float, believed: Array) -> StepTest:
-    """Return the test from z (n,), steps (n, o) and the walk's eigenvalues (n,), times `unit`, in its eigenvectors.
+def _test_step_up(whitened: _Whitened, steps: Array) -> StepTest:
+    """Test readings z (n,) for one of the whitened unit steps (n, o), upwards, by the likelihood ratio to no step.
 
-    `believed`: logarithm of the density of each of `WALKS`.
+    Both likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
     """
-    n = len(z)
-    weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
-    total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
-    lead, square = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
-    determinant = np.log(weight).sum(axis=1) + 2.0 * believed
-    without = 0.5 * determinant - 0.5 * n * np.log(total / n)
-    rest = np.maximum(total[:, None] - np.maximum(lead, 0.0) ** 2 / square, 1e-12 * total[:, None])
-    with_step = 0.5 * determinant[:, None] - 0.5 * n * np.log(rest / n)
-    plain = int(without.argmax())
-    walk, best = np.unravel_index(int(with_step.argmax()), with_step.shape)
-    score = 2.0 * float(with_step[walk, best] - without[plain])
-    likeliest = with_step.max(axis=1)
-    plainly, stepped = without - believed, likeliest - believed  # the recording alone says how large a walk may be
-    allowed = (plainly > plainly.max() - ALLOWED) | (stepped > stepped.max() - ALLOWED)
-    norm = np.sqrt(square[allowed])
+    n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
+    weight, total, moments, energies, residual_squares = _fit_steps(whitened.z, steps, whitened.eigen)
+    determinant = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
+    log_likelihood = 0.5 * determinant - 0.5 * n * np.log(total / n)
+    log_likelihood_with_step = 0.5 * determinant[:, None] - 0.5 * n * np.log(residual_squares / n)
+    walk_without_step = int(log_likelihood.argmax())
+    walk, best = np.unravel_index(int(log_likelihood_with_step.argmax()), log_likelihood_with_step.shape)
+    score = 2.0 * float(log_likelihood_with_step[walk, best] - log_likelihood[walk_without_step])
+    # walks that the data alone, without the prior, allow: with or without a step
+    data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - walk_log_priors
+    allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
+    # length of the curve of whitened steps on the unit sphere, from the angles between neighbouring onsets
+    norm = np.sqrt(energies[allowed])
     cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
-    # of the curve of whitened steps on the unit sphere
     length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
-    law = NullLaw(min(n, 0.5 * n + 2.0), float(length))
-    noise = float(rest[walk, best]) / n
-    fitted = float(lead[walk, best] / square[walk, best]), float(np.sqrt(noise / square[walk, best]))
-    size = lead[plain] / square[plain]
+    law = NullLaw(min(n, 0.5 * n + 2.0), float(length))  # degrees of freedom: see the module
+    noise = float(residual_squares[walk, best]) / n
+    size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
+    size = moments[walk_without_step] / energies[walk_without_step]
+    squares = total[walk_without_step] - moments[walk_without_step] ** 2 / energies[walk_without_step]
     return StepTest(
         score=score,
         chance=law.chance(score),
         best=int(best),
-        onsets=onsets,
-        likelihood=with_step.max(axis=0),
+        onsets=whitened.onsets,
+        likelihood=log_likelihood_with_step.max(axis=0),
         size=size,
-        deviation=np.sqrt(np.maximum(total[plain] - lead[plain] ** 2 / square[plain], 0.0) / n / square[plain]),
-        fitted=fitted,
-        walk=(unit * float(WALKS[plain]), unit * float(WALKS[walk])),
-        noise=(float(total[plain]) / n, noise),
+        deviation=np.sqrt(np.maximum(squares, 0.0) / n / energies[walk_without_step]),
+        fitted=FittedStep(float(size_at_best), float(error_at_best)),
+        walk=(unit * float(WALKS[walk_without_step]), unit * float(WALKS[walk])),
+        noise=(float(total[walk_without_step]) / n, noise),
         law=law,
     )

@@ -1,13 +1,14 @@
-"""Is the pump in the circuit at rest? Two hypotheses of a machine: its valves stay open, or shut.
+"""Two hypotheses of a machine at rest: its valves leave the pump in the circuit (open), or cut it off (shut).
 
-Open, what passes pump and piston moves the balance at rest as in motion. Shut, leakage and zero of the pump count in
-motion, and rests tell of the piston alone. Both balances are linear in the same columns, so that one set of sums serves
-both. Let g be what leaks in motion and r at rest, each by its own coefficient of p_A - p_B, with the covariance of
+Open, leakage of pump and piston is in the balance at rest as in motion. Shut, leakage and flow offset of the pump
+count in motion only, and rests show the piston alone. Both balances are linear in the same columns, so that one set
+of sums serves both. Let g be the leakage in motion and r at rest, coefficients of p_A - p_B, with the covariance of
 blocks whose errors differ. Open, r lies about g; shut and healthy, about zero,
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
-and the odds of the recordings of one machine multiply. A leaking piston moves r towards g: healthy recordings tell.
+and the odds of the recordings of one machine multiply. A leaking piston moves r towards g, so that the
+healthy recordings decide.
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -19,24 +20,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
 
-def apply_regime(blocks: Blocks, columns: Columns, shut: bool) -> Blocks:
-    """Return blocks that hold the columns at rest as those of one hypothesis."""
+def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
+    """Transform Gram matrices with columns at rest to the columns of one hypothesis: open, or `shut` at rest."""
     if shut:
-        turn = turn_to_shut(columns.names)
-        return replace(blocks, gram=np.asarray(turn.T @ blocks.gram @ turn))
-    kept = [k for k, name in enumerate((*columns.names, "left")) if name not in RESTS]
-    return replace(blocks, gram=np.asarray(blocks.gram[..., kept, :][..., kept]))
+        transform = shut_at_rest_matrix(roles.names)
+        return replace(blocks, gram=np.asarray(transform.T @ blocks.gram @ transform))
+    without_rests = [k for k, name in enumerate((*roles.names, "left")) if name not in RESTS]
+    return replace(blocks, gram=np.asarray(blocks.gram[..., without_rests, :][..., without_rests]))
 
 
-def turn_to_shut(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) that turns columns with those at rest, the left side last, into `shut_at_rest`'s."""
-    turned = []
+def shut_at_rest_matrix(names: Sequence[str]) -> Array:
+    """Build the matrix (m, n) that combines a balance's m columns to those with the pump cut off at rest.
+
+    With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`): the column of
+    the offset becomes bias - rest bias, that of the leak at rest becomes leak - rest leak, and the rest bias is left
+    out. `names` (m - 1,) of the columns; the last column is the left side.
+    """
+    columns = []
     for k, name in enumerate((*names, "left")):
         column = np.zeros(len(names) + 1)
         column[k] = 1.0
@@ -44,53 +50,70 @@ def turn_to_shut(names: Sequence[str]) -> Array:
             column[names.index(REST_BIAS)] = -1.0
         elif name == REST_LEAK:
             column[names.index(LEAK)], column[k] = 1.0, -1.0
-        elif name == REST_BIAS:
-            continue
-        turned.append(column)
-    return np.column_stack(turned)
+        if name != REST_BIAS:
+            columns.append(column)
+    return np.column_stack(columns)
 
 
-def shut_without_rests(sums: Array, names: Sequence[str]) -> Array:
-    """Return the sums (E, m + 1, m + 1) of a shut machine from those (E, m, m) of an open one, without rests."""
+def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
+    """Repeat the leak's row and column in Gram matrices (E, m, m) of a recording without rests.
+
+    With the pump cut off at rest the leak at rest has a column of its own, equal to the leak's where nothing rests.
+    `names` (m - 1,) of the columns, without the left side; the result is (E, m + 1, m + 1).
+    """
     index = [*range(len(names) + 1)]
     index.insert(names.index(LEAK), names.index(LEAK))
-    return np.asarray(sums[:, index][:, :, index])
+    return np.asarray(gram[:, index][:, :, index])
 
 
-def has_rests(blocks: Blocks, columns: Columns) -> bool:
-    """Tell whether anything stands still within blocks that hold the columns at rest."""
-    bias = columns.names.index(REST_BIAS)
-    return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)
+def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
+    """Test whether blocks with columns at rest contain any rest."""
+    bias = roles.names.index(REST_BIAS)
+    return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)  # its column is zero in motion
 
 
-def shut_odds(blocks: Blocks, columns: Columns) -> float:
-    """Compute the log odds that the pump is cut off at rest; 0 where nothing tells."""
-    gram, believed = blocks.gram[:, 0], priors("inference")["rest"]
-    at_rest, bias = (columns.names.index(name) for name in RESTS)
-    if not has_rests(blocks, columns) or len(blocks) < 2:
+def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
+    """Compute the log odds that the pump is cut off at rest; 0 without information."""
+    gram = blocks.gram[:, 0]
+    at_rest, bias = (roles.names.index(name) for name in RESTS)
+    if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
-    chosen = [*columns.nuisance, at_rest, bias]
-    grams, left = gram[:, chosen][:, :, chosen], gram[:, chosen, columns.left]
-    coefficients, covariance = _sandwich(grams, left)
-    both = [chosen.index(columns.leak), chosen.index(at_rest)]
-    motion, more = coefficients[both]
-    resting, differing = float(covariance[np.ix_(both, both)].sum()), float(covariance[both[1], both[1]])
-    if not (resting > 0.0 and differing > 0.0):
+    fitted = [*roles.nuisance, at_rest, bias]
+    grams, moments = gram[:, fitted][:, :, fitted], gram[:, fitted, roles.left]
+    coefficients, covariance = _fit_with_robust_covariance(grams, moments)
+    leaks = [fitted.index(roles.leak), fitted.index(at_rest)]
+    motion, extra_at_rest = coefficients[leaks]  # the columns add up: the leak at rest is the sum of both
+    rest_variance, extra_variance = float(covariance[np.ix_(leaks, leaks)].sum()), float(covariance[leaks[1], leaks[1]])
+    if not (rest_variance > 0.0 and extra_variance > 0.0):
         return 0.0
-    shut = _log_normal(motion + more, resting + (believed["shut"] * motion) ** 2)
-    open_ = _log_normal(more, differing + (believed["open"] * motion) ** 2)
-    most: float = believed["most"]
-    return float(np.clip(shut - open_, -most, most))
+    odds = rest_log_odds(motion + extra_at_rest, rest_variance, motion, extra_variance)
+    max_odds: float = INFERENCE.rest.most
+    return float(np.clip(odds, -max_odds, max_odds))
 
 
-def _sandwich(grams: Array, left: Array) -> tuple[Array, Array]:
-    """Return coefficients (c,) of sums (K, c, c) and (K, c), and their covariance where the blocks' errors differ."""
+def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
+    """Compute the log odds that a quantity at rest is about zero rather than about its value in `motion`.
+
+    `variance`: of the value at rest; `difference_variance`: of its difference from that in motion.
+    """
+    prior = INFERENCE.rest
+    shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)
+    return shut - _normal_log_density(value - motion, difference_variance + (prior.open * motion) ** 2)
+
+
+def _fit_with_robust_covariance(grams: Array, moments: Array) -> tuple[Array, Array]:
+    """Fit coefficients (c,) to the normal equations of K blocks; return them with White's covariance (c, c).
+
+    `grams` (K, c, c): products of the columns; `moments` (K, c): their products with the left side.
+    """
     total = grams.sum(axis=0)
-    coefficients = solve(total, left.sum(axis=0))
-    scores = left - grams @ coefficients
+    coefficients = solve(total, moments.sum(axis=0))
+    scores = moments - grams @ coefficients
     inverse = solve(total, np.eye(len(total)))
-    return coefficients, inverse @ (scores.T @ scores) @ inverse * (len(grams) / (len(grams) - 1.0))
+    small_sample_factor = len(grams) / (len(grams) - 1.0)
+    return coefficients, inverse @ (scores.T @ scores) @ inverse * small_sample_factor
 
 
-def _log_normal(value: float, variance: float) -> float:
+def _normal_log_density(value: float, variance: float) -> float:
+    """Compute the log density of a normal law of mean zero at `value`, up to a constant."""
     return -0.5 * value * value / variance - 0.5 * float(np.log(variance))

@@ -1,26 +1,26 @@
-"""Is it more than in the baseline? A recording's leakage against the scatter between healthy recordings.
+"""Rise of a recording's leakage beyond that of healthy recordings, whose scatter is estimated.
 
-The sums of the baseline's recordings, the zero of the flow of each set aside, are added up and give the coefficients of
-all terms; what a recording's own rows leave of them along the leak's column is its rise, its other coefficients free
-within what recordings of a machine differ by. The rise of each healthy recording against the others measures how
-recordings differ; whatever the model does not describe is in it, once. With r_j the rise of recording j of n against
-the n - 1 others, y_j = r_j (n - 1)/n; for the judged one y is its rise.
+The Gram matrices of the healthy recordings, without the flow's offset, are added up and give the coefficients of all
+terms. The residual of a recording under these coefficients, projected on the leak's column, is its rise; its other
+coefficients are free within a prior on the differences between recordings. The rise r_j of each healthy recording
+against the n - 1 others measures the scatter, with all that the model does not describe: y_j = r_j (n - 1)/n. For the
+judged recording y is its rise.
 
-How far the other coefficients differ is believed to within a factor only: a machine held at one temperature repeats
-them to a thousandth, another's change by a tenth from run to run. A narrow prior makes every rise precise where it is
-true and scatter where it is not, so y is formed by several widths, each weighted by what is believed of it and the
-evidence of the healthy ones, p(y_1 .. y_n).
+The width of that prior is known to within a factor only: a machine held at one temperature repeats its coefficients to
+a thousandth, another changes by a tenth from run to run. Too narrow a prior makes rises scatter, too wide a one makes
+them imprecise; so y is computed for several widths, each weighted by its prior and by the likelihood of the healthy
+recordings, p(y_1 .. y_n).
 
-Leakage goes with the inverse of the oil's viscosity, so that levels compare in logarithms where they are clearly above
-zero: z = asinh(a / 2 c) of the level a = level of all + y, c what errors make of it. All z of a width are normal about
-an unknown mean, with the variance sigma^2 of each by itself and a covariance between them of which there are several
-candidates. Of sigma nothing is known beforehand but its decades, from a recording's own deviation to a tenth of the
-flow: five recordings that agree show what two do not. Recordings of one session, by their dates, share oil and set-up:
-a deviation tau of sessions, half-normal beforehand. Recordings without a date are of one session. Where the oil's
-temperature T is known of all, z goes with a slope a kelvin that the recordings tell, about what is believed of it, and
-one of other oil than they had is the less certain; else tau holds what oil may do. So it is under another load or speed
-than theirs. The rise, y beyond what the others let expect, follows a mixture over all of these. What is believed stands
-in `priors.toml`.
+Leakage is proportional to the inverse of the oil's viscosity, so that levels are compared as logarithms where they
+are clearly above zero: z = asinh(a / 2 c) of the level a = mean level + y, with c from the errors of a. For each
+width all z are normal about an unknown mean, each with the variance sigma^2, plus one of several candidate covariances
+between them. sigma has a log-uniform prior from a recording's standard error to a tenth of the flow: five recordings
+that agree tell what two do not. Recordings of one session (by date; undated ones form one session) share oil and
+set-up: their deviation tau has a half-normal prior. If the oil's temperature T is known for all, z has a slope in T,
+with a prior, so that a recording with oil outside of the known range is less certain; otherwise the viscous pressure
+drop of the motion (`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect. Load and speed
+outside of the known range make a recording less certain, too. The rise follows the mixture over all of these. The
+priors are in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -28,33 +28,41 @@ I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unk
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, solve, total
-from sealscope.diagnosis.inference.rows.weak_form import LARGEST
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum_blocks
+from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.inference.terms import ORIFICE
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Name of the data that leakage against healthy recordings is.
+#: `Observable.data` of the leakage against healthy recordings.
 RISE = "rise"
-#: Nodes of a deviation, and the largest one between sessions over what is believed; most recordings that are compared.
-NODES, WIDEST, MOST = 32, 3.0, 60
-#: Widths of what recordings differ by that are weighed, and how far from what is believed [deviations].
-SCALES, FARTHEST = 11, 2.5
-#: Fewest healthy recordings that hold pressures: their mean and scatter.
-FEWEST_HELD = 2
-#: Least deviation: what is divided by is no zero.
+#: Number of grid points of a standard deviation.
+NODES = 32
+#: Largest standard deviation between sessions on the grid, over its prior.
+MAX_SESSION_RATIO = 3.0
+#: Maximum number of healthy recordings whose covariances are evaluated.
+MAX_RECORDINGS = 60
+#: Number of widths of the prior on differences between recordings, and the largest log width [standard deviations].
+SCALES, MAX_SCALE = 11, 2.5
+#: Minimum number of healthy recordings with holds under pressure: for a mean and a scatter.
+MIN_WITH_HOLDS = 2
+#: Reach of a grid of rises [standard deviations].
+MAX_LOG = 4.0
+#: Lower limit of divisors and of arguments of logarithms.
 TINY = 1e-300
-#: Laws that one of logarithms is split into, how much narrower each is, where logarithms end, what weighs nothing.
-PARTS, NARROWER, FARTHEST_Z, FAINTEST = 7, 0.5, 30.0, 16.0
+#: Normal laws that a law of z is split into, their relative width, limit of abs(z), and negligible log weight.
+PARTS, PART_WIDTH, MAX_Z, NEGLIGIBLE = 7, 0.5, 30.0, 16.0
 
 
 class Mixture(NamedTuple):
-    """A mixture of normal laws: `weights`, `deviations` and `centres` beside that of the whole, (k,) each."""
+    """Mixture of normal laws: `weights`, `deviations` and `centres` about the mean of the mixture, (k,) each."""
 
     weights: Array
     deviations: Array
@@ -62,83 +70,121 @@ class Mixture(NamedTuple):
 
     def quantile(self, probability: float) -> float:
         """Return the value below which the mixture lies with a probability."""
-        from scipy.optimize import brentq
         from scipy.special import ndtr, ndtri
 
-        unit = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
-        centres, deviations = self.centres / unit, self.deviations / unit
+        scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
+        centres, deviations = self.centres / scale, self.deviations / scale
 
         def excess(value: float) -> float:
             return float(self.weights @ ndtr((value - centres) / deviations)) - probability
 
-        ends = centres + ndtri(probability) * deviations
-        low, high = float(ends.min()), float(ends.max())
-        return unit * (low if not excess(low) < 0.0 < excess(high) else float(brentq(excess, low, high)))
+        part_quantiles = centres + ndtri(probability) * deviations
+        low, high = float(part_quantiles.min()), float(part_quantiles.max())
+        return scale * (low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high))
 
 
 class Rise(NamedTuple):
-    """The leak's coefficient beyond the baseline's: `value` and its `deviation`, with `freedom` degrees of freedom.
+    """Rise of the leak's coefficient beyond the healthy recordings: estimate `value` and its standard `deviation`.
 
-    `parts`: the mixture that it follows, where that is no single Student's law; `at_most`: a leak that begins within
-    the recording raises it by anything up to its mean.
+    In a healthy recording `value` has the distribution `mixture`, or without one that of `deviation` times Student's t.
+    `may_be_partial`: the leak may have begun within the recording, which shows between nothing and all of the rise.
     """
 
     value: float
     deviation: float
-    freedom: float
-    parts: Mixture | None = None
-    at_most: bool = False
+    degrees_of_freedom: float
+    mixture: Mixture | None = None
+    may_be_partial: bool = False
+
+    def widen(self, variance: float) -> Rise:
+        """Add a variance to all parts of the mixture; return the rise unchanged if it has none, or variance <= 0."""
+        if self.mixture is None or not variance > 0.0:
+            return self
+        mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
+        return self._replace(deviation=float(np.sqrt(self.deviation**2 + variance)), mixture=mixture)
 
     @property
     def score(self) -> float:
-        """The rise over its deviation."""
+        """The rise over its standard deviation."""
         return self.value / self.deviation
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording scores as high."""
-        return min(self._exceedance(self.score), 1.0)
-
-    def _exceedance(self, score: float) -> float:
+        """Probability that a healthy recording has a higher score."""
         from scipy.special import ndtr, stdtr
 
-        if self.parts is None:
-            return float(stdtr(self.freedom, -score))
-        weights, deviations, centres = self.parts
-        return float(weights @ ndtr((centres - score * self.deviation) / deviations))
+        if self.mixture is None:
+            return min(float(stdtr(self.degrees_of_freedom, -self.score)), 1.0)
+        weights, deviations, centres = self.mixture
+        return min(float(weights @ ndtr((centres - self.score * self.deviation) / deviations)), 1.0)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy recording exceeds with a probability."""
+        """Return the score that a healthy recording exceeds with a given probability."""
         from scipy.special import stdtrit
 
-        if self.parts is None:
-            return float(stdtrit(self.freedom, 1.0 - chance))
-        return self.parts.quantile(1.0 - chance) / self.deviation
+        if self.mixture is None:
+            return float(stdtrit(self.degrees_of_freedom, 1.0 - chance))
+        return self.mixture.quantile(1.0 - chance) / self.deviation
 
-    def log_ratio(self, rise: float) -> float:
-        """Return the logarithm of the likelihood of a true rise over that of none."""
-        if self.at_most and rise > 0.0:
-            densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
-            if 0.0 < self.value < rise:
-                densities.append(self._log_density(0.0))
-            return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
+    def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
+        """Compute the log likelihood ratio of a true rise against no rise.
+
+        `log_deviation`: standard deviation of the logarithm of the true rise about that of `rise`.
+        """
+        if log_deviation > 0.0 and rise > 0.0:
+            return self._log_ratio_lognormal(rise, log_deviation)
+        if self.may_be_partial and rise > 0.0:
+            return self._log_ratio_partial(rise)
         return self._log_density(self.value - rise) - self._log_density(self.value)
 
+    def _log_ratio_partial(self, rise: float) -> float:
+        """Compute `log_ratio` for a rise of which the recording shows any part: by the mean density over the parts."""
+        densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
+        if 0.0 < self.value < rise:  # the likeliest part, which the grid may miss
+            densities.append(self._log_density(0.0))
+        return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
+
+    def log_ratio_within(self, rise: float, tail: float) -> float:
+        """Compute `log_ratio` with both densities limited from below to the density at the `tail` quantiles.
+
+        So a value that no healthy recording predicts is evidence neither for nor against a rise.
+        """
+        tail_rises = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
+        min_log_density = min(self._log_density(rise) for rise in tail_rises)
+        log_densities = [max(self._log_density(error), min_log_density) for error in (self.value - rise, self.value)]
+        return log_densities[0] - log_densities[1]
+
+    def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
+        """Integrate `log_ratio` over a log-normal true rise, on a grid that resolves prior and likelihood."""
+        grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
+        grid = np.concatenate(
+            [rise * np.exp(log_deviation * grid_deviations), self.value + self.deviation * grid_deviations]
+        )
+        grid = np.unique(grid[grid > TINY])
+        prior = -0.5 * (np.log(grid / rise) / log_deviation) ** 2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
+        logarithms = (
+            prior + [self._log_density(self.value - true_rise) for true_rise in grid] - self._log_density(self.value)
+        )
+        log_max = float(logarithms.max())
+        return log_max + float(np.log(max(np.trapezoid(np.exp(logarithms - log_max), grid), TINY)))
+
     def _log_density(self, value: float) -> float:
-        """Return the logarithm of the density of a healthy recording's rise, up to a constant."""
-        if self.parts is None:
+        """Compute the log density of a healthy recording's rise, up to a constant."""
+        if self.mixture is None:
             z = value / self.deviation
-            return float(-0.5 * (self.freedom + 1.0) * np.log1p(z * z / self.freedom))
-        weights, deviations, centres = self.parts
-        parts = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
-        return float(np.logaddexp.reduce(parts - 0.5 * ((value - centres) / deviations) ** 2))
+            if np.isinf(self.degrees_of_freedom):  # Student's law is the normal one
+                return -0.5 * z * z
+            return float(-0.5 * (self.degrees_of_freedom + 1.0) * np.log1p(z * z / self.degrees_of_freedom))
+        weights, deviations, centres = self.mixture
+        log_weights = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
+        return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the upper bound that holds with a probability; a rise below zero does not make it smaller."""
+        """Return the upper bound of the rise for a probability; a negative estimate counts as zero."""
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the interval of the rise that holds with a probability."""
+        """Return the central interval of the rise for a probability."""
         tail = 0.5 - 0.5 * probability
         high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
         return self.value - high, self.value - low
@@ -147,9 +193,10 @@ class Rise(NamedTuple):
 class RecordingSums(NamedTuple):
     """Sums over a recording of one machine, to be added to those of other recordings.
 
-    `sums` (E, m, m) of its rows, the zero of its flow set aside; `flow` of the pump and `pressure`, mean sizes
-    [m^3/s], [Pa]; `start_s`: its date [s since 1970], `oil_degC`, its oil's temperature, and `held`, what its holds
-    leak (`locked_holds.HeldLeaks`), None where they are not known.
+    `sums` (E, m, m): Gram matrix of each equation over the variance of a row, the flow's offset eliminated; mean `flow`
+    of the pump [m^3/s] and `pressure` [Pa], both absolute; `start_s`: date [s since 1970];
+    `oil_degC`: temperature of the oil; `held`: leaks during holds (`locked_holds.HeldLeaks`); `viscous_drop`:
+    logarithm of the pressure drop over the speed, and its standard error. The last four are None if unknown.
     """
 
     sums: Array
@@ -158,66 +205,85 @@ class RecordingSums(NamedTuple):
     start_s: float | None = None
     oil_degC: float | None = None
     held: Array | None = None
+    viscous_drop: Array | None = None
 
     @classmethod
     def from_blocks(
         cls,
         blocks: Blocks,
-        columns: Sequence[Columns],
+        columns: Sequence[ColumnRoles],
         start_s: float | None = None,
         oil_degC: float | None = None,
     ) -> RecordingSums:
-        """Compute the sums of a recording's blocks."""
+        """Add up the Gram matrices of a recording's blocks, and average flow and pressure."""
         weights = np.maximum(blocks.rows, 1e-9)
-        flow, pressure = (float(np.average(values, weights=weights)) for values in (blocks.flow, blocks.driving()))
-        return cls(_about_own(total(blocks, columns), columns), flow, pressure, start_s, oil_degC)
+        flow, pressure = (
+            float(np.average(values, weights=weights)) for values in (blocks.flow, blocks.mean_pressure())
+        )
+        return cls(_eliminate_unshared(sum_blocks(blocks, columns), columns), flow, pressure, start_s, oil_degC)
 
 
-def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> Rise:
+def _conductance_of_flow(recording: RecordingSums) -> float:
+    """Return the conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 without pressure."""
+    return recording.flow / recording.pressure if recording.pressure > 0.0 else 0.0
+
+
+def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate the rise of a recording's leak coefficient beyond healthy recordings of the same machine.
 
-    All are of `columns`, one of each equation.
+    `columns`: of each equation, the same for all recordings.
     """
-    everything, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
-    believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    decades = np.linspace(-FARTHEST, FARTHEST, SCALES)
-    widths = believed["between"] ** decades
-    rises, own_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
-    if count > 1:
-        pairs = [_rises(recording.sums, everything - recording.sums, columns, widths) for recording in baseline]
-        rises, own_errors = (np.array(numbers).T * ((count - 1) / count) for numbers in zip(*pairs, strict=True))
-    values, error = _rises(judged.sums, everything, columns, widths)
-    level, level_error = _level(everything, columns)
-    errors = believed["own"] * np.median(np.column_stack([error, own_errors]), axis=1)
-    errors = np.maximum(errors, max(believed["finest"] * by_flow, 1.0 / LARGEST))
+    healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
+    prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
+    exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    widths = prior.between**exponents
+    rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
+    if count > 1:  # of each healthy recording over the others, scaled to one over the mean of all
+        projections = [
+            _project_on_leak(recording.sums, healthy_sums - recording.sums, columns, widths) for recording in baseline
+        ]
+        rises, rise_errors = (
+            np.array(estimates).T * ((count - 1) / count) for estimates in zip(*projections, strict=True)
+        )
+    values, error = _project_on_leak(judged.sums, healthy_sums, columns, widths)
+    level, level_error = _leak_level(healthy_sums, columns)
+    errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
+    errors = np.maximum(errors, max(prior.finest * conductance_of_flow, 1.0 / MAX_READING))
     return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of what passes the piston while valves shut the chambers; None where too few hold pressures.
+    """Estimate the rise of the piston's leakage from holds with shut valves; None if too few recordings have holds.
 
-    A leak that begins within the recording raises it by anything between nothing and its mean.
+    The leak may have begun within the recording, whose mean then contains only a part of it.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
-    known = [recording.held for recording in baseline if recording.held is not None]
-    if judged.held is None or len(known) < FEWEST_HELD:
+    if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
         return None
-    count, by_flow = len(known), judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    healthy = np.array(known)
-    level = float(healthy[:, 0].mean())
-    least = max(priors("inference")["scatter"]["finest"] * by_flow, 1.0 / LARGEST)
-    errors = np.maximum(np.median(np.append(healthy[:, 1], judged.held[1])), least)
-    values, rises = np.array([judged.held[0] - level]), (healthy[:, 0] - level)[None]
-    shown = _compare_levels(
-        judged, baseline, _Estimates(values, rises, errors[None], max(level, 0.0), errors / np.sqrt(count))
+    healthy = np.array([recording.held for recording in baseline])
+    healthy_leaks, healthy_errors = healthy[:, :2].T  # `HeldLeaks`: leak past the piston, and its standard deviation
+    leak, leak_error = judged.held[:2]
+    level = float(healthy_leaks.mean())
+    conductance_of_flow = _conductance_of_flow(judged)
+    min_error = max(INFERENCE.scatter.finest * conductance_of_flow, 1.0 / MAX_READING)
+    error = np.maximum(np.median(np.append(healthy_errors, leak_error)), min_error)
+    estimates = _Estimates(
+        values=np.array([leak - level]),
+        rises=(healthy_leaks - level)[None],
+        errors=error[None],
+        level=max(level, 0.0),
+        level_error=error / np.sqrt(len(baseline)),
+        min_crossover=INFERENCE.scatter.largest * conductance_of_flow,
     )
-    return shown._replace(at_most=True)
+    rise = _compare_levels(judged, baseline, estimates)
+    return rise.widen(float(leak_error) ** 2 - float(error) ** 2)._replace(may_be_partial=True)
 
 
 class _Estimates(NamedTuple):
-    """Rises `values` (s,) of the judged recording, and `rises` (s, n) of the healthy ones, by each of s ways.
+    """Rises estimated with s widths of the prior: `values` (s,) of the judged, `rises` (s, n) of healthy recordings.
 
-    `errors` (s,) of one; `level` of all healthy ones, with its error.
+    `errors` (s,): standard error of a rise; `level`: mean coefficient of the healthy recordings, with its error;
+    `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero.
     """
 
     values: Array
@@ -225,339 +291,484 @@ class _Estimates(NamedTuple):
     errors: Array
     level: float
     level_error: float
+    min_crossover: float = 0.0
 
 
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
-    """Compare rises with what healthy recordings let expect, their levels in logarithms."""
-    values, rises, errors, level, level_error = estimates
-    believed, by_flow = priors("inference")["scatter"], judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    decades = np.linspace(-FARTHEST, FARTHEST, SCALES) if len(values) == SCALES else np.zeros(len(values))
-    starts, pause = (
-        [recording.start_s for recording in (*baseline, judged)],
-        3600.0 * priors("inference")["oil"]["shift"],
+    """Estimate the rise beyond the distribution of levels that healthy recordings predict, about in logarithms.
+
+    z = asinh(level / 2 c) (`_LevelScale`) is normal about an unknown mean, with an unknown scatter sigma of each
+    recording and the covariances of sessions, oil and unusual conditions.
+    """
+    values, rises, errors, level, level_error, min_crossover = estimates
+    prior = INFERENCE.scatter
+    conductance_of_flow = _conductance_of_flow(judged)
+    exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
+    recordings = [*baseline, judged]
+    oils = _oil_hypotheses(recordings)
+    # scatter that the oil does not explain: warmer oil is thinner and leaks more
+    oil_factor = np.exp(oils[0].thinning[:-1])
+    unexplained = rises - level * (oil_factor - oil_factor.mean())
+    scatter = float(np.median(unexplained.std(axis=1)))
+    scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
+    steepness = scale.slope(level)
+    relative_slope = steepness * level
+    excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
+    sessions = number_sessions([recording.start_s for recording in recordings], 3600.0 * INFERENCE.oil.shift)
+    max_relative = min(steepness * prior.largest * conductance_of_flow, prior.relative)
+    max_sigma = np.maximum(max_relative, 10.0 * steepness * errors)
+    sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
+    transformed, healthy = scale.transform(values), scale.transform(rises)
+    # log Jacobian of z, and log prior of the width
+    estimate_logarithms = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * exponents**2
+    predictions = []
+    for oil in oils:
+        candidates = _candidate_covariances(
+            sessions,
+            oil,
+            relative_slope,
+            session_deviation=steepness * prior.session * conductance_of_flow,
+            condition_deviation=relative_slope * (excess * INFERENCE.conditions.leak),
+        )
+        shifts = relative_slope * oil.thinning
+        predicted = Population(*candidates).predict(
+            transformed - shifts[-1], healthy - shifts[:-1], sigma, estimate_logarithms + oil.log_probability
+        )
+        predictions.append(scale.to_levels(predicted, transformed))
+    return _rise_of_mixture(
+        Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True))), values
     )
-    sessions = np.array(sessions_of(starts, pause))
-    warmer, oil = _oil_shifts([*baseline, judged])
-    unseen = (
-        sum(condition.excess for condition in conditions_beyond(judged, baseline))
-        * priors("inference")["conditions"]["leak"]
-    )
-    nodes = WIDEST * ((np.arange(NODES) + 0.5) / NODES) ** 2  # closer near zero
-    believed_of = 0.5 * np.log(nodes) - 0.5 * nodes**2
+
+
+def _candidate_covariances(
+    sessions: Sequence[int], oil: _Oil, relative_slope: float, *, session_deviation: float, condition_deviation: float
+) -> tuple[Array, Array]:
+    """Build candidate covariances (g, n + 1, n + 1) of z between recordings, the judged one last, and their log priors.
+
+    `relative_slope`: dz over a relative change of the level. Standard deviations of z: `session_deviation`, between
+    sessions by the prior; `condition_deviation`, of the judged recording by its unusual load and speed.
+    """
+    # grid of the deviation between sessions over its prior, denser near zero; half-normal prior, times the spacing
+    ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
+    log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
     if len(set(sessions)) == 1:
-        nodes, believed_of = np.zeros(1), np.zeros(1)
-    slope, doubt = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
-    thin = np.exp(slope * warmer[:-1])
-    left = rises - level * (thin - thin.mean())
-    turn = max(level_error, float(np.median(errors)), float(np.median(left.std(axis=1))), 0.1 * level)
-    scale = _Levels(level, turn)
-    steep = scale.slope(level)
-    relative = steep * level
-    between = ((np.hypot(relative * oil, steep * believed["session"] * by_flow) * nodes) ** 2)[:, None, None]
-    between = between * np.equal.outer(sessions, sessions) + np.outer(warmer, warmer) * (relative * doubt) ** 2
-    between[:, -1, -1] += (relative * unseen) ** 2
-    if relative * oil > 0.0 and sessions[-1] not in sessions[:-1]:  # a day like those that are known, or like none
-        logs = np.log([[1.0 - believed["unlike"]], [believed["unlike"]]])
-        believed_of, between = (logs + believed_of).ravel(), np.tile(between, (2, 1, 1))
-        between[len(nodes) :, -1, -1] += 2.0 * (relative * oil) ** 2
-    shifts = relative * slope * warmer
-    most = np.maximum(min(steep * believed["largest"] * by_flow, believed["relative"]), 10.0 * steep * errors)
-    transformed, known = scale.transform(values), scale.transform(rises) - shifts[:-1]
-    predicted = Population(between, believed_of).predict(
-        transformed - shifts[-1],
-        known,
-        np.geomspace(steep * errors, most, NODES, axis=1),
-        np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * decades**2,
-    )
-    return _combined(scale.levels(predicted, transformed), values)
+        ratios, log_priors = np.zeros(1), np.zeros(1)
+    by_unknown_oil = relative_slope * oil.session_deviation
+    session_variances = (np.hypot(by_unknown_oil, session_deviation) * ratios) ** 2
+    # recordings of one session share its deviation; the oil's known effect has an error of its slope and of each value
+    covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
+    covariances = covariances + np.outer(oil.thinning, oil.thinning) * (relative_slope * oil.slope_deviation) ** 2
+    covariances += np.diag(relative_slope**2 * oil.variances)
+    covariances[:, -1, -1] += condition_deviation**2
+    if by_unknown_oil > 0.0 and sessions[-1] not in sessions[:-1]:
+        # the judged recording's day has oil like that of the known days, or unlike it
+        unlike = INFERENCE.scatter.unlike
+        log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
+        covariances = np.tile(covariances, (2, 1, 1))
+        covariances[len(ratios) :, -1, -1] += 2.0 * by_unknown_oil**2
+    return covariances, log_priors
 
 
-class _Levels(NamedTuple):
-    """Levels a of a coefficient as z = asinh(a / 2 c): logarithms beyond c, proportional to a below."""
+class _LevelScale(NamedTuple):
+    """Transform z = asinh(a / 2 c) of levels a of a coefficient: logarithmic far above c, linear far below.
+
+    `level`: mean of the healthy recordings; `crossover`: c.
+    """
 
     level: float
-    turn: float
+    crossover: float
 
     def transform(self, excess: Array) -> Array:
-        """Return z of levels that are so far beyond that of all."""
-        return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.turn)))
+        """Compute z of levels that exceed the mean level by `excess`."""
+        return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
         """Return dz/da at levels."""
-        return 1.0 / np.hypot(level, 2.0 * self.turn)
+        return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
-    def levels(self, predicted: Mixture, transformed: Array) -> Mixture:
-        """Convert a law of z, relative to `transformed` (s,), to one of levels relative to the level of all.
+    def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
+        """Convert a distribution of z, relative to `transformed` (s,), to one of levels relative to the mean level.
 
-        Each part is split into narrower ones, in which the levels are linear in z.
+        Each part is split into narrower ones, within which the level is linear in z.
         """
-        x, shares = np.polynomial.hermite_e.hermegauss(PARTS)
+        x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
-        z = np.clip(centres[..., None] + np.sqrt(1.0 - NARROWER**2) * deviations * x, -FARTHEST_Z, FARTHEST_Z)
+        z = np.clip(centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x, -MAX_Z, MAX_Z)
         return Mixture(
-            predicted.weights[..., None] + np.log(shares / shares.sum()),
-            2.0 * self.turn * np.cosh(z) * NARROWER * deviations,
-            2.0 * self.turn * np.sinh(z) - self.level,
+            predicted.weights[..., None] + np.log(part_weights / part_weights.sum()),
+            2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,
+            2.0 * self.crossover * np.sinh(z) - self.level,
         )
 
 
-def _combined(predicted: Mixture, values: Array) -> Rise:
-    """Return the rise of `values` (s,) over laws (s, ...) of what healthy recordings show, by their log weights."""
+def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
+    """Convert predictions (s, ...) of a healthy level, with log weights, to the rise of `values` (s,) beyond them."""
     offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
     logs, deviations, centres = (
         part.ravel() for part in (predicted.weights, predicted.deviations, predicted.centres - offset)
     )
-    kept = logs > logs.max() - FAINTEST
-    weights = np.exp(logs[kept] - logs.max())
-    law = Mixture(weights / weights.sum(), deviations[kept], centres[kept])
-    low, middle, high = (law.quantile(probability) for probability in (0.16, 0.5, 0.84))
-    return Rise(-middle, 0.5 * (high - low), np.inf, law._replace(centres=law.centres - middle))
+    is_counted = logs > logs.max() - NEGLIGIBLE
+    weights = np.exp(logs[is_counted] - logs.max())
+    mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])
+    low, middle, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
+    return Rise(-middle, 0.5 * (high - low), np.inf, mixture._replace(centres=mixture.centres - middle))
 
 
-class Beyond(NamedTuple):
-    """A condition of a recording that no healthy one had: its `name`, value, range of theirs, and unit.
+class UnusualCondition(NamedTuple):
+    """Condition of a recording outside of the range `low` to `high` of the healthy ones.
 
-    `excess`: how far it is beyond them, in powers of e of load or speed, or as they would change the oil.
+    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `log_excess`: log
+    ratio of load or speed to the end of the range, 0 for oil, whose slope has an uncertainty that covers it.
     """
 
     name: str
     value: float
     low: float
     high: float
-    unit: str
-    excess: float
+    log_excess: float = 0.0
 
 
-def conditions_beyond(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[Beyond]:
-    """Find the conditions of a recording that are beyond those of the healthy ones: oil, load, speed."""
-    allowed, extremes = priors("inference")["conditions"], list[Beyond]()
-    for name, unit, field in (("load", "Pa", "pressure"), ("speed", "m^3/s", "flow")):
-        value, known = getattr(judged, field), [getattr(healthy, field) for healthy in baseline]
-        if not known or not min(value, *known) > 0.0:
+def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
+    """Find the conditions (load, speed, oil) of a recording outside of the range of the healthy ones."""
+    allowed, unusual = INFERENCE.conditions, list[UnusualCondition]()
+    loads_and_speeds = (
+        ("load", judged.pressure, [healthy.pressure for healthy in baseline]),
+        ("speed", judged.flow, [healthy.flow for healthy in baseline]),
+    )
+    for name, value, healthy_values in loads_and_speeds:
+        if not healthy_values or not min(value, *healthy_values) > 0.0:
             continue
-        excess = float(max(np.log(value / max(known)), np.log(min(known) / value)))
-        if excess > allowed["ratio"]:
-            extremes.append(Beyond(name, value, min(known), max(known), unit, excess))
-    warm = [healthy.oil_degC for healthy in baseline if healthy.oil_degC is not None]
-    if judged.oil_degC is not None and warm:
-        excess = max(judged.oil_degC - max(warm), min(warm) - judged.oil_degC)
-        if excess > allowed["oil"]:  # what it does is in the slope's doubt
-            extremes.append(Beyond("oil", judged.oil_degC, min(warm), max(warm), "degC", 0.0))
-    return extremes
+        low, high = min(healthy_values), max(healthy_values)
+        log_excess = float(max(np.log(value / high), np.log(low / value)))
+        if log_excess > allowed.ratio:
+            unusual.append(UnusualCondition(name, value, low, high, log_excess))
+    oil_temperatures = [healthy.oil_degC for healthy in baseline if healthy.oil_degC is not None]
+    if judged.oil_degC is not None and oil_temperatures:
+        low, high = min(oil_temperatures), max(oil_temperatures)
+        if max(judged.oil_degC - high, low - judged.oil_degC) > allowed.oil:
+            unusual.append(UnusualCondition("oil", judged.oil_degC, low, high))
+    return unusual
 
 
-def leave_one_out(recordings: Sequence[RecordingSums], columns: Sequence[Columns]) -> Array:
-    """Compute the rise (n,) of each recording beyond the n - 1 others, by what is believed of their differences."""
-    everything = np.sum([recording.sums for recording in recordings], axis=0)
-    rises = [_rises(recording.sums, everything - recording.sums, columns, np.ones(1))[0] for recording in recordings]
+def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
+    """Compute how far the leak coefficient (n,) of each recording lies above the mean of all n.
+
+    That is (n - 1)/n of its rise beyond the other n - 1; other coefficients differ by their usual prior.
+    """
+    usual_width = np.ones(1)
+    all_sums = np.sum([recording.sums for recording in recordings], axis=0)
+    rises = [
+        _project_on_leak(recording.sums, all_sums - recording.sums, columns, usual_width)[0] for recording in recordings
+    ]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))
 
 
 class Population:
-    """Values that are normal about an unknown mean, the last of them the judged one.
+    """Normal values about an unknown mean, the last of them judged.
 
     Parameters
     ----------
     candidates : array of float, shape (g, n + 1, n + 1)
-        Covariances between them, beside the variance of each by itself; those of n = 0 are of a single value.
-    logarithms : array of float, shape (g,)
-        Of what is believed of each candidate.
+        Candidate covariances between the values, in addition to the variance sigma^2 of each; n may be 0.
+    log_priors : array of float, shape (g,)
+        Log prior of each candidate.
     """
 
-    def __init__(self, candidates: Array, logarithms: Array) -> None:
+    def __init__(self, candidates: Array, log_priors: Array) -> None:
         n = candidates.shape[1] - 1
-        self._chosen = np.unique(np.linspace(0, n - 1, min(n, MOST)).astype(int))
-        known = candidates[:, self._chosen[:, None], self._chosen]
-        eigen, basis = np.linalg.eigh(known)
-        self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis  # (g, 1, n), beside nodes of sigma
-        self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._chosen, n])[:, None]
+        # evenly spaced healthy values, which limits the time; covariances along the eigenvectors of theirs
+        self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
+        healthy = candidates[:, self._sample[:, None], self._sample]
+        eigen, basis = np.linalg.eigh(healthy)
+        self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis  # (g, 1, n): 1 for the nodes of sigma
+        self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]
-        self._own, self._logarithms = candidates[:, n, n, None], logarithms[:, None]
+        self._judged_variance, self._log_priors = candidates[:, n, n, None], log_priors[:, None]
 
-    def rise(self, values: Array, known: Array, usual: float, freedom: float) -> Rise:
-        """Estimate the rise of a value beyond its prediction from the known ones.
+    def rise(self, values: Array, healthy_values: Array, prior_sigma: float, freedom: float) -> Rise:
+        """Estimate the rise of the judged value beyond its prediction from the healthy ones, of unknown scatter sigma.
 
-        `values` (s,) and `known` (s, n): the same quantity, estimated in s ways; the evidence of those known weighs the
-        ways. `usual`, `freedom`: what is believed of sigma, whose square has a scaled inverse chi square law.
+        `values` (s,) and `healthy_values` (s, n): the same quantity estimated in s ways, weighted by the likelihood of
+        the healthy ones. sigma^2 has a scaled inverse chi-squared prior with scale `prior_sigma`^2 and `freedom`
+        degrees of freedom.
         """
-        count = len(self._chosen)
-        healthy = known[:, self._chosen]
-        squares = freedom * usual**2 + np.sum((healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1)
-        if not 1e4 * squares.max() < LARGEST:  # numbers that cannot be computed with bound nothing
+        count = len(self._sample)
+        healthy = healthy_values[:, self._sample]
+        sums_of_squares = freedom * prior_sigma**2 + np.sum(
+            (healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1
+        )
+        if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return no bound
             return Rise(float(values.mean()), np.inf, freedom)
-        least = np.sqrt(np.maximum(0.1 * freedom * usual**2, 1e-9 * squares) / (freedom + count))
-        most = np.maximum(100.0 * np.sqrt(squares), 10.0 / LARGEST)
-        sigma = np.geomspace(np.maximum(least, 1.0 / LARGEST), most, NODES, axis=1)
-        believed = -0.5 * freedom * (np.log(sigma**2) + usual**2 / sigma**2)
-        predicted = self.predict(values, known, sigma, np.zeros(len(values)), believed)
-        return _combined(predicted._replace(centres=predicted.centres + values[:, None, None]), values)
+        min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
+        max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
+        sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)
+        log_prior = -0.5 * freedom * (np.log(sigma**2) + prior_sigma**2 / sigma**2)
+        predicted = self.predict(values, healthy_values, sigma, np.zeros(len(values)), log_prior)
+        return _rise_of_mixture(predicted._replace(centres=predicted.centres + values[:, None, None]), values)
 
     def predict(
-        self, values: Array, known: Array, sigma: Array, logarithms: Array, believed: Array | float = 0.0
+        self,
+        values: Array,
+        healthy_values: Array,
+        sigma: Array,
+        log_priors: Array,
+        sigma_log_prior: Array | float = 0.0,
     ) -> Mixture:
-        """Return the law of the judged value beside `values` (s,): log weights, deviations, centres (s, g, nodes).
+        """Predict the judged value relative to `values` (s,): log weights, deviations and centres (s, g, nodes).
 
-        `known` (s, n): the others, in s ways of which `logarithms` (s,) are believed; `sigma` (s, nodes): evenly spaced
-        in their logarithms, of whose densities `believed` (s, nodes) are the logarithms.
+        `healthy_values` (s, n): the other values x, in s ways with `log_priors` (s,); `sigma` (s, nodes): log-spaced
+        grid, with log prior densities `sigma_log_prior` (s, nodes). With covariances V of the healthy values and c with
+        the judged one, the prediction is m + c' V^-1 (x - m), m the generalised least-squares mean (kriging).
         """
-        healthy = known[:, self._chosen]
+        healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
         weight = 1.0 / (variance[..., None] + self._eigen)  # (s, g, nodes, n)
-        of_ones, cross = weight * self._ones, self._cross
-        precision = (of_ones * self._ones).sum(axis=-1)
+        weighted_ones, cross = weight * self._ones, self._cross
+        precision = (weighted_ones * self._ones).sum(axis=-1)
         rotated = np.einsum("gij,si->sgj", self._basis, healthy)[:, :, None]
-        mean = (of_ones * rotated).sum(axis=-1) / precision
-        left = weight * (rotated - mean[..., None] * self._ones)
-        logarithm = 0.5 * (np.log(weight).sum(axis=-1) - np.log(precision) - (left * rotated).sum(axis=-1))
-        logarithm += self._logarithms + np.reshape(logarithms, (-1, 1, 1))
-        logarithm += (
-            np.broadcast_to(believed, sigma.shape)[:, None] + np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))[:, None]
+        mean = (weighted_ones * rotated).sum(axis=-1) / precision
+        weighted_residual = weight * (rotated - mean[..., None] * self._ones)
+        log_likelihood = 0.5 * (
+            np.log(weight).sum(axis=-1) - np.log(precision) - (weighted_residual * rotated).sum(axis=-1)
         )
-        centres = mean + (left * cross).sum(axis=-1) - values[:, None, None]
-        missing = 1.0 - (of_ones * cross).sum(axis=-1)
-        variances = variance + self._own - (weight * cross**2).sum(axis=-1) + missing**2 / precision
-        return Mixture(logarithm, np.sqrt(variances), centres)
+        log_likelihood += self._log_priors + np.reshape(log_priors, (-1, 1, 1))
+        # prior density of log sigma, times the spacing of its grid
+        log_spacing = np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))
+        log_likelihood += np.broadcast_to(sigma_log_prior, sigma.shape)[:, None] + log_spacing[:, None]
+        centres = mean + (weighted_residual * cross).sum(axis=-1) - values[:, None, None]
+        mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)
+        variances = variance + self._judged_variance - (weight * cross**2).sum(axis=-1) + mean_deficit**2 / precision
+        return Mixture(log_likelihood, np.sqrt(variances), centres)
 
 
-def sessions_of(starts: Sequence[float | None], pause: float) -> list[int]:
-    """Return the session of each recording: a number of its own after every gap [s] longer than `pause`."""
+def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
+    """Return the session number of each recording, -1 if undated; a gap above `pause` [s] separates sessions."""
     dates = sorted(start for start in starts if start is not None)
-    begins = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
-    return [-1 if start is None else int(np.searchsorted(begins, start, "right")) for start in starts]
+    session_starts = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
+    return [-1 if start is None else int(np.searchsorted(session_starts, start, "right")) for start in starts]
 
 
-def _oil_shifts(recordings: Sequence[RecordingSums]) -> tuple[Array, float]:
-    """Compute the oil temperature of each recording over the mean of all but the last [K], and a doubt.
+class _Oil(NamedTuple):
+    """Hypothesis on the oil of n + 1 recordings: what it makes of the logarithm of their leakage.
 
-    Where a temperature is missing none counts: the levels of sessions deviate in their logarithms by the doubt, else 0.
+    `thinning` (n + 1,): predicted logarithm relative to the mean of all but the last, proportional to a slope with a
+    relative `slope_deviation`; `variances` (n + 1,) of each prediction; `session_deviation`: standard deviation between
+    sessions.
     """
-    known = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
-    if len(known) < len(recordings):  # the difference of two sessions has twice the variance of each
-        return np.zeros(len(recordings)), float(np.sqrt(0.125) * np.log(priors("inference")["oil"]["warmest"]))
-    return np.array(known) - np.mean(known[:-1]), 0.0
+
+    thinning: Array
+    variances: Array
+    log_probability: float = 0.0
+    slope_deviation: float = 0.0
+    session_deviation: float = 0.0
 
 
-def _level(sums: Array, columns: Sequence[Columns]) -> tuple[float, float]:
-    """Return the leak's coefficient in healthy recordings by their sums (E, m, m), at least zero, and its error."""
-    precision, vector = 0.0, 0.0
-    for e, column in enumerate(columns):
-        nuisance = [k for k in column.compared if k != column.leak and np.isfinite(column.between[k])]
-        cross = sums[e][nuisance, column.leak]
-        solved = solve(sums[e][np.ix_(nuisance, nuisance)], np.column_stack([cross, sums[e][nuisance, column.left]]))
-        precision += float(sums[e][column.leak, column.leak] - cross @ solved[:, 0])
-        vector += float(sums[e][column.leak, column.left] - cross @ solved[:, 1])
-    return (max(vector, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
+def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
+    """List the hypotheses on the oil: by its temperature if known, else by the viscous pressure drop, or unknown."""
+    prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
+    temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
+    if len(temperatures) == len(recordings):
+        warmer = np.array(temperatures) - np.mean(temperatures[:-1])
+        slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
+        return [_Oil(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
+    # the difference of two sessions has a standard deviation of half the range, each session sqrt(1/2) of that
+    unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
+    drops = [recording.viscous_drop for recording in recordings if recording.viscous_drop is not None]
+    if len(drops) < len(recordings):
+        return [unknown]
+    drop, error = np.array(drops).T
+    variance, error_variance = unknown.session_deviation**2, (prior.per_drop * error) ** 2
+    reliability = variance / (variance + error_variance)  # variance of the true drop over that of the measured one
+    by_drop = _Oil(
+        thinning=-prior.per_drop * reliability * (drop - drop[:-1].mean()),
+        variances=reliability * error_variance,
+        log_probability=float(np.log(prior.drop_tells)),
+        slope_deviation=prior.per_drop_deviation / prior.per_drop,
+    )
+    return [by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
 
 
-def motion_change(judged: Array, baseline: Sequence[Array], columns: Columns) -> float:
-    """Compute the logarithm of the flow that motion takes in a recording over that in others, by sums (m, m).
+def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
+    """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices (E, m, m).
 
-    Area over displacement differs by it: another machine, or another scale.
+    The other coefficients are eliminated from each equation (Schur complement), and the equations added up.
     """
-    everything, motion = np.sum(baseline, axis=0), list(columns.motion)
-    chosen = list(columns.nuisance)
-    places = [chosen.index(k) for k in motion]
-    flows = [
-        np.diag(judged)[motion] @ solve(sums[np.ix_(chosen, chosen)], sums[chosen, columns.left])[places]
-        for sums in (judged, everything)
-    ]
-    return float(np.log(np.maximum(np.abs(flows), np.finfo(float).tiny)) @ [1.0, -1.0])
+    precision, moment = 0.0, 0.0
+    for e, roles in enumerate(columns):
+        nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
+        cross = gram[e][nuisance, roles.leak]
+        solved = solve(gram[e][np.ix_(nuisance, nuisance)], np.column_stack([cross, gram[e][nuisance, roles.left]]))
+        precision += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
+        moment += float(gram[e][roles.leak, roles.left] - cross @ solved[:, 1])
+    return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
-def student(value: float, deviations: Sequence[float] | Array, believed: float) -> Rise:
-    """Return a rise against n healthy recordings, each of which deviates so far from the others.
+def motion_change(judged: Array, baseline: Sequence[Array], roles: ColumnRoles) -> tuple[float, float]:
+    """Compute the log ratio of the flow explained by motion in a recording to that in others, and its standard error.
 
-    `believed`: what is believed of the scatter beforehand.
+    `judged`, `baseline`: Gram matrices (m, m). The flow is the sum of the least-squares coefficients of motion,
+    weighted by the energies of their columns in the recording. The ratio differs from 1 if area over displacement
+    changed: another machine, or another scale. The error is that of the recording alone.
     """
-    width, count = priors("inference")["scatter"], len(deviations)
-    squares = width["freedom"] * believed * believed
-    freedom = width["freedom"] + count - 1
+    reference, motion = np.sum(baseline, axis=0), list(roles.motion)
+    nuisance = list(roles.nuisance)
+    motion_index = [nuisance.index(k) for k in motion]
+    weights = np.zeros(len(nuisance))
+    weights[motion_index] = np.diag(judged)[motion]
+    flows, deviations = list[float](), list[float]()
+    for gram in (judged, reference):
+        right_sides = np.column_stack([gram[nuisance, roles.left], weights])
+        coefficients, error_weights = solve(gram[np.ix_(nuisance, nuisance)], right_sides).T
+        flows.append(max(abs(float(weights @ coefficients)), np.finfo(float).tiny))
+        deviations.append(math.sqrt(max(float(weights @ error_weights), 0.0)))
+    return math.log(flows[0] / flows[1]), deviations[0] / flows[0]
+
+
+def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
+    """Estimate the distribution of a rise as Student's t, by the scatter of n healthy recordings.
+
+    `deviations` (n,): of each healthy recording from the mean of the others; `prior_scatter`: prior standard deviation.
+    """
+    prior, count = INFERENCE.scatter, len(deviations)
+    sum_of_squares = prior.freedom * prior_scatter * prior_scatter
+    freedom = prior.freedom + count - 1
     if count > 1:
-        squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
-    deviation = np.sqrt(squares / freedom * (1.0 + 1.0 / count))
+        sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
+    deviation = np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))
     return Rise(value, max(float(deviation), np.finfo(float).tiny), freedom)
 
 
-def _about_own(sums: Array, columns: Sequence[Columns]) -> Array:
-    """Return a recording's sums (E, m, m) with the coefficients set aside that nothing ties to another recording's."""
-    reduced = sums.copy()
-    for e, column in enumerate(columns):
-        untied = [k for k in column.compared if k != column.leak and not np.isfinite(column.between[k])]
-        cross = sums[e][:, untied]
-        reduced[e] -= cross @ solve(sums[e][np.ix_(untied, untied)], cross.T)
-        reduced[e][untied] = reduced[e][:, untied] = 0.0
+def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
+    """Eliminate the coefficients without a prior across recordings, such as the flow's offset (Schur complement).
+
+    `gram` (E, m, m); in the result their rows and columns are zero.
+    """
+    reduced = gram.copy()
+    for e, roles in enumerate(columns):
+        unshared = [k for k in roles.compared if k != roles.leak and not np.isfinite(roles.between_deviation[k])]
+        cross = gram[e][:, unshared]
+        reduced[e] -= cross @ solve(gram[e][np.ix_(unshared, unshared)], cross.T)
+        reduced[e][unshared] = reduced[e][:, unshared] = 0.0
     return reduced
 
 
 class LawFit(NamedTuple):
-    """Fit of an orifice's law to a rise, beside the laminar law.
+    """Fit of a rise by an orifice's law instead of the laminar one.
 
-    `regression` of its flow on p_A - p_B [Pa^-0.5], all else eliminated; `log_ratio` of the likelihoods a row, by the
-    residuals that either leaves.
+    `regression` of its flow on p_A - p_B [Pa^-0.5], all else eliminated; `log_ratio`: log likelihood ratio to the
+    laminar law per independent reading, from the residual sums of squares.
     """
 
     regression: float
     log_ratio: float
 
 
-def compare_laws(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[Columns]) -> LawFit | None:
-    """Compare the law of an orifice with the laminar one by what a recording leaves of the healthy ones' balance.
+def compare_laws(
+    judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
+) -> LawFit | None:
+    """Compare the fit of an orifice's law with the laminar one's to the residual of the healthy recordings' balance.
 
-    None where the columns hold no such law, or nothing tells.
+    Return None if the balance has no such term, or the recording has no information on both.
     """
-    if any(ORIFICE not in column.names for column in columns):
+    if any(ORIFICE not in roles.names for roles in columns):
         return None
     reference = np.sum([recording.sums for recording in baseline], axis=0)
-    grams, leads, square = np.zeros((2, 2)), np.zeros(2), 0.0
-    for e, column in enumerate(columns):
-        sums, tests = judged.sums[e], [column.leak, column.names.index(ORIFICE)]
-        residual, nuisance, prior = _left_over(sums, reference[e], column)
-        tied = sums[np.ix_(nuisance, nuisance)] + np.diag(prior)
-        solved = solve(tied, np.column_stack([sums[np.ix_(nuisance, tests)], residual[nuisance]]))
-        grams += sums[np.ix_(tests, tests)] - sums[np.ix_(tests, nuisance)] @ solved[:, :2]
-        leads += residual[tests] - sums[np.ix_(tests, nuisance)] @ solved[:, 2]
-        square += float(residual[-1] - residual[nuisance] @ solved[:, 2])
-    energy = np.diag(grams)
-    if not energy.min() > 0.0 or not grams[0, 1] > 0.0:
+    grams, moments, left_square = np.zeros((2, 2)), np.zeros(2), 0.0
+    for e, roles in enumerate(columns):
+        gram, tests = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]
+        residual, nuisance, prior = _residual_products(gram, reference[e], roles)
+        regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
+        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, tests)], residual[nuisance]]))
+        grams += gram[np.ix_(tests, tests)] - gram[np.ix_(tests, nuisance)] @ solved[:, :2]
+        moments += residual[tests] - gram[np.ix_(tests, nuisance)] @ solved[:, 2]
+        left_square += float(residual[-1] - residual[nuisance] @ solved[:, 2])
+    energies = np.diag(grams)
+    if not energies.min() > 0.0 or not grams[0, 1] > 0.0:
         return None
-    unexplained = np.maximum(square - leads**2 / energy, 1e-9 * abs(square) + TINY)
-    return LawFit(float(grams[0, 1] / energy[0]), float(-0.5 * np.log(unexplained[1] / unexplained[0])))
+    residual_squares = np.maximum(left_square - moments**2 / energies, 1e-9 * abs(left_square) + TINY)
+    return LawFit(float(grams[0, 1] / energies[0]), float(-0.5 * np.log(residual_squares[1] / residual_squares[0])))
 
 
-def _left_over(sums: Array, reference: Array, column: Columns) -> tuple[Array, list[int], Array]:
-    """Compute the residual of a recording under the others' balance, as products with all columns, itself last.
+def compare_with_leak(
+    judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles], rival: str
+) -> float | None:
+    """Compute the log likelihood ratio of a rise described by the column `rival` to one described by the leak.
 
-    Returned with the columns that may differ, and the prior precision of their differences.
+    The ratio is that of one independent reading, from the residual sums of squares. With the rival, the leak may differ
+    as it does between healthy recordings. Return None if the balance has no such column, or the recording has no
+    information on one of both.
     """
-    chosen = [k for k in column.compared if k == column.leak or np.isfinite(column.between[k])]
-    coefficients = np.zeros(len(sums))
-    coefficients[chosen] = -solve(reference[np.ix_(chosen, chosen)], reference[chosen, column.left])
-    nuisance = [k for k in chosen if k != column.leak]
-    size = np.abs(coefficients[nuisance])
+    if any(rival not in roles.names for roles in columns):
+        return None
+    reference = np.sum([recording.sums for recording in baseline], axis=0)
+    residual_squares = []
+    for is_rival in (False, True):
+        energy = moment = left_square = 0.0
+        for e, roles in enumerate(columns):
+            gram, tested = judged.sums[e], roles.names.index(rival) if is_rival else roles.leak
+            residual, nuisance, prior = _residual_products(gram, reference[e], roles, has_leak=is_rival)
+            regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
+            solved = solve(regularised, np.column_stack([gram[nuisance, tested], residual[nuisance]]))
+            energy += float(gram[tested, tested] - gram[tested, nuisance] @ solved[:, 0])
+            moment += float(residual[tested] - gram[tested, nuisance] @ solved[:, 1])
+            left_square += float(residual[-1] - residual[nuisance] @ solved[:, 1])
+        if not energy > 0.0:
+            return None
+        gain = max(moment, 0.0) ** 2 / energy  # oil only leaves
+        residual_squares.append(max(left_square - gain, 1e-9 * abs(left_square) + TINY))
+    return float(-0.5 * np.log(residual_squares[1] / residual_squares[0]))
+
+
+class _Residual(NamedTuple):
+    """Residual of a recording under the coefficients of healthy recordings.
+
+    `products` (m,): with all columns, with itself last; `nuisance`: indices of the c columns whose coefficients may
+    differ between recordings; `prior_precision` (c,) of their differences.
+    """
+
+    products: Array
+    nuisance: list[int]
+    prior_precision: Array
+
+
+def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> _Residual:
+    """Compute the residual of a recording under the coefficients of others, as its products with every column.
+
+    `gram`, `reference` (m, m): of the recording and of the others. Its `compared` coefficients are those of the others;
+    all but the leak may differ from these by a prior (`nuisance`). `has_leak`: the leak may, too, by `between.pump`.
+    """
+    compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
+    coefficients = np.zeros(len(gram))
+    coefficients[compared] = -solve(reference[np.ix_(compared, compared)], reference[compared, roles.left])
+    nuisance = [k for k in compared if has_leak or k != roles.leak]
+    relative_sd = np.where(np.array(nuisance) == roles.leak, INFERENCE.between.pump, roles.between_deviation[nuisance])
     with np.errstate(divide="ignore", over="ignore"):
-        prior = 1.0 / (size * column.between[nuisance]) ** 2
-    coefficients[column.left] = 1.0
-    residual = sums @ coefficients
-    residual[column.left] = coefficients @ residual
-    return residual, nuisance, np.minimum(prior, 1e9 * np.diag(sums)[nuisance])
+        prior = 1.0 / (np.abs(coefficients[nuisance]) * relative_sd) ** 2
+    coefficients[roles.left] = 1.0
+    products = gram @ coefficients
+    products[roles.left] = coefficients @ products  # the residual's sum of squares
+    # a coefficient of zero has an infinite precision
+    return _Residual(products, nuisance, np.minimum(prior, 1e9 * np.diag(gram)[nuisance]))
 
 
-def _rises(sums: Array, reference: Array, columns: Sequence[Columns], widths: Array) -> tuple[Array, Array]:
-    """Return the rise (s,) of the leak's coefficient in one recording's sums (E, m, m) beyond others', and its error.
+def _project_on_leak(
+    gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
+) -> tuple[Array, Array]:
+    """Estimate the rise (s,) of a recording's leak coefficient beyond that of `reference`, and its errors (s,).
 
-    The recording's other coefficients differ from theirs by what is believed of recordings of one machine, over all
-    `widths` (s,).
+    `gram`, `reference` (E, m, m). The other coefficients differ by a normal prior, scaled with each of `widths` (s,),
+    and are eliminated (Schur complement): rise = moment / precision, summed over the equations.
     """
-    precision, vector = np.zeros((2, len(widths)))
-    for e, column in enumerate(columns):
-        residual, nuisance, prior = _left_over(sums[e], reference[e], column)
-        matrix, cross = sums[e][np.ix_(nuisance, nuisance)], sums[e][nuisance, column.leak]
+    precision, moment = np.zeros((2, len(widths)))
+    for e, roles in enumerate(columns):
+        residual, nuisance, prior = _residual_products(gram[e], reference[e], roles)
+        matrix, cross = gram[e][np.ix_(nuisance, nuisance)], gram[e][nuisance, roles.leak]
         right = np.column_stack([cross, residual[nuisance]])
         for s, width in enumerate(widths):
-            tied = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
-            solved = solve(tied, right)
-            precision[s] += float(sums[e][column.leak, column.leak] - cross @ solved[:, 0])
-            vector[s] += float(residual[column.leak] - cross @ solved[:, 1])
-    known = precision > 0.0
-    divisor = np.where(known, precision, 1.0)
-    return np.where(known, vector / divisor, 0.0), np.where(known, divisor**-0.5, 0.0)
+            regularised = matrix + np.diag(np.minimum(prior / width**2, 1e9 * np.diag(matrix)))
+            solved = solve(regularised, right)
+            precision[s] += float(gram[e][roles.leak, roles.leak] - cross @ solved[:, 0])
+            moment[s] += float(residual[roles.leak] - cross @ solved[:, 1])
+    is_known = precision > 0.0
+    divisor = np.where(is_known, precision, 1.0)
+    return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)

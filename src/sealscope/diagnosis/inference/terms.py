@@ -1,15 +1,15 @@
 """The terms of a machine's volume balance, as rows of data.
 
-A balance is linear in what is not known of the machine. For a pump-controlled cylinder
+A balance is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
 
     D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
 
 with the pump's displacement D [m^3/rad], the leakage conductance G [m^3/(s Pa)] and a coefficient c_j for each term;
 f_j and g_j are functions of the recorded channels. A term gives its increment f_j dg_j over each sampling interval, so
-that nothing is differentiated (`weak_form`). Behind a servo valve each chamber has a balance of its own, whose left
-side is what the piston displaces and whose terms are the orifice flows of the valve's edges; G is the same in both.
+that nothing is differentiated (`weak_form`). Behind a servo valve each chamber has a balance of its own: its left side
+is the volume displaced by the piston, its terms are the orifice flows of the valve's edges; G is the same in both.
 
-What is believed of a term is in `priors.toml`: how fast its coefficient may drift, each with unit and source.
+The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the edges).
 """
@@ -17,13 +17,13 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continui
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array
@@ -32,62 +32,48 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: The least absolute pressure that the terms of air are computed for [Pa].
-LEAST_ABSOLUTE: float = priors("inference")["pressure"]["least"]
-#: Half the time over which speed and direction of motion are taken [s]: a few counts of an encoder at slow motion.
+#: Minimum absolute pressure in the terms of air [Pa].
+MIN_ABSOLUTE_PRESSURE: float = INFERENCE.pressure.least
+#: Half the time of the central difference for speed and direction [s]: a few encoder counts at slow motion.
 HALF_DIFFERENCE = 0.025
-#: Time over which speeds are averaged to find rests, and the shortest rest [s].
-AVERAGED, LEAST_REST = (priors("inference")["rest"][name] for name in ("averaged", "least"))
+#: Averaging time of the speeds by which rests are found, and minimum length of a rest [s].
+AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
+
+
+class RestLimits(NamedTuple):
+    """Maximum mean rates at rest: of the `pump`'s volume [m^3/s] and of the `piston` [m/s]."""
+
+    pump: float
+    piston: float
 
 
 class Signals:
-    """Samples of the channels that terms read, with what several terms share.
+    """Samples of the channels that terms read, and signals derived from them, each computed once.
 
-    Parameters
-    ----------
-    channels : mapping of str to array_like of float, shape (n,)
-        Values in SI units.
-    rate : float
-        Sampling rate [Hz].
-    zeros : mapping of str to float
-        What is added to a gauge pressure to make it an absolute one [Pa], by the channel's name.
-    zero : float, optional
-        What p_A - p_B reads too much [Pa].
-    still : tuple of two floats, optional
-        Largest mean rate of the pump's volume [m^3/s] and speed of the piston [m/s] at rest; by default nothing rests.
+    `channels` (n,) in SI units; `to_absolute`: absolute minus gauge pressure [Pa] by the channel's name, by default the
+    atmosphere; `offset`: sensor offset that is subtracted from p_A - p_B [Pa]; `rest_limits`: None to find no rests.
+    `step(name)` returns the increments of a channel, and `mean(name)` the means of neighbouring samples, (n - 1,).
     """
 
     def __init__(
         self,
         channels: Mapping[str, Array],
         rate: float,
-        zeros: Mapping[str, float],
-        zero: float = 0.0,
-        still: tuple[float, float] = (-1.0, -1.0),
+        to_absolute: Mapping[str, float] | None = None,
+        offset: float = 0.0,
+        rest_limits: RestLimits | None = None,
     ) -> None:
-        self._channels, self.rate, self._zeros, self._zero = channels, rate, zeros, zero
-        self._still = still
-        self._stands: Array | None = None
-        self._steps: dict[str, Array] = {}
-        self._means: dict[str, Array] = {}
+        self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
+        self._rest_limits = rest_limits
+        self._rests: Array | None = None
+        self.step = cache(lambda name: np.asarray(np.diff(channels[name])))
+        self.mean = cache(lambda name: _interval_means(channels[name]))
 
     def __contains__(self, name: object) -> bool:
         return name in self._channels
 
     def __getitem__(self, name: str) -> Array:
         return self._channels[name]
-
-    def step(self, name: str) -> Array:
-        """Return the increments of a channel, shape (n - 1,)."""
-        if name not in self._steps:
-            self._steps[name] = _steps(self._channels[name])
-        return self._steps[name]
-
-    def mean(self, name: str) -> Array:
-        """Return the means of neighbouring samples, shape (n - 1,)."""
-        if name not in self._means:
-            self._means[name] = _middle(self._channels[name])
-        return self._means[name]
 
     @property
     def dt(self) -> float:
@@ -101,8 +87,13 @@ class Signals:
 
     @cached_property
     def pressure_difference(self) -> Array:
-        """p_A - p_B [Pa] in the middle of each interval, about its zero."""
-        return self.mean("p_A") - self.mean("p_B") - self._zero
+        """p_A - p_B [Pa] in the middle of each interval, sensor offset removed."""
+        return self.mean("p_A") - self.mean("p_B") - self._offset
+
+    @property
+    def pressure_root(self) -> Array:
+        """sign(dp) sqrt(abs(dp)) of `pressure_difference` dp [Pa^0.5]."""
+        return _signed_root(self.pressure_difference)
 
     @cached_property
     def port_difference(self) -> Array:
@@ -111,537 +102,420 @@ class Signals:
 
     @cached_property
     def absolute(self) -> Mapping[str, Array]:
-        """Absolute pressure [Pa] of each chamber, at least `LEAST_ABSOLUTE`."""
+        """Absolute pressure [Pa] of each chamber at each sample, at least `MIN_ABSOLUTE_PRESSURE`."""
         return {
-            name: np.maximum(self._channels[name] + self._zeros.get(name, P_ATM), LEAST_ABSOLUTE)
+            name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)
             for name in ("p_A", "p_B")
         }
 
     @cached_property
     def speed(self) -> Array:
         """Speed of the piston [m/s] at each sample, by a central difference."""
-        half = max(1, round(HALF_DIFFERENCE * self.rate))
+        half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
         x = self._channels["x"]
-        padded = np.concatenate([x[:1].repeat(half), x, x[-1:].repeat(half)])
-        return np.asarray((padded[2 * half :] - padded[: -2 * half]) * (0.5 * self.rate / half))
-
-    @cached_property
-    def outward(self) -> Array:
-        """1 where the piston moves towards B or stands still, else 0, at each sample."""
-        return (self.speed >= 0.0).astype(float)
+        padded = np.concatenate([x[:1].repeat(half_width), x, x[-1:].repeat(half_width)])
+        return np.asarray((padded[2 * half_width :] - padded[: -2 * half_width]) * (0.5 * self.rate / half_width))
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """1 where p_A > p_B, else 0, at each sample."""
-        return (self._channels["p_A"] > self._channels["p_B"] + self._zero).astype(float)
+        """1 if side A carries the load (p_A > p_B), else 0, at each sample."""
+        return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
-        """Return the increments of x of one direction while one side carries the pressure [m]."""
-        out_A, out, by = self._ways
-        share = (out_A if by_A else out - out_A) if outward else (by - out_A if by_A else 1.0 - out - by + out_A)
-        return np.asarray(share * self.step("x"))
+        """Return the increments of x [m] in one direction of motion while one side has the higher pressure.
+
+        Standstill counts as outward motion.
+        """
+        is_counted = (self._is_outward == outward) & (self.carried_by_A == by_A)
+        return _interval_means(is_counted.astype(float)) * self.step("x")
 
     @cached_property
-    def _ways(self) -> tuple[Array, Array, Array]:
-        """Shares of each interval in which the piston moves outward while A carries, moves outward, and A carries."""
-        return _middle(self.outward * self.carried_by_A), _middle(self.outward), _middle(self.carried_by_A)
+    def _is_outward(self) -> NDArray[np.bool_]:
+        """True if the piston moves towards B or stands still, at each sample."""
+        return np.asarray(self.speed >= 0.0)
 
-    def stands(self, left: Callable[[Signals], Array]) -> Array:
+    def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each interval in which the pump, by its volume, or the piston stands still, else 0."""
-        if self._stands is None:
-            pump = find_rests(left(self), self.rate, self._still[0])
-            self._stands = (pump | find_rests(self.step("x"), self.rate, self._still[1])).astype(float)
-        return self._stands
+        limits = self._rest_limits
+        if limits is None:
+            return np.zeros_like(self.time_step)
+        if self._rests is None:  # computed once: all terms of a balance have the same `pump_volume`
+            pump = find_rests(pump_volume(self), self.rate, limits.pump)
+            self._rests = (pump | find_rests(self.step("x"), self.rate, limits.piston)).astype(float)
+        return self._rests
 
-    def acceleration_step(self) -> Array:
-        """Return the increments of the piston's speed [m/s], by which a delay between channels shows."""
-        return _slope(self.step("x") * self.rate)
 
+def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_]:
+    """Flag the sampling intervals at rest: the mean rate over `AVERAGING_TIME` is below `limit` for `MIN_REST` or more.
 
-def find_rests(increments: Array, rate: float, still: float) -> NDArray[np.bool_]:
-    """Find the intervals of rests: the mean rate over `AVERAGED` seconds stays below `still` for `LEAST_REST`.
-
-    `increments` (n,) of the pump's volume or of x; missing ones are no rest.
+    `increments` (n,) of the pump's volume or of x; missing samples are no rests.
     """
-    size, least = max(1, round(AVERAGED * rate)), max(2, round(LEAST_REST * rate))
-    if still < 0.0 or len(increments) < size + least:
+    window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
+    if len(increments) < window + min_length:
         return np.zeros(len(increments), dtype=bool)
-    known = np.isfinite(increments)
-    volume, missing = (
-        np.concatenate([[0], np.cumsum(values)]) for values in (np.where(known, increments, 0.0), ~known)
+    is_known = np.isfinite(increments)
+    sums, n_missing = (
+        np.concatenate([[0], np.cumsum(values)]) for values in (np.where(is_known, increments, 0.0), ~is_known)
     )
-    below = np.abs(volume[size:] - volume[:-size]) <= still * size / rate
-    below &= missing[size:] == missing[:-size]
-    covered = _spread(below, size)  # every interval of a quiet stretch
-    runs = np.concatenate([[0], np.cumsum(~covered)])
-    whole = runs[least:] == runs[:-least]
-    return _spread(whole, least)
+    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate  # for the window from each sample on
+    is_slow &= n_missing[window:] == n_missing[:-window]
+    n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
+    return _extend_flags(n_moving[min_length:] == n_moving[:-min_length], min_length)
 
 
-def _spread(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Mark the `length` places from each start on, shape (n + length - 1,)."""
-    counts = np.zeros(len(starts) + length, dtype=int)
-    counts[: len(starts)] += starts
-    counts[length:] -= starts
-    return np.cumsum(counts)[:-1] > 0
+def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    """Flag the `length` samples from each flagged start (n,) on, shape (n + length - 1,)."""
+    changes = np.zeros(len(starts) + length, dtype=int)  # of the number of runs that cover a sample
+    changes[: len(starts)] += starts
+    changes[length:] -= starts
+    return np.cumsum(changes)[:-1] > 0
 
 
-def _middle(values: Array) -> Array:
-    middle = values[1:] + values[:-1]
-    middle *= 0.5
-    return middle
+def _interval_means(values: Array) -> Array:
+    """Average neighbouring samples (n,): the values in the middle of each interval, (n - 1,)."""
+    means = values[1:] + values[:-1]
+    means *= 0.5
+    return means
 
 
-def _steps(values: Array) -> Array:
-    return values[1:] - values[:-1]
+def _signed_root(values: Array) -> Array:
+    """Compute the root of the magnitude, with the sign of the value."""
+    return np.asarray(np.sign(values) * np.sqrt(np.abs(values)))
 
 
-def _slope(values: Array) -> Array:
-    """Return half the difference of a value's neighbours, at the ends the whole one to its neighbour."""
-    slope = np.empty_like(values)
-    slope[0], slope[-1] = values[1] - values[0], values[-1] - values[-2]
-    slope[1:-1] = 0.5 * (values[2:] - values[:-2])
-    return slope
+#: Kinds of coefficients: each has priors on its drift and on its differences between recordings.
+Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "pump", "outside", "edge"]
 
 
 class Term(NamedTuple):
-    """A term of a balance: a row of data.
+    """A term of a balance.
 
-    `increments` gives f dg over each sampling interval, shape (n - 1,); `unit` is that of its coefficient; `cause` is
-    what a step of the coefficient means; `nuisance`: the coefficient is unknown in any machine and drifts as `drift`
-    allows (a table of `priors.toml`), else it is zero unless that cause is present; `compared`: or unless recordings,
-    whose duties differ, are compared; `needs`: channels; `driven`: by a "pressure" or by its "root", so that a zero of
-    the sensors acts on the flow.
+    `unit` of the coefficient: m^3 over that of the increments; `increments` computes f dg over each sampling interval,
+    shape (n - 1,); `cause`: meaning of a step of the coefficient; `drift`: the entry of `priors.toml` with the prior on
+    the coefficient, or "" if it is zero unless that cause is present; `needs`: channels; `driver` of the flow: a
+    "pressure" or its "root", so that sensor offsets affect it, or "".
     """
 
     name: str
-    formula: str
     unit: str
     increments: Callable[[Signals], Array]
     cause: Cause
-    drift: str = ""
-    nuisance: bool = True
-    compared: bool = False
+    drift: Coefficient | Literal[""] = ""
     needs: tuple[str, ...] = ()
-    driven: str = ""
+    driver: Literal["", "pressure", "root"] = ""
+
+    @property
+    def nuisance(self) -> bool:
+        """True if the coefficient is unknown within a recording of any machine."""
+        return bool(self.drift) and not self.compared
+
+    @property
+    def compared(self) -> bool:
+        """True if the coefficient is unknown only when recordings with different duties are compared."""
+        return self.drift == "speed"
 
 
 class Equation(NamedTuple):
-    """A balance: what gives the increments of its left side [m^3], and its terms, with those of the leak last.
+    """A balance: function of the increments of its left side [m^3], and its terms, those of the leak last.
 
-    `healthy`: what is believed of a healthy machine's leak (a row of `priors.toml`), where that says more than nothing;
-    `by_command`: no channel gives its flow, so that `balance.commanded` makes a speed of the command; `takes`: 1 where
-    a flow into A is positive on the left, -1 where it is negative.
+    `healthy`: standard deviation of a healthy machine's conductance [m^3/(s Pa)], infinite if unknown; `by_command`: no
+    channel gives the flow, so that `balance.derive_drive_signals` computes a speed from the command; `flow_sign`: 1 if
+    a flow into A is positive on the left side, -1 if negative.
     """
 
     name: str
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
-    healthy: str = ""
+    healthy: float = float("inf")
     by_command: bool = False
-    takes: float = 1.0
+    flow_sign: float = 1.0
 
 
 #: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
-#: Free air in both chambers at once; what single coefficients of its kind do it does.
+#: Free air in both chambers at once, instead of the coefficients of each chamber.
 AIR = "free air"
-#: The pump's own leakage, by the pressures at its ports.
-PUMP = "pump leak"
-#: What passes or is read whatever the pressures are; a zero of the pressures acts through it.
+#: The pump's own leakage, by the pressures at its ports; if a valve cuts it off at rest, in motion only.
+PUMP, TURNING = "pump leak", "pump leak while it turns"
+#: Constant flow or offset of the flow; an offset of the pressures changes it.
 BIAS = "bias"
-#: What the name of a leak to the outside ends with where a check valve makes it up.
+#: Suffix of the name of an external leak that a check valve compensates.
 MADE_UP = ", made up"
-#: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
-CYLINDER = "cylinder"
-LOCKED = "locked"
-#: What remains of a speed loop's state at the first sample, which nothing recorded tells (19 s of the thesis's drive).
-START = "start"
-
-_LEAKS = (
-    Term(
-        LEAK,
-        "(p_A - p_B) dt",
-        "m^3/(s Pa)",
-        lambda s: s.pressure_difference * s.dt,
-        "piston or pump leak",
-        "leak",
-        needs=("p_A", "p_B"),
-        driven="pressure",
-    ),
-    Term(
-        ORIFICE,
-        "sign(p_A - p_B) sqrt(abs(p_A - p_B)) dt",
-        "m^3/(s Pa^0.5)",
-        lambda s: np.sign(s.pressure_difference) * np.sqrt(np.abs(s.pressure_difference)) * s.dt,
-        "piston or pump leak",
-        nuisance=False,
-        needs=("p_A", "p_B"),
-        driven="root",
-    ),
-)
-
-
-def _motion_by_side(outward: bool, by_A: bool) -> Term:
-    way, side = ("out", "in")[not outward], "AB"[not by_A]
-    return Term(
-        f"motion {way}, {side} carries",
-        f"dx, v {'>=' if outward else '<'} 0, p_{side} the larger",
-        "m^2",
-        lambda s: s.directed_step(outward, by_A),
-        "sensor fault",
-        "motion",
-        needs=("x",),
-    )
-
-
-def _of_side(side: str) -> tuple[Term, ...]:
-    name = f"p_{side}"
-    return (
-        Term(
-            f"compliance {side}",
-            f"dp_{side}",
-            "m^3/Pa",
-            lambda s: s.step(name),
-            "air in the oil",
-            "compliance",
-            needs=(name,),
-        ),
-        Term(
-            f"compliance {side} over the stroke",
-            f"x dp_{side}",
-            "m^2/Pa",
-            lambda s: s.mean("x") * s.step(name),
-            "air in the oil",
-            "compliance",
-            needs=(name, "x"),
-        ),
-        Term(
-            f"free air {side}",
-            f"d(1/p_{side})",
-            "m^3 Pa",
-            lambda s: _steps(1.0 / s.absolute[name]),
-            "air in the oil",
-            "air",
-            needs=(name,),
-        ),
-        Term(
-            f"dissolving air {side}",
-            f"d(log p_{side})",
-            "m^3",
-            lambda s: _steps(np.log(s.absolute[name])),
-            "air in the oil",
-            "air",
-            needs=(name,),
-        ),
-    )
-
-
-def _released(rig: Rig, share: Callable[[Signals], Array | float]) -> Term:
-    """Return free air in both chambers at once, each by its volume; `share`: how far side A's balance counts."""
-    from sealscope.physics.cylinder import volumes_at_middle
-
-    cylinder = rig.cylinder
-    middle = dict(zip("AB", volumes_at_middle(cylinder), strict=True))
-    areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
-
-    def released(s: Signals) -> Array:
-        by_A = share(s)
-        volumes = {side: np.maximum(middle[side] + areas[side] * s.mean("x"), 0.1 * middle[side]) for side in "AB"}
-        expands = {side: volumes[side] * _steps(1.0 / s.absolute[f"p_{side}"]) for side in "AB"}
-        return np.asarray(by_A * expands["A"] - (1.0 - by_A) * expands["B"])
-
-    formula = "V_A d(1/p_A) - V_B d(1/p_B)"
-    return Term(AIR, formula, "Pa", released, "air in the oil", nuisance=False, needs=("x", "p_A", "p_B"))
-
-
-def _lost_outside(side: str, share: float = 1.0) -> Term:
-    """Return the external leak of one side; `share`: how far it counts in the balance, and its sign there."""
-    name = f"p_{side}"
-    return Term(
-        f"external leak {side}",
-        f"{'-' if share < 0.0 else ''}max(p_{side}, 0) dt",
-        "m^3/(s Pa)",
-        lambda s: share * np.maximum(s.mean(name), 0.0) * s.dt,
-        "external leak",
-        nuisance=False,
-        needs=(name,),
-        driven="pressure",
-    )
-
-
-def _made_up(side: str) -> Term:
-    """Return the external leak of one side, made up by a check valve on the side of lower pressure.
-
-    While that is the same side, the balance shows nothing. What B loses the pump need not take: it is negative.
-    """
-    name = f"p_{side}"
-
-    def made_up_volume(s: Signals) -> Array:
-        carries = _middle(s.carried_by_A)
-        return np.asarray((carries if side == "A" else carries - 1.0) * np.maximum(s.mean(name), 0.0) * s.dt)
-
-    return Term(
-        f"external leak {side}{MADE_UP}",
-        f"{'-' if side == 'B' else ''}[{name} the larger] max({name}, 0) dt",
-        "m^3/(s Pa)",
-        made_up_volume,
-        "external leak",
-        nuisance=False,
-        needs=("p_A", "p_B"),
-        driven="pressure",
-    )
-
-
 #: A delay between position and flow.
 LAG = "lag"
-_LAG = Term(LAG, "dv", "m^2 s", lambda s: s.acceleration_step(), "sensor fault", "motion", needs=("x",))
-#: What a pump loses the more, the faster it turns: its filling, and slip that no recorded pressure drives.
+#: Loss of the pump that grows with speed: incomplete filling, and slip that no recorded pressure drives.
 SPEED_LOSS = "loss over speed"
+#: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
+CYLINDER, LOCKED = "cylinder", "locked"
+#: Decay of the speed loop's unknown initial state (time constant 19 s for the thesis's drive).
+START = "start"
+#: Columns of leakage and flow offset that are zero unless the pump or the piston stands still (`regimes`).
+RESTS = REST_LEAK, REST_BIAS = "leak at rest", "bias at rest"
+
+_PRESSURES = ("p_A", "p_B")
+
+
+def _conductance_term(
+    name: str,
+    increments: Callable[[Signals], Array],
+    cause: Cause,
+    needs: tuple[str, ...] = _PRESSURES,
+    drift: Coefficient | Literal[""] = "",
+) -> Term:
+    """Make a term whose flow is a conductance times a pressure."""
+    return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
+
+
+_LEAKS = (
+    _conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, "piston or pump leak", drift="leak"),
+    Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, "piston or pump leak", "", _PRESSURES, "root"),
+)
+
+
+def _motion_term(outward: bool, by_A: bool) -> Term:
+    """Make the term of the motion in one direction while one side has the higher pressure: dx."""
+    name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
+    return Term(name, "m^2", lambda s: s.directed_step(outward, by_A), "sensor fault", "motion", ("x",))
+
+
+def _chamber_terms(side: str) -> tuple[Term, ...]:
+    """Make the terms of one chamber's compliance, dp and x dp, and of its free air, d(1/p), and dissolved, d ln p."""
+    p, name = f"p_{side}", f"compliance {side}"
+    cause: Cause = "air in the oil"
+    return (
+        Term(name, "m^3/Pa", lambda s: s.step(p), cause, "compliance", (p,)),
+        Term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), cause, "compliance", (p, "x")),
+        Term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute[p]), cause, "air", (p,)),
+        Term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute[p])), cause, "air", (p,)),
+    )
+
+
+def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
+    """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B), w = `weight_A`."""
+    from sealscope.physics.cylinder import mid_stroke_volumes
+
+    cylinder = rig.cylinder
+    mid_volumes = dict(zip("AB", mid_stroke_volumes(cylinder), strict=True))
+    areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
+
+    def expansion(s: Signals, side: str) -> Array:
+        """Compute V d(1/p) of one chamber."""
+        # at least a tenth of that at mid-stroke: x of an unknown origin may exceed the stroke
+        volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
+        return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
+
+    def weighted_expansion(s: Signals) -> Array:
+        weight = weight_A(s)
+        return np.asarray(weight * expansion(s, "A") - (1.0 - weight) * expansion(s, "B"))
+
+    return Term(AIR, "Pa", weighted_expansion, "air in the oil", needs=("x", *_PRESSURES))
+
+
+def _external_leak_term(side: str, weight: float = 1.0) -> Term:
+    """Make the term of one side's external leak: max(p, 0) dt times its signed `weight` in the balance."""
+    p = f"p_{side}"
+
+    def lost_volume(s: Signals) -> Array:
+        return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
+
+    return _conductance_term(f"external leak {side}", lost_volume, "external leak", (p,))
+
+
+def _compensated_leak_term(side: str) -> Term:
+    """Make the term of one side's external leak in a circuit whose check valve refills the side of lower pressure.
+
+    The leak thus changes the balance only while its side has the higher pressure. The term of B is negative.
+    """
+
+    def lost_volume(s: Signals) -> Array:
+        weight = _interval_means(s.carried_by_A) - float(side == "B")
+        return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
+
+    return _conductance_term(f"external leak {side}{MADE_UP}", lost_volume, "external leak")
+
+
+_START = Term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, "sensor fault", "bias", (START,))
+_BIAS = Term(BIAS, "m^3/s", lambda s: s.time_step, "sensor fault", "bias")
 _SPEED_LOSS = Term(
-    SPEED_LOSS,
-    "abs(v) dx",
-    "m s",
-    lambda s: _middle(np.abs(s.speed)) * s.step("x"),
-    "sensor fault",
-    "speed",
-    nuisance=False,
-    compared=True,
-    needs=("x",),
+    SPEED_LOSS, "m s", lambda s: _interval_means(np.abs(s.speed)) * s.step("x"), "sensor fault", "speed", ("x",)
 )
-_BIAS = Term(BIAS, "dt", "m^3/s", lambda s: s.time_step, "sensor fault", "bias")
-_PUMP = Term(
-    PUMP,
-    "(p_1 - p_2) dt",
-    "m^3/(s Pa)",
-    lambda s: s.port_difference * s.dt,
-    "pump leak",
-    nuisance=False,
-    needs=("p_1", "p_2"),
-    driven="pressure",
-)
-#: With it the leak's coefficient is that of pump and piston together, and what the lines add is the pump's alone;
-#: without lines it is zero.
-_LINES = Term(
+_PUMP = _conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", ("p_1", "p_2"))
+#: With it the leak's coefficient is that of pump and piston; the lines' pressure drop acts on the pump only.
+_LINES = _conductance_term(
     "pump leak by the lines",
-    "((p_1 - p_2) - (p_A - p_B)) dt",
-    "m^3/(s Pa)",
     lambda s: (s.port_difference - s.pressure_difference) * s.dt,
     "pump leak",
+    ("p_1", "p_2", *_PRESSURES),
     "pump",
-    needs=("p_1", "p_2", "p_A", "p_B"),
-    driven="pressure",
 )
-
-_START = Term(
-    "start of the drive",
-    "exp(-t/tau) dt",
-    "m^3/s",
-    lambda s: s.mean(START) * s.dt,
-    "sensor fault",
-    "bias",
-    needs=(START,),
-)
-
 _CYLINDER = (
-    *(_motion_by_side(outward, by_A) for outward in (True, False) for by_A in (True, False)),
-    *_of_side("A"),
-    *_of_side("B"),
-    _LAG,
+    *(_motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *_chamber_terms("A"),
+    *_chamber_terms("B"),
+    Term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), "sensor fault", "motion", ("x",)),  # dv
     _SPEED_LOSS,
     _BIAS,
     _LINES,
     _PUMP,
-    _lost_outside("A"),
-    _lost_outside("B", -1.0),
-    _made_up("A"),
-    _made_up("B"),
+    _external_leak_term("A"),
+    _external_leak_term("B", -1.0),
+    _compensated_leak_term("A"),
+    _compensated_leak_term("B"),
     *_LEAKS,
 )
 
 
-class _Way(NamedTuple):
-    """One edge of the valve at a chamber: what it connects, and the sign of the command that opens it."""
+def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float) -> tuple[Term, ...]:
+    """Make the terms of a valve's metering edge, open while `sign` u > 0: gain, delay by the spool's lag, overlap."""
 
-    name: str
-    drop: tuple[str, str]
-    opens: float
+    def unit_flow(s: Signals) -> Array:
+        return _signed_root(s.mean(upstream) - s.mean(downstream))
 
-    @classmethod
-    def at_chamber(cls, side: str, rising: bool) -> _Way:
-        """Return the edge from the supply into a chamber (`rising`), or from the chamber to the return."""
-        opens = 1.0 if (side == "A") == rising else -1.0
-        return cls(
-            *((f"P to {side}", ("p_1", f"p_{side}")) if rising else (f"{side} to T", (f"p_{side}", "p_2"))), opens
-        )
+    def proportional_flow(s: Signals) -> Array:
+        return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
 
-    def root(self, s: Signals) -> Array:
-        """Return the root of the pressure drop with its sign [Pa^0.5]."""
-        drop = s.mean(self.drop[0]) - s.mean(self.drop[1])
-        return np.asarray(np.sign(drop) * np.sqrt(np.abs(drop)))
+    def overlap_flow(s: Signals) -> Array:
+        return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
-    def term(self, name: str, opening: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        """Return a term of this edge's flow."""
-        formula = opening.replace("u", "u" if self.opens > 0 else "-u") + f" sqrt({self.drop[0]} - {self.drop[1]}) dt"
-        return Term(f"{name} {self.name}", formula, unit, increments, "sensor fault", "edge", needs=("u", *self.drop))
+    def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
+        return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
+
+    return (
+        make_term("edge", "m^3/(s V Pa^0.5)", proportional_flow),
+        make_term("late edge", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),
+        make_term("overlap", "m^3/(s Pa^0.5)", overlap_flow),
+    )
 
 
-def _edges(side: str) -> tuple[Term, ...]:
-    """Return the flow of a chamber's edges over their gain; late, by the spool's lag; by overlap, underlap and wear."""
-    terms = []
-    for way in (_Way.at_chamber(side, True), _Way.at_chamber(side, False)):
+def _chamber_equation(side: str, rig: Rig) -> Equation:
+    """Make the balance of one chamber behind a valve: the piston displaces the flow of its edges.
 
-        def gain(s: Signals, way: _Way = way) -> Array:
-            return np.asarray(np.maximum(way.opens * s.mean("u"), 0.0) * way.root(s) * s.dt)
-
-        def late(s: Signals, gain: Callable[[Signals], Array] = gain) -> Array:
-            return _slope(gain(s))
-
-        def overlap(s: Signals, way: _Way = way) -> Array:
-            return np.asarray((way.opens * s.mean("u") > 0.0) * way.root(s) * s.dt)
-
-        terms += [
-            way.term("edge", "max(u, 0)", "m^3/(s V Pa^0.5)", gain),
-            way.term("late edge", "d max(u, 0)", "m^3/(V Pa^0.5)", late),
-            way.term("overlap", "[u > 0]", "m^3/(s Pa^0.5)", overlap),
-        ]
-    return tuple(terms)
-
-
-def _chamber(side: str, rig: Rig) -> Equation:
-    """Return the balance of one chamber behind a valve: what the piston displaces is what its edges pass.
-
-    An overlap takes from the flow in either direction what a leak under friction's pressure takes: only what is known
-    of a healthy piston tells them apart, and so friction that changes from a leak.
+    An overlap of the edges reduces the flow in both directions like a leak driven by the friction's pressure; only the
+    prior on a healthy piston separates the two, and a change of friction from a leak.
     """
-    area = rig.cylinder.A_A if side == "A" else rig.cylinder.A_B
-    lost = (_lost_outside("A", float(side == "A")), _lost_outside("B", -float(side == "B")))
-    terms = (*_edges(side), *_of_side(side), _BIAS, _released(rig, lambda s: float(side == "A")), *lost, *_LEAKS)
-    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, "piston", takes=-1.0)
+    area, is_A = (rig.cylinder.A_A, True) if side == "A" else (rig.cylinder.A_B, False)
+    sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
+    terms = (
+        *_metering_edge_terms(f"P to {side}", "p_1", f"p_{side}", sign),
+        *_metering_edge_terms(f"{side} to T", f"p_{side}", "p_2", -sign),
+        *_chamber_terms(side),
+        _BIAS,
+        _free_air_term(rig, lambda s: float(is_A)),
+        _external_leak_term("A", float(is_A)),
+        _external_leak_term("B", -float(not is_A)),
+        *_LEAKS,
+    )
+    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0)
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
-    """Return the balances of a machine that its recorded channels allow, empty where they allow none.
+    """Return the balances of a machine that its recorded channels allow; empty if there is none.
 
-    Behind a servo valve that of each chamber; else that of the cylinder, with the pump's angle, its speed, a flow meter
-    or, for want of these, the command as the source of its flow.
+    Behind a servo valve there is one for each chamber; else there is one of the cylinder, with the flow from the pump's
+    angle, its speed, a flow meter or, without these, the command.
     """
-    if rig.valve.spool == "present" and {"x", "u", "p_1", "p_2"} <= channels:
-        sides = [side for side in "AB" if f"p_{side}" in channels]
-        balances = [_chamber(side, rig) for side in sides]
-        return tuple(_with_channels(balance, channels) for balance in balances) if len(sides) == 2 else ()
-    left = pump_volume(rig, channels)
-    if left is None or not {"x", "p_A", "p_B"} <= channels:
+    if rig.circuit.valve_controlled and {"x", "u", "p_1", "p_2"} <= channels:
+        if not channels.issuperset(_PRESSURES):
+            return ()
+        return tuple(_select_recorded_terms(_chamber_equation(side, rig), channels) for side in "AB")
+    left, source = pump_volume(rig, channels), flow_source(channels)
+    if left is None or not {"x", *_PRESSURES} <= channels:
         return ()
-    by_command = flow_source(channels) == "u"
-    # an angle has no zero of a speed: what is lost whatever the pressures are is lost to the outside
-    terms = [
-        term._replace(cause="external leak", drift="outside") if term.name == BIAS and "theta" in channels else term
-        for term in ((_START, *_CYLINDER) if by_command else _CYLINDER)
-    ]
-    if flow_source(channels) == "q_pump":  # a meter reads what the pump's filling leaves
+    # an angle has no offset of speed, so that a constant flow is external leakage, not a sensor error
+    bias = _BIAS._replace(cause="external leak", drift="outside") if "theta" in channels else _BIAS
+    terms = [bias if term is _BIAS else term for term in ((_START, *_CYLINDER) if source == "u" else _CYLINDER)]
+    if source == "q_pump":  # a meter is downstream of the filling loss
         terms.remove(_SPEED_LOSS)
-    one_side = rig.cylinder.single_rod
-    terms.insert(-len(_LEAKS), _released(rig, lambda s: _middle(s.carried_by_A) if one_side else 0.5))
-    balance = Equation(CYLINDER, left, tuple(terms), by_command=by_command)
-    return (_with_channels(balance, channels | {START}),)
+    single_rod = rig.cylinder.single_rod
+    air = _free_air_term(rig, lambda s: _interval_means(s.carried_by_A) if single_rod else 0.5)
+    balance = _insert_before_leaks(Equation(CYLINDER, left, tuple(terms), by_command=source == "u"), air)
+    return (_select_recorded_terms(balance, channels | {START}),)  # START is derived, not recorded
 
 
-_STORED = tuple(
-    term for side in "AB" for term in _of_side(side) if term.drift == "compliance" and "x" not in term.needs
+#: Terms of a balance without a piston in motion: the chambers' compliances, external leaks, and the leak.
+_STANDSTILL = (
+    *(_chamber_terms(side)[0] for side in "AB"),
+    *(_external_leak_term("A"), _external_leak_term("B", -1.0)),
+    *_LEAKS,
 )
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the balance of a pump's delivery while the piston displaces nothing; None if no channel gives it.
 
-    Over whole cycles or at standstill: neither motion nor position is in it. A zero of the flow is not told from
-    leakage under a steady load, and is taken for none.
+    It is used over whole cycles or at standstill, so that motion and position do not enter. An offset of the flow
+    cannot be separated from leakage under a steady load, and is assumed to be zero.
     """
     left = pump_volume(rig, channels)
-    if rig.valve.spool == "present" or left is None or not {"p_A", "p_B"} <= channels:
+    if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(_PRESSURES):
         return None
-    return Equation("circulation", left, (_START, *_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
+    return Equation("circulation", left, (_START, *_STANDSTILL))
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of a load that shut valves hold: what the loaded side loses, the piston gives way by.
+    """Return the balance of a load held by shut valves: the piston moves by the leakage of the loaded side.
 
-    Whether seal, valve or line loses it, the channels do not tell; a command that stands still tells that they are
-    shut. x grows as A fills. None for a pump-controlled machine, or where position, command or a pressure is missing.
+    The channels do not separate leaks of seal, valve and line. A constant command means shut valves; x grows as A
+    fills. None for a pump-controlled machine, or if position, command or a pressure is missing.
     """
-    if rig.valve.spool != "present" or not {"x", "u", "p_A", "p_B"} <= channels:
+    if not rig.circuit.holds_load or not {"x", "u", *_PRESSURES} <= channels:
         return None
 
-    def gives_way(s: Signals) -> Array:
+    def displaced_volume(s: Signals) -> Array:
         area = rig.cylinder.A_A if np.nanmean(s.pressure_difference) > 0.0 else rig.cylinder.A_B
         return -area * s.step("x")
 
-    return Equation(LOCKED, gives_way, (*_STORED, _lost_outside("A"), _lost_outside("B", -1.0), *_LEAKS))
+    return Equation(LOCKED, displaced_volume, _STANDSTILL)
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return the function for the increments of the pump's delivered volume [m^3]; None if no channel gives them.
+    """Return the function of the increments of the pump's delivered volume [m^3]; None if no channel gives them.
 
-    By its angle, its speed, a flow meter, or the speed that the drive makes of the command. A meter's scale for each
-    direction is in the areas of that direction.
+    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command. A scale
+    error of a flow meter in either direction changes the fitted area in that direction.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
         return lambda s: displacement * s.step("theta")
     if source == "q_pump":
         return lambda s: s.mean("q_pump") * s.dt
-    if source == "omega" or (source == "u" and rig.valve.spool != "present"):
+    if source == "omega" or (source == "u" and rig.circuit.pump_feeds_chambers):
         return lambda s: displacement * s.mean("omega") * s.dt
     return None
 
 
-#: Columns that count at rest, while the pump or the piston stands still: leakage and zero (`regimes`).
-REST_LEAK, REST_BIAS = "leak at rest", "bias at rest"
-RESTS = (REST_LEAK, REST_BIAS)
-#: What passes the pump alone, where a valve cuts it off at rest.
-TURNING = "pump leak while it turns"
-
-
 def with_rests(equation: Equation) -> Equation:
-    """Add to a pump's balance the columns that count at rest, before those of the leak."""
+    """Add the columns of leakage and flow offset at rest to a pump's balance, before those of the leak."""
     left = equation.left
-
-    def term(name: str, formula: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        return Term(name, f"[rest] {formula}", unit, increments, "pump leak", nuisance=False, driven="pressure")
-
-    rests = (
-        term(REST_LEAK, "(p_A - p_B) dt", "m^3/(s Pa)", lambda s: s.stands(left) * s.pressure_difference * s.dt),
-        term(REST_BIAS, "dt", "m^3/s", lambda s: s.stands(left) * s.dt),
+    return _insert_before_leaks(
+        equation,
+        _conductance_term(REST_LEAK, lambda s: s.at_rest(left) * s.pressure_difference * s.dt, "pump leak", ()),
+        Term(REST_BIAS, "m^3/s", lambda s: s.at_rest(left) * s.dt, "pump leak", driver="pressure"),
     )
-    return equation._replace(terms=_before_leaks(equation, rests))
 
 
 def shut_at_rest(equation: Equation) -> Equation:
-    """Return a pump's balance where a valve cuts the pump off at rest: its leakage and zero count in motion."""
+    """Return a pump's balance for a valve that shuts at rest: pump leakage and offset count in motion only."""
     left = equation.left
-    pump = Term(
-        TURNING,
-        "[moves] (p_A - p_B) dt",
-        "m^3/(s Pa)",
-        lambda s: (1.0 - s.stands(left)) * s.pressure_difference * s.dt,
-        "pump leak",
-        "pump",
-        needs=("p_A", "p_B"),
-        driven="pressure",
+
+    def leaked_volume(s: Signals) -> Array:
+        return (1.0 - s.at_rest(left)) * s.pressure_difference * s.dt
+
+    shut = _insert_before_leaks(equation, _conductance_term(TURNING, leaked_volume, "pump leak", drift="pump"))
+    return shut._replace(
+        terms=tuple(
+            term._replace(increments=lambda s: (1.0 - s.at_rest(left)) * s.dt) if term.name == BIAS else term
+            for term in shut.terms
+        )
     )
-    terms = (
-        term._replace(formula="[moves] dt", increments=lambda s: (1.0 - s.stands(left)) * s.dt)
-        if term.name == BIAS
-        else term
-        for term in _before_leaks(equation, (pump,))
-    )
-    return equation._replace(terms=tuple(terms))
 
 
-def _before_leaks(equation: Equation, terms: tuple[Term, ...]) -> tuple[Term, ...]:
-    return (*equation.terms[: -len(_LEAKS)], *terms, *equation.terms[-len(_LEAKS) :])
+def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
+    """Insert terms before those of the leak, which are the last."""
+    first_leak = len(equation.terms) - len(_LEAKS)
+    return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
 
 
-def _with_channels(equation: Equation, channels: frozenset[str]) -> Equation:
+def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:
+    """Drop the terms whose channels are not recorded."""
     return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))

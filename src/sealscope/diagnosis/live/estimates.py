@@ -1,4 +1,4 @@
-"""What a watch gives and compares with: an estimate of every block, the leak that its tests show, and the baseline.
+"""Estimates of a watch: of every block, of a leak, and of the healthy machine that they are compared with.
 
 The baseline is learned over stated hours of healthy running, then frozen, with a version.
 """
@@ -8,22 +8,31 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.live.sequential import StepEstimate
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.onset import Interval as Onset
+from sealscope.diagnosis.inference.scatter import Rise
+from sealscope.diagnosis.live.rise import LEVEL, LiveRise
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.recording import Array
 
 Interval = tuple[float, float]
 Duty = tuple[float, float]
+#: Blocks per mean that is compared with the baseline.
+GROUP: int = LIVE.watch.group
 
 
 @dataclass(frozen=True)
 class BlockEstimate:
     """Estimate of one block.
 
-    `number`: blocks so far, with this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it is not
-    judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`: beyond
-    that of the healthy machine, each with a 95 % interval, in which the oil may have warmed [L/min], None where it is
-    not known.
+    `number`: blocks so far, including this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it
+    is not judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`:
+    its rise over the healthy machine [L/min], each with a 95 % interval that allows for warmer oil, or None if unknown.
     """
 
     number: int
@@ -42,12 +51,12 @@ class BlockEstimate:
 
 @dataclass(frozen=True)
 class WatchedLeak:
-    """A leak that the tests show, until `dismiss` or `relearn` is called.
+    """A leak that a test has shown, until `dismiss` or `relearn` is called.
 
-    `raised_s`: clock when it was first shown, `onset_s`: since when it leaks [s], `leak_lpm`: its size when it was
-    shown [L/min], both with 95 % intervals; `conductance_before`, `conductance_before_sd`: that before the onset and
-    its deviation [m^3/(s Pa)]; `test`, `cause`, `reason`: which test shows it, where the oil goes, and why, in one
-    line; `score`, `threshold`: of the test's statistic.
+    `raised_s`: clock of the alarm; `onset_s`: begin of the leak [s], `leak_lpm`: its size at the alarm [L/min], both
+    with 95 % intervals; `conductance_before`: conductance before the onset, `rise`: its rise, with the standard
+    deviation `rise_sd` [m^3/(s Pa)], under the mean `pressure` difference [Pa]; `test`: "step" or "level"; `cause`:
+    path of the oil; `reason`: one line; `score`, `threshold`: of the test (`rise.LiveRise`).
     """
 
     raised_s: float
@@ -56,34 +65,39 @@ class WatchedLeak:
     leak_lpm: float | None
     leak_interval_lpm: Interval | None
     conductance_before: float
-    conductance_before_sd: float
+    rise: float
+    rise_sd: float
+    pressure: float
     test: str
-    cause: str
+    cause: Cause
     reason: str
     score: float
     threshold: float
 
     @property
+    def estimate(self) -> LiveRise:
+        """The rise with its test."""
+        onset = Onset(self.onset_s, *self.onset_interval_s)
+        return LiveRise(self.test, self.score, onset, self.rise, self.rise_sd)
+
+    @property
+    def allowed(self) -> float:
+        """False-alarm probability of the test."""
+        return LiveRise(self.test, self.threshold).chance
+
+    @property
     def rarity(self) -> float:
-        """Share of the stated false-alarm rate at which a healthy machine shows such a score, from 1e-9 to 1.
-
-        For a level by the normal tail; for a step half the score is the logarithm of an e-value (`sequential`).
-        """
-        from scipy.special import log_ndtr
-
-        if self.test == "level":
-            exponent = float(log_ndtr(-self.score) - log_ndtr(-self.threshold))
-        else:
-            exponent = 0.5 * (self.threshold - self.score)
+        """Rate of such scores in a healthy machine, as a fraction of the stated false-alarm rate, from 1e-9 to 1."""
+        exponent = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(exponent, math.log(1e-9))))
 
 
 @dataclass(frozen=True)
 class HealthyLevel:
-    """Leakage conductance of a machine in its healthy recordings, which a watch begins with.
+    """Leakage conductance of a healthy machine in `count` recordings, or means of successive blocks.
 
-    `level`, `low`, `high`: mean, least and largest of the recordings', `deviation` of one of them [m^3/(s Pa)];
-    `known_s`: when the last of them was made [s since 1970].
+    `level`, `low`, `high`, `deviation`: mean, minimum, maximum and standard deviation of these [m^3/(s Pa)]; `known_s`:
+    clock up to which it is known [s], of recordings the start of the last one.
     """
 
     level: float
@@ -91,91 +105,100 @@ class HealthyLevel:
     high: float
     deviation: float
     known_s: float
+    count: int
 
 
 @dataclass(frozen=True)
-class WatchBaseline:
+class WatchBaseline(HealthyLevel):
     """A healthy machine, as it was while the baseline was learned.
 
-    `version`: 1 for the first, one more after each repair; `learned_s`: clock when it was complete [s]; `hours` of
-    operation that it rests on; `level`, `low`, `high`: conductance of pump and piston, its mean, and least and largest
-    mean of successive blocks [m^3/(s Pa)]; `lpm`: the mean as a flow under the pressure difference learned with
-    [L/min], None where that cannot be stated; `duty_low`, `duty_high`: least and largest logarithm of mean pressure
-    difference [Pa] and of rms flow of the pump [m^3/s].
+    `version`: 1 for the first, one more after each repair; `hours` of operation; `lpm`: `level` as a flow at the mean
+    pressure difference [L/min], None if it cannot be stated; `duty_low`, `duty_high`: minima and maxima of the
+    logarithms of mean pressure difference [Pa] and mean flow of the pump [m^3/s].
     """
 
     version: int
-    learned_s: float
     hours: float
-    level: float
-    low: float
-    high: float
     lpm: float | None
     duty_low: Duty
     duty_high: Duty
 
-    def rise(self, now: float, g: float, deviation: float, probability: float) -> StepEstimate | None:
-        """Estimate the rise of a mean conductance that warm oil cannot explain; None where there is none.
 
-        The ceiling is the least conductance of the baseline with the warmest oil.
+def find_level_rise(
+    healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
+) -> LiveRise | None:
+    """Estimate the rise of a mean conductance over a healthy level, or return None if none is shown.
 
-        `deviation`: of `g`; `probability`: of a look at a healthy machine as warm as that.
-        """
-        return estimate_rise(self, "baseline", (now, self.learned_s, now), g, deviation, probability)
-
-
-def estimate_rise(
-    healthy: HealthyLevel | WatchBaseline,
-    name: str,
-    onset: tuple[float, float, float],
-    g: float,
-    deviation: float,
-    probability: float,
-) -> StepEstimate | None:
-    """Estimate the rise of a mean conductance over a healthy level called `name`, as `WatchBaseline.rise` does.
-
-    `onset`: since when, and its interval [s], where there is a rise.
+    Two tests must show it at the false-alarm `probability`: against the least healthy mean with the warmest oil, and
+    against the mean of the healthy means by their scatter (Student's t, B. L. Welch's degrees of freedom). `g`: the
+    mean, with its standard `deviation`; `onset`: of the rise, if there is one.
     """
-    from scipy.special import ndtri
+    from scipy.special import ndtr, ndtri
 
-    warmest = priors("inference")["oil"]["warmest"]
-    ceiling = warmest * max(healthy.low, 0.0)
-    score, threshold = (g - ceiling) / deviation, -float(ndtri(probability))
-    if score <= threshold:
+    if healthy.count < 2:
         return None
-    reason = (
-        f"the leakage conductance is {g:.3g} m^3/(s Pa), over {warmest:g} times the least of the {name}: more than the "
-        f"warmest oil makes of it (score {score:.1f}, threshold {threshold:.1f})"
-    )
-    # what is healthy may be anywhere from the least to the ceiling
-    spread = max(healthy.level - healthy.low, ceiling - healthy.level, 0.0) / WITHIN_95
+    max_healthy = INFERENCE.oil.warmest * max(healthy.low, 0.0)
+    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)
+    variance = deviation**2 + scatter
+    degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
+    rise = Rise(g - healthy.level, math.sqrt(variance), min(degrees_of_freedom, 1e9))  # beyond it Student's t is normal
+    chance = max(float(ndtr((max_healthy - g) / deviation)), rise.chance)
+    if chance >= probability:
+        return None
+    # the healthy conductance now may be anywhere from the least healthy mean to the largest
+    healthy_sd = max(healthy.level - healthy.low, max_healthy - healthy.level, 0.0) / WITHIN_95
     size = g - max(healthy.level, 0.0)
-    return StepEstimate(score, onset, size, math.hypot(deviation, spread), "level", threshold, reason)
+    score = -float(ndtri(max(chance, 1e-300)))  # finite for a chance of 0
+    return LiveRise(LEVEL, score, onset, size, math.hypot(deviation, healthy_sd))
 
 
-def within(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether a duty lies between two others, within a margin; a leak may take more of the pressure."""
-    believed = priors("live")["watch"]
-    margin = believed["margin"]
-    below = (low[0] - believed["damped"], low[1] - margin)
-    return all(least <= value <= most + margin for value, least, most in zip(duty, below, high, strict=True))
+def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
+    """Return the conductance before a leak, with the range that the oil's temperature may give it by the clock `t` [s].
+
+    The range grows from the onset on, for `shift` hours, to that of the coldest and the warmest oil.
+    """
+    oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
+    max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
+    low, high = before / max_ratio, max(before, 0.0) * max_ratio
+    return HealthyLevel(before, low, high, deviation=leak.rise_sd, known_s=leak.onset_s, count=1)
+
+
+def mean_flow(flows: Array, errors: Array) -> Flow:
+    """Average the flows of blocks [L/min]; the standard error covers their own standard `errors` and their scatter."""
+    count = len(flows)
+    scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
+    return Flow(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))
+
+
+def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
+    """Test whether a duty is in the range `low` to `high` and a margin, larger below, as a leak lowers the pressure."""
+    margin = LIVE.watch.margin
+    min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)
+    return all(lower <= value <= upper + margin for value, lower, upper in zip(duty, min_duty, high, strict=True))
 
 
 @dataclass
 class BaselineLearning:
-    """Sums of the baseline during learning; None where no block gave a value yet."""
+    """Running sums from which the baseline is computed.
+
+    Of all `blocks`: `total` conductance, `flow` per unit of it, range of the duty. Of `count` means of `GROUP` blocks:
+    `mean`, sum of `squares` about it, `low`, `high`. `group`: conductances that await their mean.
+    """
 
     blocks: int = 0
     total: float = 0.0
     flow: float = 0.0
-    low: float | None = None
-    high: float | None = None
     duty_low: Duty | None = None
     duty_high: Duty | None = None
     group: list[float] = field(default_factory=list)
+    count: int = 0
+    mean: float = 0.0
+    squares: float = 0.0
+    low: float | None = None
+    high: float | None = None
 
-    def add(self, g: float, flow: float, duty: Duty, group: int) -> None:
-        """Add a block's conductance, flow of a unit of it [L/min] and duty; means are of `group` blocks."""
+    def add(self, g: float, flow: float, duty: Duty) -> None:
+        """Add a block: its conductance `g` [m^3/(s Pa)], `flow` per unit of it [L/min], and duty."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -183,16 +206,24 @@ class BaselineLearning:
         self.duty_low = min(low[0], duty[0]), min(low[1], duty[1])
         self.duty_high = max(high[0], duty[0]), max(high[1], duty[1])
         self.group.append(g)
-        if len(self.group) == group:
-            mean = sum(self.group) / group
+        if len(self.group) == GROUP:
+            mean, self.group = sum(self.group) / GROUP, []
             self.low = mean if self.low is None else min(self.low, mean)
-            self.high, self.group = mean if self.high is None else max(self.high, mean), []
+            self.high = mean if self.high is None else max(self.high, mean)
+            # Welford's recursion of mean and sum of squared deviations
+            self.count, difference = self.count + 1, mean - self.mean
+            self.mean += difference / self.count
+            self.squares += difference * (mean - self.mean)
 
-    def frozen(self, version: int, end: float, hours: float, litres: bool) -> WatchBaseline:
-        """Return the baseline of one block or more."""
-        assert self.duty_low is not None and self.duty_high is not None
+    def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
+        """Compute the baseline, learned until `end` [s] in `hours`, from the sums over at least `GROUP` blocks.
+
+        `states_lpm`: state its level as a flow [L/min], too.
+        """
+        assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
-        low = min(self.group) if self.low is None else self.low  # shorter than one group
-        high = max(self.group) if self.high is None else self.high
-        lpm = level * self.flow / self.blocks if litres else None
-        return WatchBaseline(version, end, hours, level, low, high, lpm, self.duty_low, self.duty_high)
+        lpm = level * self.flow / self.blocks if states_lpm else None
+        deviation = math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
+        period = {"version": version, "hours": hours, "lpm": lpm, "known_s": end}
+        duty = {"duty_low": self.duty_low, "duty_high": self.duty_high}
+        return WatchBaseline(level, self.low, self.high, deviation, count=self.count, **period, **duty)  # type: ignore[arg-type]

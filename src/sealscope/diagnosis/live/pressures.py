@@ -1,183 +1,241 @@
-"""An actuator watched by both chamber pressures and the command, without a position.
+"""Watch an actuator by both chamber pressures and the command, without a position.
 
 The response of p_A - p_B to the command is estimated along with the machine (`diagnosis.inference.pressures.response`),
-block by block, so that friction, stiffness and gain that change as the oil warms are not taken for a leak. Changes of
-the conductance are stated, levels are not. After a pause, or where it has lost the machine, nothing before is compared
-with what comes after.
+block by block, so that changes of friction, stiffness and gain as the oil warms are not taken for a leak. Changes of
+the conductance are stated, levels are not. Blocks are not compared across a pause, or after the fit was lost.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.pressures.evidence import PRIORS, flow_scale, states_flow, unusable
-from sealscope.diagnosis.inference.pressures.response import LAWS, Follower, G, Machine, priors_of
-from sealscope.diagnosis.live.balance import BlockConductance, NotJudged, Shown
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.pressures.detector import RESPONSE, score_response_steps
+from sealscope.diagnosis.inference.pressures.fit import Block, Joint
+from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error, states_flow
+from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS, G, Machine, response_priors
+from sealscope.diagnosis.inference.pressures.response import Follower, parameter_information
+from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
+from sealscope.diagnosis.live.balance import BlockConductance, BlockResult, NotJudged
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.live.signals import MIN_BLOCKS, SignalWindow
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.diagnosis.priors.pressures import PRESSURE
+from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
-from sealscope.recordings.motion import does_not_move, find_holds, moves
+from sealscope.recordings.motion import describe_hold, find_holds, is_moving
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.storage.plain_state import part_of, recall, saved
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.storage.plain_state import require_part, restore_attributes, save_attributes
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_PRIORS = priors("live")["response"]
-_SETTLING, _RESUMING, _PAUSE = _PRIORS["settling"], _PRIORS["resuming"], priors("live")["watch"]["pause"]
-_SLOWEST, _READ = PRIORS["blocks"]["slowest"], ("p_A", "p_B", "u")
-#: Rows of what is kept that are pressures, after the times.
+_PRIORS = LIVE.response
+#: Blocks until the simulated states have settled, at first and after a short gap; longest such gap [s].
+_SETTLING, _RESUMING, _PAUSE = _PRIORS.settling, _PRIORS.resuming, LIVE.watch.pause
+#: Lowest sampling rate that is judged [Hz]; channels that are read.
+_MIN_RATE, _READ = PRESSURE.blocks.slowest, ("p_A", "p_B", "u")
+#: Rows of the stored samples that are pressures; row 0 is the time.
 _PRESSURES = (1, 2)
+#: Blocks that a rise is explained by.
+_WINDOW: int = LIVE.explanation.window
+#: Columns of a stored block: its end [s] and number of samples, then parameters, Gram matrix and scores of its fit.
+_END, _SAMPLES, _N_SUMS = 0, 1, 1 + len(PARAMETERS)
+_THETA = slice(2, 2 + len(PARAMETERS))
+_GRAM = slice(_THETA.stop, _THETA.stop + _N_SUMS**2)
+_SCORES = slice(_GRAM.stop, None)
+#: Largest standard deviation of a conductance that is resolved [m^3/(s Pa)]: that of its prior.
+_MAX_SD: float = PRESSURE.response["G"][1]
 
 
 class PressureEstimator:
-    """Conductances by the response, block by block, as `LiveBalance` gives them by volumes.
+    """Estimate the leakage conductance block by block from the pressure response, as `LiveBalance` does by volumes.
 
-    `rig`: what is believed of the machine; `litres`: whether it states what turns a conductance into L/min. The
-    conductance itself is not stated (`levels`), only its changes, to `size_error`; an orifice that shows as the same
-    conductance passes `orifice` times what a laminar leak does, by which the upper end of an interval is wider;
-    `inside`: share of what shows that is surely inside.
+    `rig`: prior of the machine; `litres`: whether it states the sizes that L/min need. Only changes of the conductance
+    are stated (`states_level`), with a relative error `size_error`. An orifice of the same apparent conductance passes
+    `orifice_factor` times the flow of a laminar leak, which widens the upper end of an interval;
+    `min_internal_fraction`: of an apparent leak, surely internal.
     """
 
-    method, levels, cause = "pressures", False, "leak inside or outside"
-    size_error, orifice = flow_scale(), PRIORS["conductance"]["orifice"]
-    inside: float = priors("live")["watch"]["inside"]
-    block_seconds: float = _PRIORS["seconds"]
+    method, data, states_level = "pressures", RESPONSE, False
+    cause: Cause = "leak inside or outside"
+    size_error, orifice_factor = conductance_scale_error(), PRESSURE.conductance.orifice
+    min_internal_fraction: float = LIVE.watch.inside
+    block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
+        """Start without blocks; arguments as of the class."""
         self._rig = rig
         self.litres = states_flow(rig) if litres is None else litres
-        self._kept = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
+        self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
         self._follower: Follower | None = None
-        self._held = np.full(len(_PRESSURES), math.nan)  # values that the pressures hold since the last block
+        self._held = np.full(len(_PRESSURES), math.nan)  # values that hanging pressure readings repeat, nan for none
         self._end = math.nan  # of the last block that was followed [s]
-        self._settling, self._lost = _SETTLING, 0
+        self._settling = _SETTLING  # number of blocks until the simulated states have forgotten where they began
+        self._misfits = 0  # number of successive blocks that the model does not describe
+        self._rows, self._signals = np.empty((0, 0)), SignalWindow()  # sums of the last blocks, one in a row
 
     @property
-    def begun(self) -> bool:
+    def has_begun(self) -> bool:
         """True once the machine moved long enough for its response to be fitted."""
         return self._follower is not None
 
-    def take(self, run: SampleRun) -> list[Shown]:
-        """Take the next samples; return the result of each block they complete."""
-        before = self._kept if run.follows else self._kept[:, :0]
+    def take(self, run: SampleRun) -> Iterator[BlockResult]:
+        """Process the next samples; yield the result of each block they complete before the next block is processed."""
         if not run.follows:
-            self._held[:] = math.nan
-        kept = np.hstack([before, [run.t, *(run.channels[name] for name in _READ)]])
-        first, length = (round(seconds * run.rate) for seconds in (_PRIORS["begins"], self.block_seconds))
-        results: list[Shown] = []
-        while self._follower is None and run.rate >= _SLOWEST and kept.shape[1] >= first:
-            beginning = _recording(kept[:, :first], run.rate)
-            if reason := unusable(beginning, self._rig) or does_not_move(beginning):
-                kept = kept[:, first // 2 :]
-                results.append(NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}"))
+            self._held[:], self._samples = math.nan, self._samples[:, :0]
+        samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
+        n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
+        is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
+        while self._follower is None and not is_slow and samples.shape[1] >= n_first:
+            beginning = _recording(samples[:, :n_first], run.rate)
+            if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
+                samples = samples[:, n_first // 2 :]  # try again half a beginning later
+                yield NotJudged(float(run.t[-1]), "", f"half minutes before the first block: {reason}")
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
-        while (self._follower is not None or run.rate < _SLOWEST) and kept.shape[1] >= length:
-            holds = [find_holds(kept[k], run.rate, self._held[k - 1]) for k in _PRESSURES]
-            if min(hold.open for hold in holds) < length:  # a hold may go on
+        while (self._follower is not None or is_slow) and samples.shape[1] >= n_block:
+            if not self._remove_holds(samples, n_block, run.rate):
                 break
-            for k, hold in zip(_PRESSURES, holds, strict=True):
-                self._held[k - 1] = kept[k, length - 1] if hold.flags[length - 1] else math.nan
-                kept[k, :length][hold.flags[:length]] = math.nan
-            block, kept = _recording(kept[:, :length], run.rate), kept[:, length:]
-            results.append(self._estimate_block(block))
-        self._kept = kept.copy()
-        return results
+            block, samples = _recording(samples[:, :n_block], run.rate), samples[:, n_block:]
+            yield self._estimate_block(block)
+        self._samples = samples.copy()
 
-    def _estimate_block(self, block: Recording) -> Shown:
-        """Return the conductance of a block, or the reason why it is not judged."""
-        begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
-        if self._follower is None or block.rate < _SLOWEST:
-            return _passed_over(end, f"sampled at less than {_SLOWEST:g} Hz")
-        if not all(np.isfinite(block[name]).all() for name in _READ):
-            return _passed_over(end, "missing values")
-        interrupted = self._resume(begin - self._end, block.rate)
-        follower = self._follower
-        self._end = end
-        sums = follower.take(block)
-        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
-        settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
-        described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS["described"]
-        ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0)) if math.isfinite(variance) else 1.0
-        follower.variance *= ratio ** (1.0 / (_PRIORS["usual"] if described and not settling else _RESUMING))
-        if not described:  # after some of them the machine is lost
-            self._lost += 1
-            if self._lost < _PRIORS["lost"] and np.isfinite(follower.theta).all():
-                self._settling = self._settling if settling else _RESUMING
-                return _passed_over(end, "settling" if settling else "not described by the model", interrupted)
-            follower.interrupt(math.inf)
-            self._lost, self._settling = 0, _SETTLING
-            return _passed_over(end, "not described by the model", True)
-        self._lost = 0
-        width = PRIORS["response"]["G"][1]
-        g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
-        if settling:
-            return _passed_over(end, "settling", interrupted)
-        if sd > width:
-            return _passed_over(end, "conductance not resolved" if moves(block["u"]) else "at standstill", interrupted)
-        dp = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
-        sizes = np.log(np.maximum([dp, np.sqrt(np.mean(block["u"] ** 2))], np.finfo(float).tiny))
-        duty = float(sizes[0]), float(sizes[1])
-        return [BlockConductance(begin, end, g, sd, g, width, dp / LITRE_PER_MINUTE, duty)]
-
-    def _resume(self, gap: float, rate: float) -> bool:
-        """Prepare for a block after a gap [s]; return True if it must not be compared with any before.
-
-        What is known of the machine stays at another rate, but may lie elsewhere among the likely parameters there.
-        """
-        assert self._follower is not None
-        anew = self._follower.machine.rate != rate
-        if anew:
-            self._follower = self._follower.at_rate(self._rig, rate)
-        elif abs(gap) < 0.5 / rate:
+    def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
+        """Set hanging pressure readings in the first `n_block` samples to nan; False if later ones must decide."""
+        holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
+        if min(hold.pending for hold in holds) < n_block:
             return False
-        short = -1.0 / rate <= gap <= _PAUSE  # nan before the first block
-        self._follower.interrupt(max(gap, 0.0) if short else math.inf)
-        self._settling = max(self._settling, _RESUMING if short else _SETTLING)
-        return anew or not short
+        for k, (row, hold) in enumerate(zip(_PRESSURES, holds, strict=True)):
+            self._held[k] = samples[row, n_block - 1] if hold.flags[n_block - 1] else math.nan
+            samples[row, :n_block][hold.flags[:n_block]] = math.nan
+        return True
 
-    def relearn(self) -> None:
-        """Forget the machine's parameters: know as little as at first."""
+    def _estimate_block(self, block: Recording) -> BlockResult:
+        """Estimate the conductance of a block, or return the reason why it is not judged."""
+        begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
+        if self._follower is None or block.rate < _MIN_RATE:
+            return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")
+        if not all(np.isfinite(block[name]).all() for name in _READ):
+            return NotJudged.with_count(end, "missing values")
+        follower, restarts = self._resume(self._follower, begin - self._end, block.rate)
+        self._follower, self._end = follower, end
+        is_settling, self._settling = self._settling > 0, max(self._settling - 1, 0)
+        if not self._follow(follower, block, is_settling):
+            return self._reject(follower, end, is_settling, restarts)
+        self._misfits = 0
+        if is_settling:
+            return NotJudged.with_count(end, "settling", restarts)
+        g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
+        if sd > _MAX_SD:
+            status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
+            return NotJudged.with_count(end, status, restarts)
+        pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
+        speed = self._rig.motor.omega_per_volt * float(np.mean(np.abs(block["u"])))
+        pump_flow = speed * self._rig.pump.q_b / (2.0 * math.pi)
+        return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
+
+    def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
+        """Report a block that the model does not describe; after `lost` successive ones restart the fit."""
+        self._misfits += 1
+        if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
+            follower.interrupt(math.inf)
+            self._misfits, self._settling = 0, _SETTLING
+            return NotJudged.with_count(end, "not described by the model", restarts=True)
+        self._settling = self._settling if is_settling else _RESUMING
+        return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
+
+    def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
+        """Prepare the fit for a block after a gap [s]; return it, and whether earlier blocks are not comparable.
+
+        At another sampling rate the parameters are the start of a new fit.
+        """
+        has_other_rate = follower.machine.rate != rate
+        if has_other_rate:
+            follower = follower.at_rate(self._rig, rate)
+        elif abs(gap) < 0.5 / rate:
+            return follower, False
+        is_short = -1.0 / rate <= gap <= _PAUSE  # gap is nan before the first block
+        follower.interrupt(max(gap, 0.0) if is_short else math.inf)
+        self._settling = max(self._settling, _RESUMING if is_short else _SETTLING)
+        return follower, has_other_rate or not is_short
+
+    def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
+        """Fit a block, store its sums, and update the usual variance; return whether the model describes the block."""
+        sums = follower.update(block)
+        self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
+        row = np.concatenate([[self._end, sums.samples], sums.theta, sums.gram.ravel(), sums.scores.ravel()])
+        stored = self._rows[1 - _WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
+        self._rows = np.vstack([stored, row])
+        is_described = bool(np.isfinite(follower.theta).all()) and follower.excess < _PRIORS.described
+        variance = float(sums.gram[0, 0]) / max(sums.samples, 1.0)
+        if math.isfinite(variance):
+            # a fading geometric mean, which one block changes by a factor of 10 at most
+            ratio = float(np.clip(max(variance, 1.0) / follower.variance, 0.1, 10.0))
+            n_blocks = _PRIORS.usual if is_described and not is_settling else _RESUMING
+            follower.variance *= ratio ** (1.0 / n_blocks)
+        return is_described
+
+    def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
+        """Test parameters and signals for changes in the blocks from `since` to the one that ends at `end` [s].
+
+        None if these blocks are not stored back to `onset`; empty if they are too few.
+        """
+        rows, seconds = self._rows, self.block_seconds
+        if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
+            return None
+        rows = rows[rows[:, _END] > since + 0.5 * seconds]
+        if len(rows) < MIN_BLOCKS or self._follower is None:
+            return ()
+        blocks = [
+            Block(row[_THETA], row[_GRAM].reshape(2 * (_N_SUMS,)), row[_SAMPLES], row[_SCORES].reshape(-1, _N_SUMS))
+            for row in rows
+        ]
+        try:
+            joint = Joint.fit(blocks, self._follower.priors, seconds, G)
+            information = parameter_information(joint, rows[:, _END] - 0.5 * seconds, seconds * len(rows))
+            response = score_response_steps(information)
+        except np.linalg.LinAlgError:
+            return ()
+        return (*response, *self._signals.observables(since))
+
+    def relearn(self, since: float = math.inf) -> None:
+        """Widen the parameters' covariance to the prior, after a repair or an exchange; `since` changes nothing."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
         """Return the state without the rig as plain values."""
-        state = saved(self, _SAVED)
+        state = save_attributes(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}
         machine = {"rate": follower.machine.rate, "law": follower.machine.law, "sense": follower.sense}
-        return state | {"follower": saved(follower, _FOLLOWED) | machine}
+        return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
-    def recall(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
-        recall(self, _SAVED, state)
-        if (known := part_of(state, "follower", (Mapping, type(None)))) is None:
+    def load_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        restore_attributes(self, _SAVED, state)
+        if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
             return
-        rate, sense = (float(part_of(known, name, (float, int))) for name in ("rate", "sense"))
+        rate, sense = (float(require_part(saved, name, (float, int))) for name in ("rate", "sense"))
         if not rate > 0.0:
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
-        if (law := part_of(known, "law", str)) not in LAWS:
+        if (law := require_part(saved, "law", str)) not in LAWS:
             raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
-        self._follower = Follower(Machine.from_rig(self._rig, rate, law), priors_of(self._rig, law), sense)
-        recall(self._follower, _FOLLOWED, known)
+        self._follower = Follower(Machine.from_rig(self._rig, rate, law), response_priors(self._rig, law), sense)
+        restore_attributes(self._follower, _FOLLOWER_ATTRIBUTES, saved)
 
 
-_SAVED = ("litres", "_kept", "_held", "_end", "_settling", "_lost")
-_FOLLOWED = ("theta", "covariance", "states", "variance", "last")
+_SAVED = ("litres", "_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
+_FOLLOWER_ATTRIBUTES = ("theta", "covariance", "states", "variance", "last")
 
 
 def _recording(rows: Array, rate: float) -> Recording:
+    """Make a recording of stored rows of samples: time [s], then the channels `_READ`."""
     t, *channels = rows
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)
-
-
-def _passed_over(end: float, status: str, interrupted: bool = False) -> NotJudged:
-    return NotJudged(end, status, f"blocks: {status}", interrupted)

@@ -1,10 +1,10 @@
-"""Did a coefficient step while it was watched? An e-detector over all onsets, beside a random walk of any size.
+"""Detect a step of a coefficient in a stream: an e-detector over all onsets, with a random walk of any size.
 
 Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine g has a level that walks:
 the innovations e_k of its Kalman filter, of variance kappa S_k with kappa unknown, are Student t given those before. A
-step of size delta at block j adds f_k delta to e_k, f the filter's answer to a step, of which block j may have a part
-only (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S and n innovations the ratio of the likelihoods,
-delta ~ N(0, v kappa) and kappa integrated, is
+step of size delta at block j adds f_k delta to e_k, with f the filter's response to a step, which may begin within
+block j (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S and n innovations the ratio of the
+likelihoods, delta ~ N(0, v kappa) and kappa integrated, is
 
     R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2),
 
@@ -23,223 +23,217 @@ Trans. Automat. Contr. 21 (1976) 108 (step in a filter).
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.compiled import kernel
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.onset import Interval, bound_steps
+from sealscope.diagnosis.live.rise import STEP, LiveRise
+from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import recall, saved
+from sealscope.storage.plain_state import restore_attributes, save_attributes
 
-_PRIORS = priors("live")["step"]
-WALKS = np.array(_PRIORS["walks"])[:, None]
-SIZES = np.array(_PRIORS["sizes"])
-PARTS = np.array(_PRIORS["parts"])
-JUMP, MEMORY = priors("live")["coefficients"]["jump"], _PRIORS["memory"]
-#: Onsets are all kept for `RECENT` blocks, then `RECENT / 4` of every doubling of age, up to `HORIZON` blocks.
-RECENT, HORIZON = _PRIORS["recent"], _PRIORS["horizon"]
-#: A block's numbers lie within so many units of the first one, or say nothing.
-_FARTHEST = 1e60
-#: Least square of an innovation over its variance: samples that repeat leave none, and a noise of zero no logarithm.
-_LEAST_SQUARE = 1e-12
-#: What is kept of each onset and walk, and of each onset.
-_FIELDS = ("answer", "along", "square", "total", "lead")
-_PLACES = ("number", "born", "onset", "begin")
-_SAVED = tuple(f"_{name}" for name in ("level", "spread", "total", "weight", "widths", "onsets", "places", "unit",
-                                       "known", "blocks", "last"))  # fmt: skip
-
-
-class StepEstimate(NamedTuple):
-    """A rise of a coefficient that a `test` shows, by a `score` over a `threshold` for a `reason`.
-
-    `score`: of a step, twice log M; `onset`: value, low and high [s]; `size` and its `deviation`.
-    """
-
-    score: float
-    onset: tuple[float, float, float]
-    size: float
-    deviation: float
-    test: str = "step"
-    threshold: float = np.nan
-    reason: str = ""
+_PRIORS = LIVE.step
+#: q of the module: variances of the walk in a block, over that of the first block's estimate (q, 1).
+WALKS = np.array(_PRIORS.walks)[:, None]
+#: v of the module: variances of the step's size; fractions of its first block in which the leak is open.
+SIZES = np.array(_PRIORS.sizes)
+PARTS = np.array(_PRIORS.parts)
+#: Standard deviations beyond which an innovation is a step, not the walk; weight of earlier innovations per block.
+JUMP, MEMORY = LIVE.coefficients.jump, _PRIORS.memory
+#: All onsets of the last `RECENT` blocks are stored, then `RECENT / 4` of each doubling of age, up to `HORIZON` blocks.
+RECENT, HORIZON = _PRIORS.recent, _PRIORS.horizon
+#: Largest number of a block, in the unit of the first block, whose square fits into a float.
+_MAX_NUMBER = 1e60
+#: Smallest square of an innovation over its variance: repeated samples have none, and log 0 is not a number.
+_MIN_SQUARE = 1e-12
+#: Innovations after which the walks' probabilities are updated, and onsets begin.
+_N_WARM = 4
+#: Blocks between two selections of the onsets.
+_SELECT_EVERY = 8
+#: Rows of the sums over innovations, for each walk and onset: 1 - f of the next block, a, b, T, and log pi of the onset
+#: with the likelihood of what came before it.
+_REST, _A, _B, _T, _LOG_PRIOR = range(5)
+_SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "log_weights", "log_variances", "sums",
+                                       "onsets", "unit", "count", "blocks", "end"))  # fmt: skip
 
 
 class StepDetector:
-    """An e-detector for a rise of one coefficient, block by block, in bounded memory."""
+    """An e-detector for a rise of one coefficient, block by block, in bounded memory.
+
+    For each walk q a Kalman filter gives `_level` and `_level_variance`; `_squares`, `_count`: T and n of the
+    innovations with a fading memory; `_log_weights`: log probability of the walk; `_log_variances`: sum of log S.
+    `_sums` (5, q, j): rows `_REST` to `_LOG_PRIOR` of each walk and onset j. `_onsets` (j, 4): number of innovations
+    since, number of the block in which the onset lies, onset and begin of that block [s]. `_unit`: standard deviation
+    of the first block, in which estimates are stored.
+    """
 
     def __init__(self) -> None:
-        self._unit, self._known, self._blocks = 0.0, 0.0, 0
-        self._level, self._spread, self._total, self._widths = (np.zeros(WALKS.shape) for _ in range(4))
-        self._weight = np.full(WALKS.shape, -np.log(len(WALKS)))
+        self._unit, self._count, self._blocks = 0.0, 0.0, 0
+        self._level, self._level_variance, self._squares, self._log_variances = np.zeros((4, *WALKS.shape))
+        self._log_weights = np.full(WALKS.shape, -np.log(len(WALKS)))
         self.forget()
 
     def forget(self) -> None:
-        """Compare with no block before now; keep the noise and the walk learned."""
-        self._last = -np.inf
-        self._onsets = np.zeros((len(_FIELDS), len(WALKS), 0))
-        self._places = np.zeros((0, len(_PLACES)))
+        """Drop all onsets and blocks before now; keep what is learned of noise and walk."""
+        self._end = -np.inf
+        self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
 
-    def resolves(self, g: float, deviation: float) -> bool:
-        """Test whether the squares of a block's numbers, in the unit of the first block, fit into floats."""
+    def is_representable(self, g: float, deviation: float) -> bool:
+        """Test whether the squares of a block's estimate and `deviation`, over the first deviation, fit into floats."""
         unit = self._unit or deviation
-        return unit > 0.0 and abs(g) < _FARTHEST * unit and unit / _FARTHEST < deviation < _FARTHEST * unit
+        return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Add a block from `begin` to `end` [s]: its estimate `g` and the `deviation` of `g`."""
+        """Update filters and sums by a block from `begin` to `end` [s]: `g` with its standard `deviation`.
+
+        With the innovation e = g - level of each walk's filter, its variance S, and the effect f of a unit step on it,
+        a += f e / S, b += f^2 / S and T += e^2 / S for each onset.
+        """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
         self._blocks += 1
-        elapsed, self._last = (begin - self._last) / (end - begin) + 1.0, end
-        if not np.isfinite(elapsed):
-            self._level[:], self._spread[:] = g, variance
+        elapsed_blocks, self._end = (begin - self._end) / (end - begin) + 1.0, end
+        if not np.isfinite(elapsed_blocks):  # the first block after `forget`
+            self._level[:], self._level_variance[:] = g, variance
             return
-        spread = self._spread + WALKS * max(elapsed, 1.0)
-        sigma, error = spread + variance, g - self._level
-        square, gain = error**2 / sigma, spread / sigma
-        is_warm = self._known >= 4
-        if is_warm:
-            self._begin_onset(begin, end)
-        _follow(self._onsets, self._places, error, sigma, gain, PARTS if is_warm else PARTS[:0])
-        self._learn(sigma, square)
-        self._level = self._level + gain * error
-        self._spread = gain * variance
+        level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
+        innovation, innovation_variance = g - self._level, level_variance + variance
+        gain = level_variance / innovation_variance
+        new_parts = PARTS if self._count >= _N_WARM else PARTS[:0]
+        if len(new_parts):
+            self._add_onsets(begin, end)
+        # f: the whole step less what the filter has followed of it
+        response = 1.0 - self._sums[_REST]
+        response[:, len(self._onsets) - len(new_parts) :] = new_parts
+        self._sums[_REST] += gain * response
+        self._sums[_A] += response / innovation_variance * innovation
+        self._sums[_B] += response / innovation_variance * response
+        self._sums[_T] += innovation**2 / innovation_variance
+        self._onsets[:, 0] += 1.0
+        self._update_walks(innovation_variance, innovation**2 / innovation_variance)
+        self._level = self._level + gain * innovation
+        self._level_variance = gain * variance
 
-    def _learn(self, sigma: Array, square: Array) -> None:
-        """Learn noise and walk from `square`, that of an innovation over its variance `sigma`."""
-        square = np.maximum(square, _LEAST_SQUARE)
-        if self._known >= 4:
-            square = np.minimum(square, JUMP**2 * self._total / self._known)
-            weight = MEMORY * self._weight - 0.5 * np.log(sigma * self._total)
-            weight -= 0.5 * (self._known + 1.0) * np.log1p(square / self._total)
-            self._weight = weight - np.logaddexp.reduce(weight, axis=0)
-        self._total = MEMORY * self._total + square
-        self._known = MEMORY * self._known + 1.0
-        self._widths = self._widths + np.log(sigma)
+    def _update_walks(self, variance: Array, square: Array) -> None:
+        """Update the noise and the probabilities of the q walks by one innovation e.
 
-    def _begin_onset(self, begin: float, end: float) -> None:
-        fresh = np.zeros((len(_FIELDS), len(WALKS), len(PARTS)))
-        weight = np.logaddexp(np.log1p(-_PRIORS["changes"]) + self._weight, np.log(_PRIORS["changes"] / len(WALKS)))
-        # p_q(e_j..e_k) = lead T_k^(-n/2) prod S^(-1/2) times what is the same for all q
-        fresh[3], fresh[4] = self._total, weight + 0.5 * (self._known * np.log(self._total) + self._widths)
-        places = np.array([[self._known, self._blocks, end - part * (end - begin), begin] for part in PARTS])
-        self._onsets = np.concatenate([self._onsets, fresh], axis=2)
-        self._places = np.concatenate([self._places, places])
-        if self._blocks % 8 == 0:
-            kept = _select_onsets(self._blocks, self._places)
-            self._onsets, self._places = self._onsets[:, :, kept], self._places[kept]
+        `variance`: S, by each walk's filter; `square`: e^2 / S; both (q, 1).
+        """
+        square = np.maximum(square, _MIN_SQUARE)
+        if self._count >= _N_WARM:
+            # clipped, as a jump is a step and says nothing of noise and walk
+            square = np.minimum(square, JUMP**2 * self._squares / self._count)
+            # log density of Student's t, the probabilities flattened by the memory
+            log_weights = MEMORY * self._log_weights - 0.5 * np.log(variance * self._squares)
+            log_weights -= 0.5 * (self._count + 1.0) * np.log1p(square / self._squares)
+            self._log_weights = log_weights - np.logaddexp.reduce(log_weights, axis=0)
+        self._squares = MEMORY * self._squares + square
+        self._count = MEMORY * self._count + 1.0
+        self._log_variances = self._log_variances + np.log(variance)
 
-    def log_e(self, least: float = -np.inf) -> float:
-        """Return log M; minus infinity where it is surely not over `least`."""
-        if not len(self._places):
+    def _add_onsets(self, begin: float, end: float) -> None:
+        """Add the onsets within a block, one for each of `PARTS`, and thin the old ones."""
+        sums = np.zeros((5, len(WALKS), len(PARTS)))
+        log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
+        # pi_j(q) p_q(e_j..e_k) = exp(sums[_LOG_PRIOR]) T_k^(-n/2) prod S^(-1/2), up to a factor equal for all q
+        sums[_T] = self._squares
+        sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
+        onsets = np.array([[self._count, self._blocks, end - part * (end - begin), begin] for part in PARTS])
+        self._sums = np.concatenate([self._sums, sums], axis=2)
+        self._onsets = np.concatenate([self._onsets, onsets])
+        if self._blocks % _SELECT_EVERY == 0:
+            is_selected = _select_onsets(self._blocks, self._onsets)
+            self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
+
+    def log_e(self, min_log_e: float = -np.inf) -> float:
+        """Compute the log e-value of a step, log M, or minus infinity if a quick bound of it is at most `min_log_e`."""
+        if not len(self._onsets):
             return -np.inf
-        if _most(self._onsets, self._places) + np.log(len(self._places) / len(PARTS)) <= least:
+        a, b, T = self._sums[_A : _T + 1]
+        explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)  # fraction of T, by the best size
+        max_log_ratio = -0.5 * float(np.min(self._onsets[:, 0] * np.log1p(-explained)))
+        if max_log_ratio + np.log(len(self._onsets) / len(PARTS)) <= min_log_e:
             return -np.inf
-        return float(np.logaddexp.reduce(self._terms().ravel()))
+        return float(np.logaddexp.reduce(self._log_terms().ravel()))
 
-    def _healthy(self) -> Array:
-        """Return log of the likelihood of each walk and onset while nothing stepped, up to a constant, shape (q, j)."""
-        return np.asarray(self._onsets[4] - 0.5 * (self._places[:, 0] * np.log(self._onsets[3]) + self._widths))
+    def _log_likelihoods(self) -> Array:
+        """Compute the log likelihood (q, j) of each walk since each onset without a step, up to a constant."""
+        n, log_T = self._onsets[:, 0], np.log(self._sums[_T])
+        return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
-    def _terms(self) -> Array:
-        """Return log of each part of M, by size, walk and onset, shape (v, q, j)."""
-        _, weighted, square, total, _ = self._onsets
-        number, widest, healthy = self._places[:, 0], SIZES[:, None, None], self._healthy()
-        rising = np.maximum(weighted, 0.0) ** 2 / ((square + 1.0 / widest) * total)
-        ratio = -0.5 * (np.log1p(widest * square) + number * np.log1p(-rising))
-        prior = np.logaddexp.reduce(healthy, axis=0) + np.log(len(SIZES) * len(PARTS))
-        return np.asarray(np.where(weighted > 0.0, ratio, -np.inf) + healthy - prior)
+    def _step_log_ratios(self) -> Array:
+        """Compute the log likelihood ratios log R (v, q, j), by the prior on the step's size, walk and onset."""
+        a, b, T = self._sums[_A : _T + 1]
+        v = SIZES[:, None, None]
+        explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
+        return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, 0] * np.log1p(-explained)))
 
-    def rise(self) -> StepEstimate:
+    def _log_terms(self) -> Array:
+        """Compute the logarithms (v, q, j) of the terms of M, by size, walk and onset."""
+        likelihoods = self._log_likelihoods()
+        total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
+        return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
+
+    def rise(self) -> LiveRise:
         """Estimate the step in the blocks: onset and size, averaged over all walks, onsets and sizes."""
-        terms = self._terms()
+        terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
-        _, weighted, square, total, _ = self._onsets
-        precision = square + 1.0 / SIZES[:, None, None]
-        mean, freedom = weighted / precision, np.maximum(self._places[:, 0] - 2.0, 1.0)
-        variance = np.maximum(total - weighted * mean, 0.0) / freedom / precision
-        value = float((weights * mean).sum())
-        deviation = float(np.sqrt((weights * (variance + (mean - value) ** 2)).sum()))
-        shares = weights.sum(axis=(0, 1))  # probability of each onset
-        onset, begin = self._places[:, 2:].T
-        order = np.argsort(onset, kind="stable")
-        low, high = np.searchsorted(np.cumsum(shares[order]), [0.025, 0.975])
-        last = order[min(high, len(order) - 1)]
-        part = float((onset - begin)[-len(PARTS)]) / len(PARTS)  # a part of a block, about
-        interval = float(shares @ onset), float(onset[order[low]]) - part, float(onset[last]) + part
-        return StepEstimate(2.0 * log_e, interval, self._unit * value, self._unit * deviation)
+        a, b, T = self._sums[_A : _T + 1]
+        precision = b + 1.0 / SIZES[:, None, None]
+        sizes, freedom = a / precision, np.maximum(self._onsets[:, 0] - 2.0, 1.0)
+        variances = np.maximum(T - a * sizes, 0.0) / freedom / precision
+        size = float((weights * sizes).sum())
+        deviation = float(np.sqrt((weights * (variances + (sizes - size) ** 2)).sum()))
+        probabilities = weights.sum(axis=(0, 1))  # of the onsets
+        onsets, begins = self._onsets[:, 2:].T
+        order = np.argsort(onsets, kind="stable")
+        low_index, high_index = np.searchsorted(np.cumsum(probabilities[order]), [0.025, 0.975])
+        latest = onsets[order[min(high_index, len(order) - 1)]]
+        resolution = float((onsets - begins)[-len(PARTS)]) / len(PARTS)  # about a part of a block
+        mean = float(probabilities @ onsets)
+        interval = Interval(mean, float(onsets[order[low_index]]) - resolution, float(latest) + resolution)
+        return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Compute the rise exceeded with probability 1 - `probability`, given a rise."""
-        from scipy.special import ndtr
-
-        if not len(self._places):
+        """Compute the rise exceeded with probability 1 - `probability`, given that there is one; inf without onsets."""
+        if not len(self._onsets):
             return np.inf
-        _, weighted, square, total, _ = self._onsets
-        healthy, size = self._healthy(), weighted / square
-        least = np.finfo(float).tiny
-        deviation = np.sqrt(np.maximum(total - weighted * size, least) / self._places[:, 0] / square)
-        positive = np.maximum(ndtr(size / deviation), 1e-300)
-        above = np.exp(healthy - np.logaddexp.reduce(healthy, axis=0)) * positive
-        low, high = 0.0, float(np.max(size + 8.0 * deviation))
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            chance = float((above * ndtr((size - middle) / deviation) / positive).sum())
-            low, high = (middle, high) if chance > (1.0 - probability) * above.sum() else (low, middle)
-        return self._unit * high
+        a, b, T = self._sums[_A : _T + 1]
+        sizes, log_likelihoods = a / b, self._log_likelihoods()
+        deviations = np.sqrt(np.maximum(T - a * sizes, np.finfo(float).tiny) / self._onsets[:, 0] / b)
+        log_weights = log_likelihoods - np.logaddexp.reduce(log_likelihoods, axis=0)
+        log_weights = log_weights + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
+        weights = np.exp(log_weights - log_weights.max())
+        return self._unit * bound_steps(weights.ravel(), sizes.ravel(), deviations.ravel(), probability)
 
     @property
     def noise(self) -> float:
-        """Ratio of the variance of a block's estimate to the stated one, with a walk of a tenth."""
-        return float((self._total[3, 0] + _PRIORS["stated"]) / (self._known + _PRIORS["stated"]))
+        """Ratio of the innovations' variance to the stated one, learned with a walk of a tenth of that variance."""
+        walk = 3  # index in `WALKS`
+        return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def state(self) -> dict[str, Any]:
         """Return the state as plain values."""
-        return saved(self, _SAVED)
+        return save_attributes(self, _SAVED)
 
-    def recall(self, state: Any) -> None:
-        """Continue from a `state` with the same bits; raises InputError where it does not fit."""
-        recall(self, _SAVED, state)
-        if self._onsets.shape[2] != len(self._places):
-            raise InputError(f"saved state's onsets must be {len(self._places)}, got {self._onsets.shape[2]}")
-
-
-@kernel
-def _follow(onsets: Any, places: Any, error: Any, sigma: Any, gain: Any, fresh: Any) -> None:
-    """Add innovations (q, 1) and their variances to the sums of all onsets; the last begin with a part."""
-    answer, weighted, square, total, _ = onsets
-    count, begun = len(places), len(places) - len(fresh)
-    for q in range(len(sigma)):
-        for j in range(count):
-            part = fresh[j - begun] if j >= begun else 1.0 - answer[q, j]
-            weighted[q, j] += part / sigma[q, 0] * error[q, 0]
-            square[q, j] += part / sigma[q, 0] * part
-            total[q, j] += error[q, 0] ** 2 / sigma[q, 0]
-            answer[q, j] += gain[q, 0] * part
-    for j in range(count):
-        places[j, 0] += 1.0
+    def load_state(self, state: Any) -> None:
+        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        restore_attributes(self, _SAVED, state)
+        if self._sums.shape[2] != len(self._onsets):
+            raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
 
 
-@kernel
-def _most(onsets: Any, places: Any) -> float:
-    """Return the most that the logarithm of a ratio of likelihoods can be, for any size of a step."""
-    _, weighted, square, total, _ = onsets
-    most = 0.0
-    for q in range(len(weighted)):
-        for j in range(len(places)):
-            if weighted[q, j] > 0.0:
-                rising = min(weighted[q, j] ** 2 / (square[q, j] * total[q, j]), 1.0 - 1e-15)
-                most = max(most, -0.5 * places[j, 0] * math.log1p(-rising))
-    return most
+def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
+    """Select the onsets to store: all of the last `RECENT` blocks, and of older blocks a grid that coarsens with age.
 
-
-def _select_onsets(now: int, places: Array) -> NDArray[np.bool_]:
-    """Select the onsets to keep: of older blocks fewer and fewer, and at their beginning only."""
-    _, born, onset, begin = places.T
-    age = now - born
-    step = 2.0 ** np.ceil(np.log2(np.maximum(age / RECENT, 1.0))) * 2.0
-    return np.asarray((age < RECENT) | ((born % step == 0) & (age < HORIZON) & (onset <= begin)))
+    The grid contains only onsets at the start of a block. `block`: number of the present block; `onsets` (j, 4).
+    """
+    _, onset_block, onset, block_start = onsets.T
+    age = block - onset_block
+    n_doublings = np.ceil(np.log2(np.maximum(age / RECENT, 1.0)))
+    spacing = 2.0 * 2.0**n_doublings  # blocks; RECENT/4 onsets in each doubling of age
+    return np.asarray((age < RECENT) | ((onset_block % spacing == 0) & (age < HORIZON) & (onset <= block_start)))

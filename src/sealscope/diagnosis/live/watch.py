@@ -7,57 +7,58 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.decision.texts import text_of
-from sealscope.diagnosis.decision.verdicts import bound_worth_stating, decide_verdict
-from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, LiveBalance, NotJudged, Shown
+from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Interval
+from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import (
+    GROUP,
     BaselineLearning,
     BlockEstimate,
     HealthyLevel,
     WatchBaseline,
     WatchedLeak,
-    estimate_rise,
-    within,
+    find_level_rise,
+    is_known_duty,
+    level_before_leak,
+    mean_flow,
 )
+from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, explain_rise
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.sequential import RECENT, StepDetector, StepEstimate
-from sealscope.diagnosis.priors import priors
-from sealscope.diagnosis.verdict.evidence import NO_LEAK, Evidence
+from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveLeak, LiveRise, decide_on_stream
+from sealscope.diagnosis.live.sequential import RECENT, StepDetector
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.formats.timebase import clock_text, counts_from_1970
-from sealscope.recordings.recording import Array, Recording
-from sealscope.storage.plain_state import part_of, recall, restored, saved
+from sealscope.recordings.recording import Recording
+from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Format of the saved state.
-STATE_VERSION = 14
-_PRIORS = priors("live")["watch"]
-#: Blocks of one mean that is compared with the baseline, and of the mean that is the leak after an alarm.
-GROUP, _OF_NOW = _PRIORS["group"], _PRIORS["recent"]
-#: What is kept of the last blocks: end, conductance, deviation, flow of a unit of it, the duty's logarithms, the total
-#: conductance and what it is off by; and of those whose mean is not whole yet.
-_LAST = np.dtype([(name, float) for name in ("end", "g", "sd", "flow", "pressure", "motion", "total", "offset")])
-_GROUP = np.dtype([(name, float) for name in ("end", "g", "sd", "offset")])
-#: A block whose numbers are larger says nothing: their products would overflow.
-_LARGEST = 1e100
-#: What a watched leak and the evidence of it call alike.
-_FIGURES = ("score", "threshold", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm")
-#: Ways of watching, each a stream of conductances.
+STATE_VERSION = 16
+_PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
+#: Blocks per mean that is stated as the leak after an alarm.
+_N_RECENT = _PRIORS.recent
+#: Numbers of a block that are saved.
+_BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
+#: Numbers of a block beyond this are refused: their products would overflow.
+_MAX_NUMBER = 1e100
+#: A way of watching estimates a conductance for each block.
 Estimator = LiveBalance | PressureEstimator
-_WithInterval = tuple[float, float, float]
-_KINDS: dict[str, type[Estimator]] = {estimator.method: estimator for estimator in (LiveBalance, PressureEstimator)}
+_ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
@@ -70,18 +71,18 @@ class Watch:
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
         As for `watch`.
     litres : mapping of str to bool, optional
-        Whether the rig states what turns a conductance into L/min, for each way of watching; by default it is asked.
+        For each way of watching, whether the rig states the sizes that L/min need; by default found from the rig.
     healthy : HealthyLevel, optional
         As for `watch`.
 
     Attributes
     ----------
     leak : WatchedLeak or None
-        The leak that the tests show.
+        The leak that a test has shown.
     baseline : WatchBaseline or None
-        What the machine is compared with, None while it is learned.
+        Healthy state that the machine is compared with, None while it is learned.
     blocks, baseline_version : int
-        Whole blocks so far, and version of the baseline, or of that which is being learned.
+        Whole blocks so far, and version of the baseline that is in use or being learned.
 
     Examples
     --------
@@ -106,38 +107,43 @@ class Watch:
         healthy: HealthyLevel | None = None,
     ) -> None:
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
-        self._probability("step", LiveBalance.block_seconds)
+        self._false_alarm_probability(STEP, LiveBalance.block_seconds)
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig, self.healthy = rig, healthy
-        self._litres = {by: kind.states_flow(rig) for by, kind in _KINDS.items()} if litres is None else litres
+        self._litres = {way: kind.states_flow(rig) for way, kind in _ESTIMATORS.items()} if litres is None else litres
         self._samples = SampleJoiner(ways_to_watch(rig))
         self._estimator: Estimator | None = None
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
         self._learning, self._detector = BaselineLearning(), StepDetector()
-        self._last, self._group = np.empty(0, _LAST), np.empty(0, _GROUP)
+        self._compared = np.empty(0, _BLOCK)  # the last blocks that the next one is compared with, at most `RECENT`
+        self._grouped = 0  # number of these that await the test of their mean
+        self._is_known = True  # whether the last block was under the baseline's duty
+        self._since = math.nan  # begin of the first block that others are compared with [s]
 
-    def _probability(self, test: str, seconds: float) -> float:
-        """Return the false-alarm probability of one look of a test, given the seconds between looks.
+    def _false_alarm_probability(self, test: str, seconds: float) -> float:
+        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, applied once in `seconds`.
 
-        Raises InputError where no threshold can be set for it.
+        Raises InputError if the stated rate of false alarms, of which each test has a fraction, allows no threshold.
         """
         rate: float = self.false_alarms_per_1000_h
-        looks: float = 1000.0 / _PRIORS[test] * 3600.0 / seconds
-        least, most = 1e-12 * looks, 0.05 * looks
-        if not least <= rate <= most:
-            raise InputError(f"false_alarms_per_1000_h must be {least:.2g} to {most:.3g}, got {rate:g}")
-        return rate / looks
+        fraction_of_alarms = getattr(_PRIORS, test)
+        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds
+        min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
+        if not min_rate <= rate <= max_rate:
+            raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
+        return rate / rate_per_probability
 
     @cached_property
     def _rig_text(self) -> str:
+        """The rig as JSON, for the saved state."""
         return json.dumps(self._rig.model_dump())
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig, whether its values state L/min, and hours, by which the baseline was learnt."""
+        """Conditions of the baseline, the rig, whether it states L/min by way of watching, and hours of learning."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -152,91 +158,100 @@ class Watch:
 
     @property
     def block_seconds(self) -> float:
-        """About how long a block is [s]."""
+        """Approximate duration of a block [s]."""
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
     def why_no_litres(self) -> str:
-        """Why no L/min is stated, "" where it is."""
-        estimator = self._estimator
-        if estimator is None or estimator.litres:
+        """Reason why L/min are not stated, "" if they are."""
+        if self._estimator is None or self._estimator.litres:
             return ""
         return "L/min is not stated: areas and displacement of the machine are not, which its file states"
 
     @property
     def evidence(self) -> Evidence:
-        """Present verdict, with the detected leak, or the 95 % bound of an undetected one."""
-        leak, estimator = self.leak, self._estimator
+        """Present verdict, with the detected leak or the 95 % upper bound of an undetected one."""
+        leak = self.leak
         if leak is not None:
-            figures: dict[str, Any] = {name: getattr(leak, name) for name in _FIGURES}
-            cause: Any = leak.cause
-            return Evidence(decide_verdict(True, math.inf, 0.0), leak.reason, cause=cause, **figures)
-        bound = self._detector.bound() if estimator is not None and len(self._last) else math.inf
-        if estimator is None or not math.isfinite(bound):
+            return decide_on_stream(self._measure(self._estimator or self._make_estimator(), leak), leak.allowed)
+        probability = self._false_alarm_probability(STEP, self.block_seconds)
+        measure = None if self._estimator is None or not len(self._compared) else self._measure(self._estimator, None)
+        if measure is None or not math.isfinite(measure.bound_flow):
             why = f": {', '.join(self.counters)}" if self.counters else ""
-            return Evidence(decide_verdict(False, math.inf, 0.0), f"waits for the first blocks{why}")
-        last = self._last[-1]
-        bound, pump = estimator.orifice * bound * float(last["flow"]), math.exp(last["motion"]) / LITRE_PER_MINUTE
-        limit = f"{bound:.2g} L/min" if estimator.litres else f"{100.0 * bound / pump:.2g} % of the pump's flow"
-        verdict = decide_verdict(False, bound, bound_worth_stating(pump))
-        return Evidence(
-            verdict,
-            text_of("bound", "none" if verdict == NO_LEAK else "hidden", limit=limit),
-            score=max(2.0 * self._detector.log_e(), 0.0),
-            threshold=-2.0 * math.log(self._probability("step", self.block_seconds)),
-            bound_lpm=bound if estimator.litres else None,
+            return decide_on_stream(None, probability, lack=f"waits for the first blocks{why}")
+        return decide_on_stream(measure, probability)
+
+    def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
+        """Describe the leak that a test has shown, or if there is none the upper bound of an undetected one."""
+        make_measure = partial(
+            LiveLeak,
+            flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
+            lpm_per_flow=1.0 / LITRE_PER_MINUTE if estimator.litres else None,
+            size_deviation=estimator.size_error,
         )
+        if leak is not None:
+            return make_measure(leak.estimate, leak.cause, leak.pressure, bound_flow=math.inf, pump_flow=(0.0, 0.0))
+        # a rise that nothing explains yet scores less than an alarm
+        max_score = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds)) * (1.0 - 1e-6)
+        test = LiveRise(STEP, min(max(2.0 * self._detector.log_e(), 0.0), max_score))
+        pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
+        bound = estimator.orifice_factor * self._detector.bound() * pressure * (1.0 + UPPER_95 * estimator.size_error)
+        return make_measure(test, estimator.cause, pressure, bound_flow=bound, pump_flow=(pump_flow, pump_flow))
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
-        """Take the next samples; results do not depend on how they are cut.
+        """Process the next samples; the estimates do not depend on how the samples are divided into calls.
 
         Parameters
         ----------
         samples : Recording
             The next samples, in SI units: ``p_A``, ``p_B``, ``x`` and ``theta`` or ``omega``; or, of a cylinder with
-            two like areas, ``p_A``, ``p_B`` and ``u``; behind a servo valve ``x``, ``u`` and all four pressures. What
-            does not fit is dropped and counted (`counters`).
+            two like areas, ``p_A``, ``p_B`` and ``u``; behind a servo valve ``x``, ``u`` and all four pressures.
+            Samples that do not fit are dropped and counted (`counters`).
         follows : bool, default True
-            False where the clock begins anew, as with a file of its own.
+            False if the clock starts anew, as at the start of a separate file.
 
         Returns
         -------
         list of BlockEstimate
-            Of every block that the samples complete.
+            One for every block that the samples complete.
         """
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Yield the estimates of `update`, each with the leak at that block.
+        """Yield the estimate of each block (`update`) with the leak known by then.
 
-        Iterate to the end: samples are taken on the way.
+        Iterate to the end, as samples are processed only then.
         """
         if not follows:
-            self._samples.restart("restart")
+            self._samples.restart("pauses between samples")
         for run in self._samples.runs(remove_dropouts(samples)):
             if self._estimator is None or self._estimator.method != self.method:  # a position came later
                 self._estimator = self._make_estimator()
-            with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
-                results = self._estimator.take(run)
-            self._samples.settled = self._estimator.begun
-            for result in results:
-                if isinstance(result, NotJudged) and not result.status:
-                    self._samples.count(result.counted)
+            results = self._estimator.take(run)
+            while True:
+                with np.errstate(all="ignore"):  # a block whose sums overflow says nothing
+                    result = next(results, None)
+                if result is None:
+                    break
+                if isinstance(result, NotJudged) and not result.status:  # samples before the first block
+                    self._samples.count(result.counter)
                 else:
-                    yield self.judged(result), self.leak
+                    yield self.judge(result), self.leak
+            self._samples.is_final = self._estimator.has_begun
 
     def _make_estimator(self) -> Estimator:
+        """Make the estimator of the conductance for the way of watching."""
         litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
             return PressureEstimator(self._rig, litres)
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the counts of blocks and baselines of an earlier watch with other settings or state."""
+        """Continue the numbering of blocks and baselines of an earlier watch with other settings or state."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
-        """Learn a new baseline from now on: the machine was repaired, or is another."""
+        """Learn a new baseline from now on, after a repair or an exchange of the machine."""
         self.baseline_version += 1
         self.baseline, self._learning = None, BaselineLearning()
         if self._estimator is not None:
@@ -244,275 +259,283 @@ class Watch:
         self.dismiss()
 
     def dismiss(self) -> None:
-        """Withdraw the leak and compare with no block before now; keep the baseline.
+        """Withdraw the leak alarm and restart the tests with the next block; keep the learned baseline.
 
-        The level of the healthy recordings, which may have raised it, is not compared with any more.
+        The reference level from healthy recordings (`healthy`), which may have caused the alarm, is dropped.
         """
         self.leak = self.healthy = None
         self._forget()
 
     def _forget(self) -> None:
+        """Restart the tests: drop all blocks that later ones would be compared with."""
         self._detector.forget()
-        self._last, self._group = self._last[:0], self._group[:0]
+        self._compared, self._grouped = self._compared[:0], 0
 
-    def judged(self, shown: Shown) -> BlockEstimate:
-        """Return the estimate of a block from its conductance, or from the reason why there is none."""
+    def judge(self, result: BlockResult) -> BlockEstimate:
+        """Process a result of the estimator; return the estimate of its last block, or the reason why there is none.
+
+        `blocks` counts results: the blocks of the first fit arrive in one.
+        """
         self.blocks += 1
-        if isinstance(shown, NotJudged):
-            if shown.apart:
+        if isinstance(result, NotJudged):
+            if result.restarts:
                 self._forget()
-            if shown.counted:
-                self._samples.count(shown.counted)
-            return BlockEstimate(self.blocks, shown.end, shown.status)
+            if result.counter:
+                self._samples.count(result.counter)
+            return BlockEstimate(self.blocks, result.end, result.status)
         assert self._estimator is not None
-        for block in shown:
-            estimate = self._judge(self._estimator, block)
+        for block in result:
+            estimate = self._judge_block(self._estimator, block)
         return estimate
 
-    def _judge(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
-        """Test a block by all that came before, and return its estimate."""
-        numbers = (block.g, block.total, block.offset, block.flow, *block.duty)
-        if not (all(abs(number) < _LARGEST for number in numbers) and self._detector.resolves(block.g, block.sd)):
+    def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
+        """Test a block against all earlier ones, learn from it, and estimate its leak."""
+        row = np.array([block], _BLOCK)
+        is_finite = all(abs(number) < _MAX_NUMBER for number in block)
+        if not (is_finite and self._detector.is_representable(block.g, block.sd)):
             self._samples.count("blocks: beyond floating point")
             return BlockEstimate(self.blocks, block.end, "beyond floating point")
-        if self.baseline is not None and not within(block.duty, self.baseline.duty_low, self.baseline.duty_high):
-            self._samples.count("blocks: another duty")
-            return BlockEstimate(self.blocks, block.end, "another duty")
-        if len(self._last) and not 0.0 <= block.end - self._last["end"][-1] <= _PRIORS["pause"]:
-            self._forget()
-        self._detector.take(block.begin, block.end, block.g, block.sd)
-        row = np.array((block.end, block.g, block.sd, block.flow, *block.duty, block.total, block.offset), _LAST)
-        self._last = np.append(self._last[1 - RECENT :], row)
-        self._test_step(estimator, block)
-        self._test_level(estimator, block)
+        has_known_duty = self._has_known_duty(block)
+        self._add_to_tests(block, row, has_known_duty=has_known_duty)
+        awaits_explanation = self._test_step(estimator, block)
+        if not has_known_duty:
+            return BlockEstimate(self.blocks, block.end, "another duty" if self.leak is None else "alarm")
+        # a step that may turn out to be no leak must not count in a test of the mean: begin a new group
+        self._grouped = 0 if awaits_explanation else self._grouped + 1
+        if self._grouped == GROUP:
+            self._grouped = 0
+            if self.leak is None:
+                self._test_level(estimator, block)
         if self.baseline is None and self.leak is None:
-            self._learning.add(block.g, block.flow, block.duty, GROUP)
-            hours = self._learning.blocks * self.block_seconds / 3600.0
-            if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):
-                self.baseline = self._learning.frozen(
-                    self.baseline_version, block.end, hours, estimator.litres and estimator.levels
-                )
-                self._learning = BaselineLearning()
+            self._learn(estimator, block)
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
-        return (
-            self._estimate(estimator, status, block)
-            if estimator.litres
-            else BlockEstimate(self.blocks, block.end, status)
-        )
+        estimate = BlockEstimate(self.blocks, block.end, status)
+        blocks = row if self.leak is None else self._blocks_of_leak(self.leak)[-_N_RECENT:]
+        return self._add_flows(estimate, estimator, blocks)
 
-    def _test_step(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Test for a step; an alarm that stands is stated anew while more blocks sharpen it."""
-        leak = self.leak
-        if leak is not None and (leak.test != "step" or block.end - leak.raised_s > RECENT * self.block_seconds):
-            return
-        threshold = -math.log(self._probability("step", block.end - block.begin))
-        least = threshold if leak is None else 0.5 * leak.score
-        if not self._detector.log_e(least) > least:
-            return
-        rise = self._detector.rise()
-        if leak is None and self._has_duty_changed(estimator, rise):
-            self._samples.count("blocks not compared: changed duty")
+    def _has_known_duty(self, block: BlockConductance) -> bool:
+        """Test whether a block's duty is one of the baseline's; every duty is, while there is no baseline."""
+        baseline = self.baseline
+        return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
+
+    def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
+        """Add a block to the tests, which restart after a pause or between known and other duties."""
+        if not has_known_duty:
+            self._samples.count("blocks: another duty")
+        if has_known_duty != self._is_known:  # blocks under different duties are not compared
+            self._is_known = has_known_duty
             self._forget()
-            return
-        reason = (
-            f"the leakage conductance rises at {clock_text(rise.onset[0])} beyond its random walk "
-            f"(score {rise.score:.1f}, threshold {2.0 * threshold:.1f})"
-        )
-        self._raise(estimator, rise._replace(threshold=2.0 * threshold, reason=reason), block)
+        if len(self._compared) and not 0.0 <= block.end - self._compared["end"][-1] <= _PRIORS.pause:
+            self._forget()
+        if not len(self._compared):
+            self._since = block.begin
+        self._detector.take(block.begin, block.end, block.g, block.sd)
+        self._compared = np.append(self._compared[1 - RECENT :], row)
 
-    def _has_duty_changed(self, estimator: Estimator, rise: StepEstimate) -> bool:
-        """Test whether the duty changed with a rise, beyond its range before and the effect of a leak."""
-        pressure, motion = self._last["pressure"], self._last["motion"]
-        after = self._last["end"] > rise.onset[0]
-        if np.count_nonzero(~after) < _OF_NOW or not after.any():
+    def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
+        """Add a block to the baseline, and freeze the baseline after the stated hours."""
+        self._learning.add(block.g, block.lpm, block.duty)
+        hours = self._learning.blocks * self.block_seconds / 3600.0
+        if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
+            states_lpm = estimator.litres and estimator.states_level
+            self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, states_lpm=states_lpm)
+            self._learning = BaselineLearning()
+
+    def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
+        """Test for a step of the conductance, and raise the leak if a leak explains it.
+
+        For `RECENT` blocks after the alarm, a higher score replaces onset and size. Return whether a step awaits an
+        explanation by further blocks.
+        """
+        leak = self.leak
+        if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
-        low, high = ((float(f(pressure[~after])), float(f(motion[~after]))) for f in (np.min, np.max))
-        now = float(np.median(pressure[after])), float(np.median(motion[after]))
-        lost = 1.0 - rise.size * math.exp(now[0] - now[1]) if estimator.levels else 1.0
-        net = now[0], now[1] + math.log(max(lost, np.finfo(float).tiny))  # the pump may give what leaks
-        return not (within(now, low, high) or within(net, low, high))
+        threshold = -math.log(self._false_alarm_probability(STEP, block.end - block.begin))
+        min_log_e = threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
+        if not self._detector.log_e(min_log_e) > min_log_e:
+            return False
+        rise, cause = self._detector.rise(), None if leak is None else leak.cause
+        if leak is None:
+            explanation = self._explain(estimator, rise, block)
+            if not explanation.is_leak:
+                return True
+            cause = OUTSIDE if explanation.is_outside else None
+        reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
+        self._raise_leak(estimator, rise, block, 2.0 * threshold, reason, cause=cause)
+        return False
+
+    def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
+        """Explain a rise by the blocks around it, or as a leak if these are no longer stored.
+
+        After a start, or a change that is surely no leak, the tests restart, and the event is counted.
+        """
+        n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))
+        if n_since < _EXPLANATION.shows:
+            return UNKNOWN
+        if rise.interval.value < self._since + _EXPLANATION.start * (block.end - block.begin):
+            self._samples.count("changes that are no leak: a start")
+            self._forget()
+            return UNKNOWN
+        with threadpool_limits(limits=1):
+            observables = estimator.observables(self._since, block.end, rise.interval.value)
+        if observables is None:
+            return RiseExplanation(is_leak=True)
+        is_settled = n_since >= _EXPLANATION.settles
+        explanation = explain_rise(observables, estimator.data, rise.interval, is_settled)
+        if explanation.other_events and is_settled:
+            self._samples.count(f"changes that are no leak: {explanation.other_events}")
+            estimator.relearn(rise.interval.high)
+            self._forget()
+        return explanation
 
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Gather blocks to means, and compare these with the baseline."""
-        self._group = np.append(self._group, np.array((block.end, block.g, block.sd, block.offset), _GROUP))
-        if len(self._group) < GROUP:
+        """Test the mean of the last `GROUP` blocks against the baseline, before there is one the healthy recordings."""
+        has_baseline = self.baseline is not None
+        healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
+        if healthy is None:
             return
-        end, g, offset = (float(self._group[name].mean()) for name in ("end", "g", "offset"))
-        sd = math.sqrt(sum(value**2 for value in self._group["sd"].tolist())) / GROUP
-        self._group = self._group[:0]
-        if self.leak is not None:
-            return
-        if self.baseline is None:
-            self._test_healthy_level(estimator, block, math.hypot(sd, offset))
-            return
-        # what all conductances are off by is in the ceiling that many times
-        deviation = math.hypot(sd, offset * (priors("inference")["oil"]["warmest"] - 1.0))
-        rise = self.baseline.rise(end, g, deviation, self._probability("level", GROUP * self.block_seconds))
-        if rise is not None:
-            self._raise(estimator, rise, block, self.baseline.level)
-
-    def _test_healthy_level(self, estimator: Estimator, block: BlockConductance, deviation: float) -> None:
-        """Compare the last blocks' total conductance with that of the healthy recordings, until there is a baseline."""
-        healthy = self.healthy
-        if healthy is None or not estimator.levels:
-            return
-        total, first, now = float(self._last["total"][-GROUP:].mean()), float(self._last["end"][0]), block.end
-        since = min(healthy.known_s, first) if counts_from_1970(now) else first
-        probability = self._probability("level", GROUP * self.block_seconds)
-        onset = first, since, now
-        deviation = math.hypot(deviation, healthy.deviation)
-        rise = estimate_rise(healthy, "healthy recordings", onset, total, deviation, probability)
-        if rise is not None:
-            self._raise(estimator, rise, block, healthy.level)
-
-    def _raise(
-        self, estimator: Estimator, rise: StepEstimate, block: BlockConductance, before: float | None = None
-    ) -> None:
-        leak, (onset, *ends) = self.leak, rise.onset
-        if before is None:
-            earlier = self._last["g"][self._last["end"] <= ends[0]][-GROUP:]
-            mean_before = float(np.mean(earlier)) if earlier.size else block.g - rise.size
-            before = leak.conductance_before if leak is not None else mean_before
-        reason = rise.reason if estimator.litres else f"{rise.reason}; {self.why_no_litres}"
-        half = WITHIN_95 * math.hypot(rise.deviation, estimator.size_error * rise.size)
-        low, high = (
-            estimator.inside * max(0.0, rise.size - half) * block.flow,
-            estimator.orifice * (rise.size + half) * block.flow,
-        )
-        self.leak = WatchedLeak(
-            raised_s=block.end if leak is None else leak.raised_s,
-            onset_s=onset,
-            onset_interval_s=(ends[0], ends[1]),
-            leak_lpm=rise.size * block.flow if estimator.litres else None,
-            leak_interval_lpm=(low, high) if estimator.litres else None,
-            conductance_before=before,
-            conductance_before_sd=rise.deviation,
-            test=rise.test,
-            cause=estimator.cause,
-            reason=reason,
-            score=rise.score,
-            threshold=rise.threshold,
-        )
-
-    def _estimate(self, estimator: Estimator, status: str, block: BlockConductance) -> BlockEstimate:
-        """Return the block's estimate: total flow, and its excess over the baseline, or over that before the leak."""
-        flow, sd = block.flow, block.sd * math.sqrt(self._detector.noise)
-        total = total_interval = leak = leak_interval = excess = None
-        if self.leak is not None:
-            excess = self._estimate_rise(self.leak, estimator, block, sd)
-        elif self.baseline is not None:
-            base, half = self.baseline, WITHIN_95 * sd
-            excess = block.g - base.level, block.g - base.high - half, block.g - base.low + half
-        if estimator.levels:
-            half = WITHIN_95 * math.hypot(sd, block.offset)
-            total = block.total * flow
-            total_interval = max(0.0, block.total - half) * flow, max(0.0, block.total + half) * flow
-        if excess is not None:
-            leak, low, high = (value * flow for value in excess)
-            leak_interval = max(0.0, low), estimator.orifice * max(0.0, high)
-        return BlockEstimate(self.blocks, block.end, status, total, total_interval, leak, leak_interval)
-
-    def _estimate_rise(
-        self, leak: WatchedLeak, estimator: Estimator, block: BlockConductance, sd: float
-    ) -> _WithInterval:
-        """Return the conductance since the onset of a leak, and its interval, in which the oil may have warmed."""
-        is_after = self._last["end"] - self.block_seconds >= leak.onset_interval_s[1]
-        recent = self._last["g"][is_after][-_OF_NOW:]
-        now, warming = float(np.mean(recent)) if recent.size else block.g, self._warming_factor(leak, block.end)
-        before, rise = max(leak.conductance_before, 0.0), now - leak.conductance_before
-        noise = sd / math.sqrt(max(len(recent), 1))
-        spread = WITHIN_95 * math.hypot(noise, leak.conductance_before_sd, estimator.size_error * rise)
-        return rise, estimator.inside * (now - before * warming - spread), now - before / warming + spread
-
-    def over_cycles(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Return the estimate of the last block with mean flows over the cycles seen, as a recording's are.
-
-        These are the last `RECENT` blocks since an interruption, of a leak those since its onset.
-        """
-        estimator, leak = self._estimator, self.leak
-        if estimator is None or not (estimator.litres and estimate.judged and len(self._last)):
-            return estimate
-        rows = self._last
-        if leak is not None:
-            is_after = rows["end"] - self.block_seconds >= leak.onset_interval_s[1]
-            rows = rows[is_after] if is_after.any() else rows[-1:]
-        flow = rows["flow"]
-        noise = math.sqrt(self._detector.noise * float(np.sum((rows["sd"] * flow) ** 2))) / len(rows)
-
-        def mean_of(values: Array) -> tuple[float, float]:
-            spread = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
-            return float(values.mean()), math.hypot(noise, spread)
-
-        total = interval = None
-        if estimator.levels:
-            total, deviation = mean_of(rows["total"] * flow)
-            half = WITHIN_95 * math.hypot(deviation, float(np.mean(rows["offset"] * flow)))
-            interval = max(0.0, total - half), max(0.0, total + half)
-        estimate = replace(estimate, total_lpm=total, total_interval_lpm=interval)
-        if leak is None and self.baseline is None:
-            return estimate
-        if leak is not None:
-            before, scale = leak.conductance_before, estimator.inside
-            warming = self._warming_factor(leak, estimate.t)
-            least, most = max(before, 0.0) * warming, before / warming
-            deviation_before = leak.conductance_before_sd
+        blocks, max_ratio, first_s = self._compared[-GROUP:], INFERENCE.oil.warmest, float(self._compared["end"][0])
+        offset, sd = float(blocks["offset"].mean()), math.sqrt(float(np.sum(blocks["sd"] ** 2))) / GROUP
+        if has_baseline:
+            name, mean, onset_s = "baseline", float(blocks["g"].mean()), float(blocks["end"].mean())
+            # the mean is compared with `max_ratio` times the baseline: a common error counts `max_ratio` - 1 times
+            deviation = math.hypot(sd, offset * (max_ratio - 1.0))
         else:
-            base = self.baseline
-            assert base is not None
-            before, scale, least, most, deviation_before = base.level, 1.0, base.high, base.low, 0.0
-        unit = float(flow.mean())
-        value, deviation = mean_of((rows["g"] - before) * flow)
-        half = WITHIN_95 * math.hypot(deviation, deviation_before * unit, estimator.size_error * value)
-        low = scale * (value + (before - least) * unit - half)
-        high = estimator.orifice * (value + (before - most) * unit + half)
-        return replace(estimate, leak_lpm=value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
+            name, mean, onset_s = "healthy recordings", float(blocks["total"].mean()), first_s
+            deviation = math.hypot(sd, offset)
+        # the leak began after the machine was known to be healthy, if both are times of one clock
+        has_one_clock = has_baseline or counts_from_1970(block.end)
+        onset = Interval(onset_s, min(healthy.known_s, first_s) if has_one_clock else first_s, block.end)
+        probability = self._false_alarm_probability(LEVEL, GROUP * self.block_seconds)
+        rise = find_level_rise(healthy, onset, mean, deviation, probability)
+        if rise is not None:
+            reason = (
+                f"the leakage conductance is {mean:.3g} m^3/(s Pa), over {max_ratio:g} times the least of the {name}: "
+                "more than the warmest oil makes of it"
+            )
+            self._raise_leak(estimator, rise, block, rise.threshold(probability), reason, before=healthy.level)
 
-    @staticmethod
-    def _warming_factor(leak: WatchedLeak, t: float) -> float:
-        """Return the factor by which warmer oil may have raised the conductance since the onset of a leak."""
-        oil, hours = priors("inference")["oil"], max(0.0, t - leak.onset_s) / 3600.0
-        return float(oil["warmest"] ** min(1.0, hours / oil["shift"]))
+    def _raise_leak(
+        self,
+        estimator: Estimator,
+        rise: LiveRise,
+        block: BlockConductance,
+        threshold: float,
+        reason: str,
+        before: float | None = None,
+        cause: Cause | None = None,
+    ) -> None:
+        """Set the leak from a rise that a test shows, at the end of a block.
+
+        `before`: conductance before the onset; None: the mean of the blocks before. Of a leak that was raised before,
+        conductance and time of the alarm stay. `cause`: None means that of all the estimator's leaks.
+        """
+        raised_s = block.end
+        if self.leak is not None:
+            before, raised_s = self.leak.conductance_before, self.leak.raised_s
+        elif before is None:
+            earlier_g = self._compared["g"][self._compared["end"] <= rise.interval.low][-GROUP:]
+            before = float(np.mean(earlier_g)) if earlier_g.size else block.g - rise.size
+        reason = f"{reason} (score {rise.score:.1f}, threshold {threshold:.1f})"
+        self.leak = WatchedLeak(
+            raised_s=raised_s,
+            onset_s=rise.interval.value,
+            onset_interval_s=rise.interval[1:],
+            leak_lpm=None,
+            leak_interval_lpm=None,
+            conductance_before=before,
+            rise=rise.size,
+            rise_sd=rise.deviation,
+            pressure=block.pressure,
+            test=rise.test,
+            cause=cause or estimator.cause,
+            reason=reason if estimator.litres else f"{reason}; {self.why_no_litres}",
+            score=rise.score,
+            threshold=threshold,
+        )
+        evidence = self.evidence
+        self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
+
+    def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
+        """Return the stored blocks since the latest onset of a leak, at least the last one."""
+        is_after = self._compared["end"] - self.block_seconds >= leak.onset_interval_s[1]
+        return self._compared[is_after] if is_after.any() else self._compared[-1:]
+
+    def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
+        """Replace the flows of the last block's estimate by means over cycles of the duty, as those of a recording are.
+
+        The means are over the last `RECENT` blocks since an interruption, or since the onset of a leak.
+        """
+        estimator = self._estimator
+        if estimator is None or not (estimate.judged and len(self._compared)):
+            return estimate
+        blocks = self._compared if self.leak is None else self._blocks_of_leak(self.leak)
+        return self._add_flows(estimate, estimator, blocks)
+
+    def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
+        """Add mean total flow and leak of blocks [L/min], with 95 % intervals, to an estimate, if L/min are stated."""
+        if not estimator.litres:
+            return estimate
+        lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
+        errors, mean_lpm = blocks["sd"] * lpm * math.sqrt(self._detector.noise), float(lpm.mean())
+        if estimator.states_level:
+            total = mean_flow(blocks["total"] * lpm, errors)
+            half_width = WITHIN_95 * math.hypot(total.deviation, float(np.mean(blocks["offset"] * lpm)))
+            interval = max(0.0, total.value - half_width), max(0.0, total.value + half_width)
+            estimate = replace(estimate, total_lpm=total.value, total_interval_lpm=interval)
+        reference = self.baseline if self.leak is None else level_before_leak(self.leak, estimate.t)
+        if reference is None:
+            return estimate
+        min_fraction, reference_sd = 1.0, 0.0
+        if self.leak is not None:
+            min_fraction, reference_sd = estimator.min_internal_fraction, self.leak.rise_sd
+        leak = mean_flow((blocks["g"] - reference.level) * lpm, errors)
+        half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
+        # the interval of the reference level, and what part of the flow may be outside or by an orifice, widen it
+        low = min_fraction * (leak.value + (reference.level - reference.high) * mean_lpm - half_width)
+        high = estimator.orifice_factor * (leak.value + (reference.level - reference.low) * mean_lpm + half_width)
+        return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the watch as plain values for JSON; its ``"version"`` is the format's."""
+        """Return the state of the watch as plain values for JSON; ``"version"`` is that of the format."""
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
             "rig": self._rig_text,
-            **saved(self, ("_litres", *_SAVED)),
+            **save_attributes(self, ("_litres", *_SAVED)),
             "estimator": None if estimator is None else estimator.state(),
         }
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Watch:
-        """Return the watch that `state` was of, also after JSON; it continues with the same bits.
+        """Restore a watch from its `state`, which may have passed through JSON; later results are bit-identical.
 
-        Raises InputError where the state is none, of another version, or damaged.
+        Raises InputError if the state is of another version or damaged.
         """
-        version = part_of(state, "version", int)
+        version = require_part(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
-        rate, hours = (part_of(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
-        litres = restored(dict[str, bool], part_of(state, "litres", Mapping), "litres")
-        watch = cls(_parse_rig(part_of(state, "rig", str)), rate, hours, litres=litres)
-        recall(watch, _SAVED, state, _KINDS_OF_SAVED)
-        if (estimator := part_of(state, "estimator", (Mapping, type(None)))) is not None:
+        rate, hours = (require_part(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
+        litres = restore(dict[str, bool], require_part(state, "litres", Mapping), "litres")
+        watch = cls(_parse_rig(require_part(state, "rig", str)), rate, hours, litres=litres)
+        restore_attributes(watch, _SAVED, state, _SAVED_TYPES)
+        if (estimator := require_part(state, "estimator", (Mapping, type(None)))) is not None:
             watch._estimator = watch._make_estimator()
-            watch._estimator.recall(estimator)
+            watch._estimator.load_state(estimator)
         return watch
 
 
-#: Attributes that are the state beside rig and estimator; types of those that may be None.
+#: Attributes saved in addition to rig and estimator; types of those that may be None.
 _SAVED = (
     *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector"),
-    *("_learning", "baseline", "leak", "healthy", "_last", "_group"),
+    *("_learning", "baseline", "leak", "healthy", "_compared", "_grouped", "_since", "_is_known"),
 )
-_KINDS_OF_SAVED = {"baseline": WatchBaseline, "leak": WatchedLeak, "healthy": HealthyLevel}
+_SAVED_TYPES = {"baseline": WatchBaseline, "leak": WatchedLeak, "healthy": HealthyLevel}
 
 
 @lru_cache(maxsize=256)
 def _parse_rig(text: str) -> Rig:
-    """Return the rig of a saved state; raises InputError where it is none."""
+    """Parse the rig of a saved state; raise InputError if it is not valid."""
     from sealscope.parameters import Rig
 
     try:
@@ -529,19 +552,19 @@ def watch(
     learn_hours: float = 8.0,
     healthy: HealthyLevel | None = None,
 ) -> Watch:
-    """Watch a running actuator: blocks in, L/min with an interval and alarms out.
+    """Watch a running actuator: estimate its leakage block by block, and alarm at a stated rate of false alarms.
 
     Parameters
     ----------
     rig : Rig, str or path, default "thesis"
-        Gives the piston's area and the pump's displacement; without a position all of the machine's model.
+        States piston area and pump displacement; without a recorded position the whole model is used.
     false_alarms_per_1000_h : float, default 1
         False alarms of a healthy machine per 1000 operating hours, at most.
     learn_hours : float, default 8
-        Operating hours of healthy running that the baseline is learned from; then it is frozen.
+        Operating hours from which the baseline is learned; then it is frozen.
     healthy : HealthyLevel, optional
-        Of a machine's healthy recordings: until there is a baseline, the total leakage is compared with it, so that a
-        leak shows that is there from the first sample.
+        Level of the machine's healthy recordings. Until there is a baseline, the total leakage is compared with it, so
+        that a leak present from the first sample is found.
 
     Returns
     -------

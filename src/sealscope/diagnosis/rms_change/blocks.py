@@ -1,7 +1,7 @@
 """Cut a recording into blocks that compare with each other, and give each the RMS of its details and of its duty.
 
-A block is a whole share of the command's cycle, so that blocks of the same phase differ by noise and by changes of the
-machine alone; where there is no cycle it is a window of fixed length.
+A block is a whole fraction of the command's cycle, so that blocks of the same phase differ by noise and by changes of
+the machine alone; without a cycle it is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -11,32 +11,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.corrections.gaps import touched
+from sealscope.recordings.corrections.gaps import flag_bridged
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.motion import ROUNDING
-from sealscope.recordings.quality import mostly_clipped
+from sealscope.recordings.quality import is_mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, Details, details, mean_squares, segment_means
 from sealscope.signals.filters import IntArray
 
-#: Quantities that make the verdict; d1 holds noise alone, d3d4 follows from d3 and d4.
+#: Quantities that are judged; d1 is almost noise alone, d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
-#: What is known of a block's duty, in the order of the columns of `RmsBlocks.duty`.
-DUTY = ("command", "rate", "load", "direction")
+#: Features of a block's duty, in the order of the columns of `RmsBlocks.duty`.
+DUTY = tuple(vars(RMS_PRIORS.duty))
 
 
 @dataclass(frozen=True)
 class RmsBlocks:
-    """Log RMS of every quantity (`QUANTITIES`) in every block.
+    """Log RMS of every quantity (`QUANTITIES`) in the n blocks without missing samples.
 
     `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber), `duty` (n, 4): log
-    RMS of the command, of its rate of change, and of the pressure difference, and the mean of the latter over its RMS;
-    the phase's own level is taken out of both. `chambers`: their names; `phases`: blocks a cycle (1: none); `cycle`:
-    its length [s], None without a cycle; `still`: the first block in which a reading does not move, as text (its log
-    RMS means nothing); `left_out`: blocks with missing samples, which are not among these.
+    RMS of the command, of its rate of change, and of the pressure difference, and the mean of the latter over its RMS,
+    all without the mean of the block's phase; `chambers`: their names; `phases`: blocks a cycle; `cycle` of the command
+    [s], None if there is none; `frozen`: the first block in which a reading does not move, as text (its log RMS means
+    nothing); `n_left_out`: number of blocks with missing samples.
     """
 
     edges: Array
@@ -45,18 +46,18 @@ class RmsBlocks:
     chambers: tuple[str, ...]
     phases: int
     cycle: float | None
-    still: str | None = None
-    left_out: int = 0
+    frozen: str | None = None
+    n_left_out: int = 0
 
     @property
     def share(self) -> float:
-        """Share of all blocks that are not left out."""
-        return len(self.log_rms) / max(len(self.log_rms) + self.left_out, 1)
+        """Fraction of all blocks that are not left out."""
+        return len(self.log_rms) / max(len(self.log_rms) + self.n_left_out, 1)
 
     @property
     def names(self) -> list[str]:
         """Names of the columns, such as "d3 of p_A"."""
-        return columns_of(self.chambers)
+        return column_names(self.chambers)
 
     @property
     def seconds(self) -> float:
@@ -64,34 +65,34 @@ class RmsBlocks:
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return the blocks after the machine's start: without 10 s or three cycles, at most an eighth of them."""
-        n, believed = len(self.log_rms), priors("rms_change")["blocks"]
-        start = max(believed["settling"], believed["settling_cycles"] * (self.cycle or 0.0))
-        first = min(n // 8, int(np.ceil(start / self.seconds))) if n else 0
+        """Return the blocks without the machine's start: 10 s or three cycles, but at most an eighth of the blocks."""
+        n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
+        start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
+        first = min(n_blocks // 8, int(np.ceil(start_s / self.seconds))) if n_blocks else 0
         return replace(self, edges=self.edges[first:], log_rms=self.log_rms[first:], duty=self.duty[first:])
 
 
-def columns_of(chambers: Sequence[str]) -> list[str]:
+def column_names(chambers: Sequence[str]) -> list[str]:
     """Return the names of the columns of `RmsBlocks.log_rms`."""
     return [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chambers to judge: those with readings not mostly clipped, or all."""
+    """Return the chambers whose readings are not mostly clipped, or all chambers if there is none such."""
     chambers = chambers_of(recording)
-    return tuple(name for name in chambers if not mostly_clipped(recording[name])) or chambers
+    return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
 
-def whole_levels(recording: Recording) -> tuple[Array, Array]:
-    """Return the log RMS (5 per judged chamber,) and the duty (4,) of the whole recording but its edges."""
+def measure_levels(recording: Recording) -> tuple[Array, Array]:
+    """Compute the log RMS (5 per judged chamber,) and the duty (4,) of a recording without the transform's edges."""
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
-    log_rms, duty = _columns(recording, transformed, np.array([inside.start, inside.stop]))
+    log_rms, duty = _measure_blocks(recording, transformed, np.array([inside.start, inside.stop]))
     return log_rms[0], duty[0]
 
 
-def _columns(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
-    """Return log RMS (n, 5 per chamber) and duty (n, 4) between consecutive sample bounds."""
+def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
+    """Compute log RMS (n, 5 per chamber) and duty (n, 4) between consecutive sample `bounds` (n + 1,)."""
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
         load = recording["p_A"] - recording["p_B"]
@@ -99,48 +100,65 @@ def _columns(recording: Recording, transformed: list[Details], bounds: IntArray)
         load = recording[chambers[0]] - recording[chambers[0]].mean()
     command = recording.channels.get("u", np.zeros(len(recording)))
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
-    rest = np.maximum(
-        priors("rms_change")["blocks"]["standstill"] ** 2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny
-    )
+    # keeps the logarithm finite in blocks at standstill
+    floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
     with np.errstate(divide="ignore", over="ignore"):
         energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
-        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + rest)
+        log_rms, duty = 0.5 * np.log(energies), 0.5 * np.log(segment_means(squares, bounds) + floor)
     return log_rms, np.vstack([duty, segment_means(load[None], bounds) / np.exp(duty[-1:])]).T
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
-    chambers, rate, believed = judged_chambers(recording), recording.rate, priors("rms_change")["blocks"]
+    chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
-    inside, cycle = transformed[0].inside(), find_cycle(recording)
-    target = max(believed["seconds"], believed["samples"] / rate)
-    phases = 1 if cycle is None else max(1, round(cycle / target))
-    length = target if cycle is None else cycle / phases * max(1, round(target / (cycle / phases)))
-    samples = inside.stop - inside.start
-    if samples > believed["most"] * length * rate:
-        length *= phases * math.ceil(samples / (believed["most"] * phases * length * rate))
+    cycle = find_cycle(recording)
+    bounds, phases = _block_bounds(transformed[0].inside(), recording.rate, cycle)
+    if len(bounds) == 1:  # too short for a block
+        no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
+        return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, phases, cycle)
+    log_rms, duty = _measure_blocks(recording, transformed, bounds)
+    times, is_complete = recording.t[0] + bounds / recording.rate, ~flag_bridged(recording, bounds)
+    frozen = _find_frozen(recording, chambers, log_rms, is_complete, times)
+    log_rms, duty, phase = log_rms[is_complete], duty[is_complete], np.flatnonzero(is_complete) % phases
+    if frozen is None:
+        for values in (log_rms, duty):  # replace the mean of every phase by that of all
+            mean = values.mean(axis=0) if len(values) else 0.0
+            for number in np.unique(phase) if phases > 1 else ():
+                values[phase == number] += mean - values[phase == number].mean(axis=0)
+    end = times[1:][is_complete][-1:] if is_complete.any() else times[:1]
+    edges, n_left_out = np.append(times[:-1][is_complete], end), int(np.count_nonzero(~is_complete))
+    return RmsBlocks(edges, log_rms, duty, chambers, phases, cycle, frozen, n_left_out)
+
+
+def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
+    """Choose the sample bounds of the blocks between the transform's edges, and the number of blocks in a cycle.
+
+    A block is a whole fraction, or a multiple, of the cycle [s]; of several cycles if there would be too many blocks.
+    """
+    prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
+    block_s = min_block_s = max(prior.seconds, prior.samples / rate)
+    phases = 1
+    if cycle is not None:
+        phases = max(1, round(cycle / min_block_s))
+        phase_s = cycle / phases
+        block_s = phase_s * max(1, round(min_block_s / phase_s))
+    if n_samples > prior.most * block_s * rate:
+        block_s *= phases * math.ceil(n_samples / (prior.most * phases * block_s * rate))
         phases = 1
-    count = int(samples / (length * rate))
-    bounds = inside.start + np.round(np.arange(count + 1) * length * rate).astype(np.int64)
-    if count == 0:
-        empty = np.empty((0, len(QUANTITIES) * len(chambers)))
-        return RmsBlocks(recording.t[bounds], empty, np.empty((0, len(DUTY))), chambers, phases, cycle)
-    log_rms, duty = _columns(recording, transformed, bounds)
-    ends, kept = recording.t[0] + bounds / rate, ~touched(recording, bounds)
+    n_blocks = int(n_samples / (block_s * rate))
+    return inside.start + np.round(np.arange(n_blocks + 1) * block_s * rate).astype(np.int64), phases
+
+
+def _find_frozen(
+    recording: Recording, chambers: Sequence[str], log_rms: Array, is_complete: NDArray[np.bool_], times: Array
+) -> str | None:
+    """Describe the first block in which a detail d1 to d4 is a rounding error or no number; `times`: bounds [s]."""
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
-    levels = log_rms.reshape(count, len(chambers), -1)[:, :, :-1]  # of d1 to d4; else rounding, or no number
-    fixed = kept[:, None] & ~np.all(np.isfinite(levels) & (levels > floor), axis=2)
-    still = None
-    if fixed.any():
-        chamber = int(np.argmax(fixed.any(axis=0)))
-        first = int(np.argmax(fixed[:, chamber]))
-        still = f"{chambers[chamber]} does not move from {ends[first]:.4g} s to {ends[first + 1]:.4g} s"
-    elif phases > 1:
-        for values in (log_rms, duty):
-            level = values[kept].mean(axis=0)
-            for phase in range(min(phases, count)):
-                same = np.flatnonzero(kept)[np.flatnonzero(kept) % phases == phase]
-                if same.size:
-                    values[same] += level - values[same].mean(axis=0)
-    edges = np.append(ends[:-1][kept], ends[1:][kept][-1:] if kept.any() else ends[:1])
-    return RmsBlocks(edges, log_rms[kept], duty[kept], chambers, phases, cycle, still, int(np.count_nonzero(~kept)))
+    levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4
+    is_frozen = is_complete[:, None] & ~np.all(np.isfinite(levels) & (levels > floor), axis=2)
+    if not is_frozen.any():
+        return None
+    chamber = int(np.argmax(is_frozen.any(axis=0)))
+    block = int(np.argmax(is_frozen[:, chamber]))
+    return f"{chambers[chamber]} does not move from {times[block]:.4g} s to {times[block + 1]:.4g} s"

@@ -12,37 +12,38 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.differences import difference
+from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.inference.differences import compare_with_healthy
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
-from sealscope.diagnosis.inference.onset import step_tests
-from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.onset import Interval, StepTest, step_tests
+from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.blocks import (
     JUDGED,
     RmsBlocks,
-    columns_of,
+    column_names,
     cut_blocks,
     judged_chambers,
-    whole_levels,
+    measure_levels,
 )
-from sealscope.diagnosis.rms_change.ringing import information, rises
+from sealscope.diagnosis.rms_change.ringing import change_information, estimate_rises
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.hydraulics import lack_of_chambers
+from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.motion import constant
+from sealscope.recordings.motion import is_constant
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, shortest
+from sealscope.signals.details import QUANTITIES, min_samples
 
 #: Name of the data that these observables describe.
 DETAILS = "details"
-#: Details that ringing, and no noise alone, fills.
+#: Details that ringing dominates, not noise.
 RINGING = ("d2", "d3")
 
 
 class RmsChange:
     """Change of the details' RMS, within a recording or against leak-free ones."""
 
-    name = "rms change"
+    name = RMS_CHANGE
     reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
@@ -50,154 +51,167 @@ class RmsChange:
 
     def usable(self, recording: Recording) -> str | None:
         """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
-        if lack := lack_of_chambers(recording):
-            return lack
-        if len(recording) < shortest():
-            return f"needs {shortest()} samples or more without a gap, got {len(recording)}"
-        still = next((name for name in chambers_of(recording) if constant(recording[name])), None)
-        return None if still is None else f"{still} is constant"
+        if missing := describe_missing_chambers(recording):
+            return missing
+        if len(recording) < min_samples():
+            return f"needs {min_samples()} samples or more without a gap, got {len(recording)}"
+        frozen = next((name for name in chambers_of(recording) if is_constant(recording[name])), None)
+        return None if frozen is None else f"{frozen} is constant"
 
-    def learn(self, recording: Recording) -> Lesson:
-        """Return the lesson of a healthy recording: log RMS and duty, their chambers, and the start."""
-        levels, duty = whole_levels(recording)
-        chambers, start = list(judged_chambers(recording)), start_seconds(recording)
-        lesson_head = {"chambers": chambers, "recorded": list(chambers_of(recording)), "rate": recording.rate}
-        return {**lesson_head, "start_s": start, "levels": levels, "duty": duty}
+    def learn(self, recording: Recording) -> Summary:
+        """Summarise a healthy recording for later comparisons: log RMS, duty, chambers, rate and start."""
+        levels, duty = measure_levels(recording)
+        return {
+            "chambers": list(judged_chambers(recording)),
+            "recorded": list(chambers_of(recording)),
+            "rate": recording.rate,
+            "start_s": start_seconds(recording),
+            "levels": levels,
+            "duty": duty,
+        }
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Return the changes of the details' RMS, within the recording or against the healthy ones."""
-        slowest: float = priors("rms_change")["rate"]["slowest"]
-        if recording.rate < slowest:
-            least = f"needs {slowest:g} Hz or more to see the ringing that a leak damps"
-            return Observed(self.name, lack=f"{least}, got {recording.rate:g} Hz: is the unit of the time right?")
+        """Test the details' RMS for changes, within the recording or against the healthy ones."""
+        min_rate: float = RMS_PRIORS.rate.slowest
+        if recording.rate < min_rate:
+            rule = f"needs {min_rate:g} Hz or more to see the ringing that a leak damps"
+            return Observed(self.name, lack=f"{rule}, got {recording.rate:g} Hz: is the unit of the time right?")
         if baseline:
             return observe_against(recording, baseline)
         blocks = cut_blocks(recording)
-        if blocks.still is not None:
-            return Observed(self.name, lack=f"the pressures cannot be trusted: {blocks.still}")
-        if len(blocks.log_rms) < (fewest := priors("rms_change")["blocks"]["fewest"]):
-            short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {fewest} are needed"
+        if blocks.frozen is not None:
+            return Observed(self.name, lack=f"the pressures cannot be trusted: {blocks.frozen}")
+        if len(blocks.log_rms) < (min_blocks := RMS_PRIORS.blocks.fewest):
+            short = f"too short to be its own baseline: {len(blocks.log_rms)} blocks, {min_blocks} are needed"
             return Observed(self.name, lack=f"{short}; give leak-free recordings as --baseline")
-        report = observe_within(blocks.without_start(), recording.rate)
-        ringing = report.ringing and report.ringing._replace(unused=recording.unused)
-        return replace(report, ringing=ringing)
+        return observe_within(blocks.without_start(), recording.rate, recording.unused)
 
 
-def observe_within(blocks: RmsBlocks, rate: float) -> Observed:
+def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test every quantity of every chamber for a step within the blocks of one recording.
 
-    The onset is that of all judged quantities that moved, which they share.
+    All judged quantities that changed share one onset, by the sum of their log likelihoods. `rate`: of the samples
+    [Hz]; `unused`: recorded columns that no channel is made of.
     """
-    looks = 2.0 * len(JUDGED) * len(blocks.chambers)
-    tests = []
-    for name, quantity, weight in zip(blocks.names, *information(blocks), strict=True):
+    changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
+    judged_steps, bounds = list[StepTest](), list[float]()
+    for name, quantity, weight in zip(blocks.names, *change_information(blocks), strict=True):
         steps = step_tests(quantity, (1.0, -1.0))
         if not steps:
             return Observed(RmsChange.name, lack=f"{name} says nothing in most blocks")
-        best = min((0, 1), key=lambda k: steps[k].chance)
-        bound = max(step.bound() for step in steps)
-        tests.append((name, steps[best], (1.0, -1.0)[best] * weight, bound))
-    judged = [row for row in tests if row[0].split()[0] in JUDGED]
-    rarest = min((step for _, step, _, _ in judged), key=lambda step: step.chance)
-    moved = [step.likelihood for _, step, _, _ in judged if step is rarest or step.chance < 0.5]
-    likelihood = np.sum(moved, axis=0)
+        up, down = steps
+        step, sign = (up, 1.0) if up.chance <= down.chance else (down, -1.0)
+        changes[name] = step, sign * weight * step.fitted.size
+        if _is_judged(name):
+            judged_steps.append(step)
+            bounds.append(max(up.bound(), down.bound()))
+    rarest = min(judged_steps, key=lambda step: step.chance)
+    # a step that half of healthy recordings show dates nothing
+    likelihood = np.sum([step.likelihood for step in judged_steps if step is rarest or step.chance < 0.5], axis=0)
     onset = replace(rarest, likelihood=likelihood, best=int(likelihood.argmax())).onset()
     observables = [
-        Observable(
-            name=_name_of(name, sign * step.fitted[0]),
-            data=DETAILS if name.split()[0] in JUDGED else "noise of details",
-            score=step.score,
-            chance=min(1.0, looks * step.chance),
-            onset=onset,
-            size=sign * step.fitted[0],
-        )
-        for name, step, sign, _ in tests
+        _make_observable(name, size, step.score, step.chance, blocks.chambers, onset)
+        for name, (step, size) in changes.items()
     ]
-    bound = min(bound for _, _, _, bound in judged)
-    return Observed(RmsChange.name, tuple(observables), share=blocks.share, ringing=Ringing(bound, rate, 0, True))
+    # blocks left out anywhere count as not judged at the end, so that few blocks do not exclude a leak
+    return Observed(
+        RmsChange.name,
+        tuple(observables),
+        share=blocks.share,
+        judged_until=blocks.share,
+        ringing=Ringing(min(bounds), rate, 0, is_dated=True, unused=unused),
+    )
 
 
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
-    """Compare a recording with leak-free recordings of the machine."""
-    chambers, recorded = judged_chambers(recording), list(chambers_of(recording))  # these make the duty
-    lessons = [
-        lesson
-        for lesson in lessons_of(RmsChange(), baseline)
-        if (lesson.get("recorded") or lesson["chambers"]) == recorded
-        and set(chambers) <= set(lesson["chambers"])
-        and abs(lesson["rate"] / recording.rate - 1.0) < 1e-3
+    """Test a recording's RMS for changes against leak-free recordings of the same chambers and rate."""
+    chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
+    # the duty is computed from all recorded chambers, and must be of the same ones
+    summaries = [
+        summary
+        for summary in healthy_summaries(RmsChange(), baseline)
+        if (summary.get("recorded") or summary["chambers"]) == recorded
+        and set(chambers) <= set(summary["chambers"])
+        and abs(summary["rate"] / recording.rate - 1.0) < 1e-3  # error of clocks
     ]
-    if not lessons:
+    if not summaries:
         lack = f"no baseline recording has the same chambers at {recording.rate:g} Hz"
         return Observed(RmsChange.name, lack=lack)
     judged = RmsChange().learn(recording)
-    observables, bound = compare_lessons(judged, lessons, chambers)
-    is_dated = None not in [lesson.get("start_s") for lesson in (judged, *lessons)]
-    return Observed(
-        RmsChange.name, observables, ringing=Ringing(bound, recording.rate, len(lessons), is_dated, recording.unused)
-    )
+    observables, bound = compare_summaries(judged, summaries, chambers)
+    is_dated = None not in [summary.get("start_s") for summary in (judged, *summaries)]
+    ringing = Ringing(bound, recording.rate, len(summaries), is_dated, recording.unused)
+    return Observed(RmsChange.name, observables, ringing=ringing)
 
 
-def compare_lessons(
-    judged: Lesson, lessons: Sequence[Lesson], chambers: Sequence[str]
+def compare_summaries(
+    judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]
 ) -> tuple[tuple[Observable, ...], float]:
     """Test every quantity of every chamber for a rise or fall against leak-free recordings.
 
-    Returns
-    -------
-    observables : tuple of Observable
-    bound : float
-        95 % bound of the size of a change that would not show, the smallest of all quantities.
+    Returns the observables, and the 95 % upper bound of the size of an undetected change, the smallest of all judged
+    quantities.
     """
-    starts = [*(lesson.get("start_s") for lesson in lessons), judged.get("start_s")]
+    starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
-    duties = np.array([lesson["duty"] for lesson in lessons], dtype=float)
-    levels = np.array([_levels(lesson, chambers) for lesson in lessons])
-    duty = np.asarray(judged["duty"], dtype=float)
-    looks, observables, bounds = 2.0 * len(JUDGED) * len(chambers), [], []
-    changes = rises(_levels(judged, chambers), duty, levels, duties, times)
-    for name, rise, weight in zip(columns_of(chambers), *changes, strict=True):
-        size = rise._replace(value=abs(rise.value))
-        is_judged = name.split()[0] in JUDGED
-        observables.append(
-            Observable(
-                name=_name_of(name, rise.value),
-                data=DETAILS if is_judged else "noise of details",
-                score=2.0 * size.log_ratio(size.value),
-                chance=min(1.0, looks * size.chance),
-                size=weight * rise.value,
-            )
-        )
-        bounds += [size.bound()] if is_judged else []
-    observables += _sides(judged, lessons, chambers)
+    duties = np.array([summary["duty"] for summary in summaries], dtype=float)
+    levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
+    observables, bounds = list[Observable](), list[float]()
+    judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
+    changes = estimate_rises(judged_levels, judged_duty, levels, duties, times)
+    for name, rise, weight in zip(column_names(chambers), *changes, strict=True):
+        change = rise._replace(value=abs(rise.value))
+        score = 2.0 * change.log_ratio(change.value)
+        observables.append(_make_observable(name, weight * rise.value, score, change.chance, chambers))
+        bounds += [change.bound()] if _is_judged(name) else []
+    observables += _compare_chambers(judged, summaries, chambers)
     return tuple(observables), min(bounds)
 
 
-def _sides(judged: Lesson, lessons: Sequence[Lesson], chambers: Sequence[str]) -> Iterator[Observable]:
-    """Yield how the ringing of one chamber stands to the other's, which the machine moves alike."""
+def _compare_chambers(judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]) -> Iterator[Observable]:
+    """Test the ratio of the chambers' ringing for a change: a filter at one sensor makes one, the machine does not."""
     if len(chambers) != len(CHAMBERS):
         return
-    rows = [(QUANTITIES.index(name), len(QUANTITIES) + QUANTITIES.index(name)) for name in RINGING]
+    ringing = [QUANTITIES.index(name) for name in RINGING]
 
-    def mean_difference(lesson: Lesson) -> float:
-        levels = _levels(lesson, chambers)
-        return float(np.mean([levels[first] - levels[second] for first, second in rows]))
+    def mean_difference(summary: Summary) -> float:
+        """Average the log ratio of p_A's ringing to p_B's."""
+        levels_A, levels_B = _summary_levels(summary, chambers).reshape(2, -1)
+        return float(np.mean(levels_A[ringing] - levels_B[ringing]))
 
-    error: float = priors("rms_change")["recordings"]["error"]
-    observable = difference(
-        "p_A beside p_B", "sides", mean_difference(judged), [mean_difference(lesson) for lesson in lessons], error
-    )
+    error: float = RMS_PRIORS.recordings.error
+    healthy = [mean_difference(summary) for summary in summaries]
+    observable = compare_with_healthy("p_A beside p_B", "sides", mean_difference(judged), healthy, error)
     if observable is not None:
-        filtered = priors("rms_change")["filtered"]
-        away = np.log(max(abs(observable.size), error) / filtered["size"]) / filtered["spread"]
-        yield replace(observable, advantage=-float(min(away, 0.0) ** 2))
+        filter_prior = RMS_PRIORS.filtered
+        # changes smaller than those that filters usually make count against a filter
+        deviations = np.log(max(abs(observable.size), error) / filter_prior.size) / filter_prior.spread
+        yield replace(observable, advantage=-float(min(deviations, 0.0) ** 2))
 
 
-def _name_of(quantity: str, change: float) -> str:
-    return f"{'rise' if change > 0.0 else 'fall'} of {quantity}"
+def _is_judged(column: str) -> bool:
+    """Test whether a column, such as "d3 of p_A", is of a judged quantity."""
+    return column.split(maxsplit=1)[0] in JUDGED
 
 
-def _levels(lesson: Lesson, chambers: Sequence[str]) -> Array:
-    """Return the log RMS (5 per chamber,) of some of the chambers of a healthy recording."""
-    levels = np.asarray(lesson["levels"], dtype=float).reshape(len(lesson["chambers"]), -1)
-    return np.concatenate([levels[lesson["chambers"].index(chamber)] for chamber in chambers])
+def _make_observable(
+    column: str, size: float, score: float, chance: float, chambers: Sequence[str], onset: Interval | None = None
+) -> Observable:
+    """Make the observable of a column's change.
+
+    `chance` is that of a single test; there are two, for a rise and a fall, of each judged quantity of each chamber.
+    """
+    return Observable(
+        name=f"{'rise' if size > 0.0 else 'fall'} of {column}",
+        data=DETAILS if _is_judged(column) else "noise of details",
+        score=score,
+        chance=min(1.0, 2.0 * len(JUDGED) * len(chambers) * chance),
+        onset=onset,
+        size=size,
+    )
+
+
+def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
+    """Select the log RMS (5 per chamber,) of these chambers from a recording's summary."""
+    levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
+    return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

@@ -4,44 +4,42 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.decision.verdicts import decide_verdict
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.trend.reading import (
     Basis,
     LeakReading,
     TrendPoint,
-    findings_of,
-    reading_of,
-    scatter_of,
-    timeline,
+    build_timeline,
+    estimate_reading,
+    list_findings,
+    scatter_prior,
 )
-from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, episodes, outlier_excess
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Verdict
+from sealscope.diagnosis.trend.trend_leak import decide_trend
+from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, find_episodes, outlier_excess
+from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, Evidence, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import MachineState, state_of
 from sealscope.errors import InputError
-from sealscope.recordings.formats.columns import listed
+from sealscope.paragraphs import join_names
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_values import plain
-from sealscope.units import DAY, LITRE_PER_MINUTE
+from sealscope.storage.plain_values import to_plain
+from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
-
-
-#: Fewest comparable recordings of which a trend is stated.
-FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -50,10 +48,9 @@ class Trend:
 
     Parameters
     ----------
-    verdict : {"leak", "no leak", "cannot tell"}
-        `leak` where the level rose beyond what a healthy machine does, and was not repaired since.
-    reason : str
-        Why, in one line.
+    decision : Evidence
+        Verdict, reason, leak, bound and onset, as of a diagnosis: `leak` where the level rose beyond what a healthy
+        machine does, a leak explains it, and it was not repaired since.
     basis : str or None
         What the levels rest on: volume balance, pressure response, or the damping of the pressures' ringing.
     unit : str
@@ -63,12 +60,12 @@ class Trend:
     points : tuple of TrendPoint
         The recordings in the order of their times.
     groups : tuple of str
-        What sets each group of recordings apart from the first one.
+        How each group of comparable recordings differs from the first group.
     episodes : tuple of Episode
-        Stretches between repairs; the last one is that of the machine as it is. Days of its `wear` count from the first
+        Recordings between repairs; the last episode is the present one. Days of its `wear` count from the first
         recording.
     rows : tuple of int
-        Numbers of the points that the episodes count.
+        Indices of the points that the episodes compare; rows of an `Episode` are indices into these.
     repair : RepairLimit
         Leak beyond the healthy level at which a repair is due; `limit` is that level.
     machine : AssumedMachine or None
@@ -89,14 +86,13 @@ class Trend:
     >>> days = [ss.simulate(duration="40 s", seed=day, leak="0.02 L/min" if day >= 4 else None) for day in range(6)]
     >>> days = [replace(run, provenance={"start": f"2024-05-0{day + 1}T08:00"}) for day, run in enumerate(days)]
     >>> trend = ss.trend(days, rig="thesis")
-    >>> trend.verdict, f"{trend.wear.now.value:.3f} {trend.unit}", trend.alarm.day
+    >>> trend.verdict, f"{trend.wear.total.value:.3f} {trend.unit}", trend.alarm.day
     ('leak', '0.020 L/min', 5.0)
     >>> trend.as_dict()["onset"]["value"]
     '2024-05-05T08:00:00'
     """
 
-    verdict: Verdict
-    reason: str
+    decision: Evidence
     basis: Basis | None
     unit: str
     pressure: float | None
@@ -112,84 +108,120 @@ class Trend:
     dated: bool
 
     @property
+    def verdict(self) -> Verdict:
+        """The verdict, "leak", "no leak" or "cannot tell"."""
+        return self.decision.verdict
+
+    @property
+    def reason(self) -> str:
+        """Reason of the verdict in one line, with the false-alarm rate."""
+        fell = bool(self.episodes) and self.episodes[-1].fell
+        rate = f"1 false alarm in {self.years:g} machine-years"
+        return f"{self.decision.reason}{' since the repair' if fell else ''} ({rate})"
+
+    @property
     def wear(self) -> Wear | None:
-        """Wear of the last stretch, None where there is no level."""
+        """Wear since the last repair, None if no recording states a level."""
         return self.episodes[-1].wear if self.episodes else None
 
     @property
+    def total(self) -> Interval | None:
+        """Present flow past pump and piston in the trend's unit, as in a diagnosis; None without a level."""
+        total = self.decision.total_leakage
+        if total is None or total.lpm is None or total.interval_lpm is None:
+            return self.wear and self.wear.total
+        return Interval(total.lpm, *total.interval_lpm)
+
+    @property
+    def leak(self) -> Interval | None:
+        """Rise of the total over the healthy one in the trend's unit, as in a diagnosis; None if it did not rise."""
+        value, ends = self.decision.leak_lpm, self.decision.leak_interval_lpm
+        if value is not None and ends is not None:
+            return Interval(value, *ends)
+        return None if self.wear is None or self.wear.onset is None else self.wear.leak
+
+    @property
     def limit(self) -> float | None:
-        """Level at which a repair is due, None where the limit cannot be stated in the levels' unit."""
+        """Level at which a repair is due, None if the limit cannot be stated in the levels' unit."""
         return None if self.wear is None else self.wear.limit
 
     @property
     def alarm(self) -> TrendPoint | None:
-        """The recording after which the last stretch alarmed, None where it did not."""
+        """The recording after which the test alarmed since the last repair, or None."""
         number = self.episodes[-1].alarm if self.episodes else None
         return None if number is None else self.points[self.rows[number]]
 
     @property
     def repairs(self) -> tuple[TrendPoint, ...]:
-        """The first recording of each stretch that began with a fall of the level."""
+        """The first recording after each repair."""
         return tuple(self.points[self.rows[episode.begin]] for episode in self.episodes if episode.fell)
 
     @property
     def next_check(self) -> str:
-        """Next check on the machine."""
-        if self.verdict == NO_LEAK:
+        """Next check on the machine, in one or two sentences."""
+        if self.verdict == NO_LEAK and self.decision.cause is None:
             return "Nothing needs a check; go on recording under the same duty."
-        if self.verdict == LEAK:
-            return state_of(LEAK, "piston or pump leak").action
-        if self.wear is None:
-            return state_of(CANNOT_TELL).action
-        return "Go on recording under the same duty, and compare the level with what a new machine passes."
+        return state_of(self.verdict, self.decision.cause).action
 
     @property
     def state(self) -> MachineState:
-        """State of the machine as NAMUR NE 107 names it, as of a diagnosis."""
-        over = self.verdict == LEAK and self.wear is not None and self.limit is not None
-        if over and self.wear.now.low > self.limit:  # type: ignore[union-attr, operator]
-            return state_of("leak over the limit", action=self.next_check)
-        return state_of("watched" if self.verdict == NO_LEAK else self.verdict, action=self.next_check)
+        """State of the machine by NAMUR NE 107, as in a diagnosis."""
+        condition: str = self.verdict
+        if self.verdict == LEAK and self.wear is not None and self.limit is not None:
+            condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
+        elif self.verdict == NO_LEAK:
+            condition = "watched"
+        return state_of(condition, self.decision.cause, action=self.next_check)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the trend as plain JSON values; a number that is not finite becomes null."""
+        wear, total = self.wear, self.decision.total_leakage
         alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
-        names = ("now", "healthy", "scatter", "growth", "step", "onset", "reach")
-        now, healthy, scatter, growth, step, onset, reach = (self.wear and getattr(self.wear, name) for name in names)
+        limit_day = wear and wear.reach and Interval(*(days[-1] + wait for wait in wear.reach))
         points = [
-            {"file": point.file, "time": self._moment(point.day), "day": point.day}
-            | {
+            {
+                "file": point.file,
+                "time": self._format_day(point.day),
+                "day": point.day,
                 "value": point.value,
                 "low": point.low,
                 "high": point.high,
                 "group": None if point.group < 0 else point.group,
+                "temperature_C": point.temperature,
+                "note": point.note,
             }
-            | {"temperature_C": point.temperature, "note": point.note}
             for point in self.points
         ]
-        return plain(  # type: ignore[no-any-return]
+        return to_plain(  # type: ignore[no-any-return]
             {
                 "verdict": self.verdict,
                 "reason": self.reason,
+                "cause": self.decision.cause,
+                "chance": self.decision.stated_chance,
+                "leak_lpm": self.decision.leak_lpm,
+                "leak_interval_lpm": self.decision.leak_interval_lpm,
+                "bound_lpm": self.decision.bound_lpm,
+                "total_leakage": total and {"lpm": total.lpm, "interval_lpm": total.interval_lpm},
                 "basis": self.basis,
                 "unit": self.unit,
                 "pressure_Pa": self.pressure,
                 "recordings": len(points),
                 "compared": len(self.rows),
-                "first": self._moment(days[0]),
-                "last": self._moment(days[-1]),
-                "now": now,
-                "healthy": healthy,
-                "day_to_day": scatter,
-                "growth_per_month": growth,
-                "step": step,
-                "onset": self._moments(onset),
-                "alarm": alarm and {"file": alarm.file, "time": self._moment(alarm.day)},
-                "repairs": [{"file": point.file, "time": self._moment(point.day)} for point in self.repairs],
+                "first": self._format_day(days[0]),
+                "last": self._format_day(days[-1]),
+                "total_level": self.total,
+                "leak_level": self.leak,
+                "healthy": wear and wear.healthy,
+                "day_to_day": wear and wear.scatter,
+                "growth_per_month": wear and wear.growth,
+                "step": wear and wear.step,
+                "onset": self._format_days(wear and wear.onset),
+                "alarm": alarm and {"file": alarm.file, "time": self._format_day(alarm.day)},
+                "repairs": [{"file": point.file, "time": self._format_day(point.day)} for point in self.repairs],
                 "limit": self.limit,
                 "repair_limit": self.repair.as_dict(),
-                "days_to_limit": reach,
-                "limit_reached": self._moments(reach and Interval(*(days[-1] + wait for wait in reach))),
+                "days_to_limit": wear and wear.reach,
+                "limit_reached": self._format_days(limit_day),
                 "false_alarm_years": self.years,
                 "healthy_recordings": self.healthy,
                 "rig": self.machine and self.machine.as_dict(),
@@ -204,14 +236,16 @@ class Trend:
             }
         )
 
-    def _moment(self, day: float) -> str | float | None:
+    def _format_day(self, day: float) -> str | float | None:
         """Format a time as an ISO stamp, or in days if the times are not known."""
         if not math.isfinite(day) or not self.dated:
             return day
-        return str(np.datetime64(round((self.points[0].start + (day - self.points[0].day) * DAY) * 1e3), "ms"))[:19]
+        time_ms = np.datetime64(round(self.points[0].time_of_day(day) * 1e3), "ms")
+        return str(time_ms)[:19]  # without the fraction of a second
 
-    def _moments(self, days: Interval | None) -> dict[str, str | float | None] | None:
-        return days and {name: self._moment(day) for name, day in days._asdict().items()}
+    def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:
+        """Format value and ends of an interval of days as `_format_day` does."""
+        return days and {name: self._format_day(day) for name, day in days._asdict().items()}
 
 
 @checked_call
@@ -231,8 +265,8 @@ def trend(
     recordings : iterable of Recording
         Recordings of the machine, in any order, or readings of them; copies count once.
     rig : Rig, str or path-like, optional
-        What may be assumed of the machine, as for `diagnose`; without it, and where the recordings do not tell, levels
-        are relative.
+        What may be assumed of the machine, as for `diagnose`; without it levels are
+        relative, unless the recordings state the machine.
     healthy : int, optional
         How many of the first recordings are known to be of a healthy machine.
     limit : str, optional
@@ -269,137 +303,118 @@ def trend(
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
     readings = [
-        recording if isinstance(recording, LeakReading) else reading_of(recording, rig) for recording in recordings
+        recording if isinstance(recording, LeakReading) else estimate_reading(recording, rig)
+        for recording in recordings
     ]
-    points, differences = timeline(readings, every)
-    return _make_trend(
-        points, differences, repair=RepairLimit.of(limit), years=years, healthy=healthy, dated=every is None
-    )
-
-
-def _make_trend(points: Sequence[TrendPoint], differences: tuple[str, ...], **stated: Any) -> Trend:
-    """Make the trend of readings in the order of their times; `stated`: further fields of it."""
+    points, differences = build_timeline(readings, every)
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)
-    kept = [points[k] for k in rows]
-    flows = bool(kept) and all(point.states_flow for point in kept)
-    trend = Trend(
-        verdict=decide_verdict(False, math.inf, 0.0),
-        reason="",
-        basis=kept[0].basis if kept else None,
-        unit="L/min" if flows else "%",
-        pressure=float(np.median([point.pressure for point in kept])) if flows else None,
+    compared = [points[k] for k in rows]
+    states_flow = bool(compared) and all(point.states_flow for point in compared)
+    first_note = [point.note for point in points if point.note][:1]
+    lack = ": ".join(["no recording states a level", *first_note])
+    result = Trend(
+        decision=decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0),
+        basis=compared[0].basis if compared else None,
+        unit="L/min" if states_flow else "%",
+        pressure=float(np.median([point.pressure for point in compared])) if states_flow else None,
         points=tuple(points),
         groups=differences,
         episodes=(),
         rows=rows,
         machine=points[0].machine if points else None,
-        findings=tuple(findings_of(points, differences)),
-        **stated,
+        findings=tuple(list_findings(points, differences)),
+        repair=RepairLimit.parse(limit),
+        years=years,
+        healthy=healthy,
+        dated=every is None,
     )
-    if kept:
-        trend = _with_levels(trend)
-    verdict, reason = _verdict(trend)
-    return replace(trend, verdict=verdict, reason=reason)
+    return _add_episodes(result) if compared else result
 
 
-def _with_levels(trend: Trend) -> Trend:
-    """Add levels and episodes to a trend of at least one comparable recording."""
-    levels, allowed = _levels(trend)
-    merged, points, rows = levels.merged(), [*trend.points], trend.rows
-    outliers = np.flatnonzero(outlier_excess(levels)[1])
+def _add_episodes(trend: Trend) -> Trend:
+    """Add levels, episodes and the decision to a trend of at least one comparable recording."""
+    levels, trend_units_per_level = _convert_levels(trend)
+    points, findings = _add_values(trend, levels)
+    averages, rows = levels.average_neighbours(), trend.rows
+    n_healthy = max(1, _count_healthy(trend) * len(averages) // len(levels))
+    allowed_rise = _allowed_rise(trend, trend_units_per_level)
+    episodes = tuple(find_episodes(averages, years=trend.years, n_healthy=n_healthy, allowed_rise=allowed_rise))
+    if averages is not levels:  # an average belongs to the recording nearest in time
+        rows = tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in averages.t)
+    decision = decide_trend(
+        [points[row] for row in rows[episodes[-1].begin :]],
+        episodes[-1],
+        trend_units_per_level=trend_units_per_level,
+        pressure=trend.pressure,
+        interval=levels.interval,
+        years=trend.years,
+    )
+    return replace(trend, points=points, findings=findings, episodes=episodes, rows=rows, decision=decision)
+
+
+def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
+    """Add the values in the trend's unit to the points, and a finding on outliers to the findings."""
+    points, findings, outliers = [*trend.points], [*trend.findings], np.flatnonzero(outlier_excess(levels)[1])
     remark = "apart from the recordings before and after: it counts as if it were near"
-    findings = [*trend.findings]
+    for k, row in enumerate(trend.rows):
+        value, half_width = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
+        note = remark if k in outliers else ""
+        points[row] = replace(points[row], value=value, low=value - half_width, high=value + half_width, note=note)
     if outliers.size:
-        files = listed((points[rows[k]].file for k in outliers), 3)
+        files = join_names((points[trend.rows[k]].file for k in outliers), 3)
         text = f"{outliers.size} of {len(points)} {remark} ({files})"
         findings.append(Finding("outlier", "warning", None, outliers.size, None, text))
-    for k, row in enumerate(rows):
-        value, half = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
-        note = remark if k in outliers else ""
-        points[row] = replace(points[row], value=value, low=value - half, high=value + half, note=note)
-    healthy_count = max(1, _count_healthy(trend) * len(merged) // len(levels))
-    return replace(
-        trend,
-        points=tuple(points),
-        findings=tuple(findings),
-        episodes=tuple(episodes(merged, years=trend.years, known=healthy_count, allowed=allowed)),
-        rows=tuple(rows[int(np.argmin(np.abs(levels.t - t)))] for t in merged.t) if merged is not levels else rows,
-    )
+    return tuple(points), tuple(findings)
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings among the first ones, known to be healthy; at least the first."""
-    first = dict.fromkeys(point.digest for point in trend.points)  # a copy counts once
-    healthy_digests = {*islice(first, trend.healthy)}
+    """Count the compared recordings among the first `trend.healthy` ones, which are known to be healthy; at least 1."""
+    digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
+    healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
-def _levels(trend: Trend) -> tuple[Levels, float | None]:
-    """Return the levels in the trend's unit, and the rise at which a repair is due, None where unknown."""
-    kept = [trend.points[k] for k in trend.rows]
+class _ConvertedLevels(NamedTuple):
+    """Levels in the trend's unit, and the number of these units per unit of a reading's level."""
+
+    levels: Levels
+    trend_units_per_level: float
+
+
+def _convert_levels(trend: Trend) -> _ConvertedLevels:
+    """Convert the compared levels to the trend's unit and to the oil temperature of the first recording.
+
+    The unit is L/min at the trend's pressure, or % of the usual level, the mean of the healthy recordings. Levels are
+    conductances [m^3/(s Pa)], but those of the ringing logarithms, whose differences from the usual one become %.
+    """
+    compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
-        np.array([getattr(point, name) for point in kept]) for name in ("day", "group", "level", "error")
+        np.array([getattr(point, name) for point in compared]) for name in ("day", "group", "level", "error")
     )
-    usual, pressure = (
-        float(np.mean(value[: _count_healthy(trend)])),
-        float(np.median([point.pressure for point in kept])),
-    )
-    prior = scatter_of(trend.basis or "ringing", usual)
-    warmer, slope_sd = np.zeros(t.size), 0.0
-    temperatures = [point.temperature for point in kept if point.temperature is not None]
+    usual, smallest_float = float(np.mean(value[: _count_healthy(trend)])), float(np.finfo(float).tiny)
+    prior = scatter_prior(trend.basis or "ringing", usual)
+    warming, slope_sd = np.zeros(t.size), 0.0  # of the oil [K]; standard deviation of its effect per K
+    temperatures = [point.temperature for point in compared if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:
-        slope, deviation = (priors("inference")["oil"][name] for name in ("per_kelvin", "per_kelvin_deviation"))
-        warmer, slope_sd = np.array(temperatures) - temperatures[0], deviation * abs(usual)
-        value, error = (values * np.exp(-slope * warmer) for values in (value, error))
-    flows = trend.pressure is not None
-    unit = pressure / LITRE_PER_MINUTE if flows else 100.0 / max(abs(usual), float(np.finfo(float).tiny))
+        warming, slope_sd = np.array(temperatures) - temperatures[0], INFERENCE.oil.per_kelvin_deviation * abs(usual)
+        value, error = (values * np.exp(-INFERENCE.oil.per_kelvin * warming) for values in (value, error))
     if trend.basis == "ringing":
-        unit, value = 100.0, value - usual
-    allowed = None
-    if trend.repair.kind == "flow" and flows:
-        allowed = trend.repair.value / LITRE_PER_MINUTE
-    elif trend.repair.kind == "creep" and kept[0].area is not None:
-        allowed = trend.repair.value * kept[0].area / pressure * unit
-    prior = prior._replace(scale=prior.scale * unit)
-    return Levels(t, value * unit, error * unit, group, warmer, prior, slope_sd * unit), allowed
+        factor, value = 100.0, value - usual
+    elif trend.pressure is not None:
+        factor = trend.pressure / LITRE_PER_MINUTE
+    else:
+        factor = 100.0 / max(abs(usual), smallest_float)
+    prior = prior._replace(scale=prior.scale * factor)
+    levels = Levels(t, value * factor, error * factor, group, warming, prior, slope_sd * factor)
+    return _ConvertedLevels(levels, factor)
 
 
-def _verdict(trend: Trend) -> tuple[Verdict, str]:
-    """Decide on a trend by its alarm and by the step that would have shown, and say why."""
-    rate, wear = f"1 false alarm in {trend.years:g} machine-years", trend.wear
-    if wear is None:
-        notes = dict.fromkeys(point.note for point in trend.points if point.note)
-        reason = ": ".join(["no recording states a level", *list(notes)[:1]])
-        return decide_verdict(False, math.inf, 0.0), reason
-    last, beyond_scatter = trend.episodes[-1], f"beyond the machine's own scatter ({rate})"
-    if trend.basis == "ringing":
-        ringing = "the damping of the pressures' ringing"
-        reason = f"{ringing} did not change {beyond_scatter}; it states no flow"
-        if last.alarm is not None:
-            reason = (
-                f"{ringing} rose {beyond_scatter}: a leak, warmer oil, or another machine; without angle and position, "
-                "or command, they cannot be told apart"
-            )
-        return decide_verdict(False, math.inf, 0.0), reason
-    if last.alarm is not None:
-        shape = "grows" if wear.step is None else "stepped up"
-        reason = f"the leakage {shape} {beyond_scatter}; pump and piston are not told apart"
-        return decide_verdict(True, math.inf, 0.0), reason
-    count = last.end - last.begin
-    if count < FEWEST:
-        reason = f"{count} comparable recordings are too few, {FEWEST} are needed"
-        return decide_verdict(False, math.inf, 0.0), reason
-    half = (wear.healthy.high - wear.healthy.low) / (2.0 * WITHIN_95)
-    detectable = priors("trend")["course"]["detectable"] * max(wear.scatter, half)
-    allowed = math.inf if trend.limit is None else trend.limit - wear.healthy.value
-    verdict = decide_verdict(False, detectable, allowed)
-    if verdict == NO_LEAK:
-        since = " since the repair" if last.fell else ""
-        return verdict, (
-            f"no rise beyond the machine's own scatter{since} ({rate}); a step of {detectable:.2g} {trend.unit} would "
-            "have shown"
-        )
-    return verdict, (
-        f"the level scatters so much from recording to recording that a rise to the limit would not surely show: "
-        f"{detectable:.2g} {trend.unit} would"
-    )
+def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
+    """Convert the limit of a repair to a rise in the trend's unit; None if there is none, or it cannot be converted."""
+    compared = [trend.points[k] for k in trend.rows]
+    if trend.repair.kind == "flow" and trend.pressure is not None:
+        return trend.repair.value / LITRE_PER_MINUTE
+    if trend.repair.kind == "creep" and compared[0].area is not None:
+        pressure = float(np.median([point.pressure for point in compared]))
+        return trend.repair.value * compared[0].area / pressure * trend_units_per_level  # creep speed times area: flow
+    return None

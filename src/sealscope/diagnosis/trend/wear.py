@@ -8,10 +8,10 @@ mu of the group l of recordings that can be compared, a covariate c with a norma
 recording to recording d, the recording's own error e_i of stated deviation s_i, and the change g: a step,
 ``g = [t >= t_j]``, or a growth, ``g = max(t - t_(j-1), 0)``. d is normal with variance tau^2, of which a share r lasts,
 half of it for an hour and half for a week: its covariance is ``tau^2 ((1 - r) [i = k] + r/2 sum_T exp(-|t_i -
-t_k|/T))``. tau has a scaled inverse chi-square prior (`DayToDay`), r is uniform on a few values, and both are summed on
-a grid. mu has a wide prior, delta a half-normal one of some scales in units of tau. With L L' = cov(y), the rows of
-z = L^-1 y up to n are those of the first n recordings alone, so that one factorisation serves all n: with G = L^-1 g,
-a = sum G^2 and b = sum G z, a change of size delta has the likelihood ratio exp(b delta - a delta^2/2).
+t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is uniform on a few values, and both are
+summed on a grid. mu has a wide prior, delta a half-normal one of some scales in units of tau. With L L' = cov(y), the
+rows of z = L^-1 y up to n are those of the first n recordings alone, so that one factorisation serves all n: with
+G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the likelihood ratio exp(b delta - a delta^2/2).
 
 The test is Shiryaev's and Roberts's: with the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
 
@@ -36,16 +36,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
 from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR
 
-#: Deviation of a prior that says nothing, over scatter and range of the values: its square leaves half of the digits.
-_WIDE, _TINY = 1e2, 1e-10
+#: Standard deviation of a flat prior, over scatter and range of the values: its square leaves half of the digits.
+_WIDE = 1e2
+#: Fraction of tau^2 added to the diagonal, which keeps the covariance positive definite.
+_JITTER = 1e-10
+#: Draws from a posterior: the ends of a 95 % interval then have a relative error of a few per cent.
+_N_DRAWS = 4000
+#: Standard deviation of a normal number over its median size.
+_SD_PER_MEDIAN = 1.4826
+#: Recordings of an episode that count for the next one's prior, which may then scatter otherwise.
+_MAX_FREEDOM = 20
 
 
-class DayToDay(NamedTuple):
+class ScatterPrior(NamedTuple):
     """Prior on the standard deviation of the level between recordings: a `scale` with degrees of `freedom`."""
 
     scale: float
@@ -56,7 +64,7 @@ class DayToDay(NamedTuple):
 class Levels:
     """Levels (n,) of n recordings in the order of their times, and the `prior` on their scatter.
 
-    `t` [days]; `value`; `error`: standard deviation that each states of itself; `group` (n,): number of the group that
+    `t` [days]; `value`; `error`: standard error that each states of itself; `group` (n,): number of the group that
     shares a mean; `covariate` (n,) with the standard deviation `slope_sd` of its coefficient, 0 for none.
     """
 
@@ -65,16 +73,16 @@ class Levels:
     error: Array
     group: IntArray
     covariate: Array
-    prior: DayToDay
+    prior: ScatterPrior
     slope_sd: float = 0.0
 
     def __len__(self) -> int:
         return self.t.size
 
-    def part(self, rows: slice) -> Levels:
-        """Select some of the recordings by `rows`."""
+    def select(self, rows: slice) -> Levels:
+        """Return the levels of the recordings `rows`."""
         t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
-        return Levels(t, value, error, self.group[rows], covariate, self.prior, self.slope_sd)
+        return replace(self, t=t, value=value, error=error, group=self.group[rows], covariate=covariate)
 
     @property
     def interval(self) -> float:
@@ -84,144 +92,164 @@ class Levels:
 
     @property
     def scatter(self) -> float:
-        """Deviation of a recording from its neighbours: their median step, shrunk towards the prior."""
+        """Standard deviation between recordings: from the median step of neighbours, shrunk towards the prior."""
         prior = self.prior
+        # the step of two neighbours has twice the variance of one
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
-        measured = (1.4826 * float(np.median(steps))) ** 2 if steps.size else 0.0
-        return math.sqrt((prior.freedom * prior_variance + steps.size * measured) / (prior.freedom + steps.size))
+        measured_variance = (_SD_PER_MEDIAN * float(np.median(steps))) ** 2 if steps.size else 0.0
+        weights = prior.freedom, steps.size
+        return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
-    def merged(self, most: int = 240) -> Levels:
-        """Reduce the levels to about `most`: average neighbours of a group where there are more."""
-        size = -(-len(self) // most)
+    def average_neighbours(self, max_count: int = 240) -> Levels:
+        """Average neighbours of a group, so that about `max_count` levels remain, which limits the time of the test."""
+        size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
-        runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)
-        rows = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
+        runs = np.split(np.arange(len(self)), np.flatnonzero(np.diff(self.group)) + 1)  # of one group each
+        parts = [run[k : k + size] for run in runs for k in range(0, run.size, size)]
+        error = np.array([math.sqrt(np.sum(self.error[rows] ** 2)) / rows.size for rows in parts])
         t, value, covariate = (
-            np.array([values[r].mean() for r in rows]) for values in (self.t, self.value, self.covariate)
+            np.array([values[rows].mean() for rows in parts]) for values in (self.t, self.value, self.covariate)
         )
-        error = np.array([math.sqrt(np.sum(self.error[r] ** 2)) / r.size for r in rows])
-        return Levels(t, value, error, self.group[[r[0] for r in rows]], covariate, self.prior, self.slope_sd)
+        group = self.group[[rows[0] for rows in parts]]
+        return replace(self, t=t, value=value, error=error, group=group, covariate=covariate)
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Return the excess of each value not counted while it is the last one, and not once the next one is known.
+    """Compute the part of each value (n,) to ignore as an outlier: while it is the last, and once the next is known.
 
-    That is what lies beyond some deviations of the three before it, unless its neighbour lies as far out.
+    That is its distance from the median of the three values before it, in excess of `outlier` standard deviations, or 0
+    if the value before or after it lies as far out on the same side.
     """
-    (last, later), outlier = np.zeros((2, len(levels))), priors("trend")["course"]["outlier"]
-    for k in range(1, len(levels)):
-        same = np.flatnonzero(levels.group == levels.group[k])
-        place = int(np.searchsorted(same, k))
-        before, after = levels.value[same[max(place - 3, 0) : place]], levels.value[same[place + 1 : place + 2]]
-        if before.size:
-            reach, middle = outlier * levels.part(slice(0, k)).scatter, float(np.median(before))
-            distance = levels.value[k] - middle
-            agree = [np.sign(distance) * (other - middle) > reach for other in (before[-1], *after)]
-            last[k] = 0.0 if agree[0] else np.sign(distance) * max(abs(distance) - reach, 0.0)
-            later[k] = 0.0 if any(agree) or not after.size else last[k]
-    return last, later
+    excess_as_last, excess = np.zeros((2, len(levels)))
+    for group in np.unique(levels.group):
+        rows = np.flatnonzero(levels.group == group)
+        values = levels.value[rows]
+        for position, row in enumerate(rows[1:], 1):
+            max_distance = TREND.history.outlier * levels.select(slice(0, row)).scatter
+            distances = values - np.median(values[max(position - 3, 0) : position])
+            sign = np.sign(distances[position])
+            if sign * distances[position - 1] > max_distance:
+                continue
+            excess_as_last[row] = sign * max(abs(distances[position]) - max_distance, 0.0)
+            is_confirmed = position + 1 < rows.size and sign * distances[position + 1] <= max_distance
+            excess[row] = excess_as_last[row] if is_confirmed else 0.0
+    return excess_as_last, excess
 
 
 class _Changes(NamedTuple):
-    """Possible changes: c of them, of m shapes (n, m).
+    """Hypotheses of a change: c changes over n recordings, of m profiles.
 
-    Of each change (c,) the `column` of its shape, the `scale` of its size in tau, `begin`: the recording that shows it
-    first, `grows`: whether it is a growth, `log_weight`: logarithm of its weight w_j, shared among the kinds and scales
-    of a begin.
+    `profiles` (n, m): g of the module, the effect of a unit change on each recording. Of each change (c,):
+    `profile_index`, the column of its profile; `scale` of its amplitude in tau; `begin`, the first recording after it;
+    `grows`, True for a growth, False for a step; `log_weight`, the logarithm of w_j, divided among the kinds and scales
+    of one begin.
     """
 
-    shape: Array
-    column: IntArray
+    profiles: Array
+    profile_index: IntArray
     scale: Array
     begin: IntArray
     grows: NDArray[np.bool_]
     log_weight: Array
 
     @classmethod
-    def after(cls, levels: Levels, known: int, *, steps_only: bool = False) -> _Changes:
-        """Return the changes that may begin after the first `known` recordings."""
-        believed = priors("trend")["change"]
-        begin = np.arange(max(known, 1), len(levels))
+    def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
+        """Make all changes that may begin after the first `n_healthy` recordings: steps, and growths per month.
+
+        The scale of a step is a multiple of the scatter tau, that of a growth tau in n usual intervals.
+        """
+        scales = TREND.change
+        begin = np.arange(max(n_healthy, 1), len(levels))
         step = (np.arange(len(levels))[:, None] >= begin).astype(float)
         growth = np.maximum(levels.t[:, None] - levels.t[begin - 1], 0.0) / DAYS_PER_MONTH
-        slopes = (
-            [] if steps_only else [DAYS_PER_MONTH / levels.interval / interval for interval in believed["intervals"]]
-        )
-        steps = len(believed["steps"])
-        scale = np.array([*believed["steps"], *slopes], dtype=float)[:, None]
-        grows = np.arange(scale.size)[:, None] >= steps
-        share = np.where(grows, len(slopes), steps) * (1.0 if steps_only else 2.0)
+        slopes = [] if steps_only else [DAYS_PER_MONTH / levels.interval / n for n in scales.intervals]
+        n_steps = len(scales.steps)
+        scale = np.array([*scales.steps, *slopes], dtype=float)[:, None]
+        grows = np.arange(scale.size)[:, None] >= n_steps
+        # steps and growths are equally likely, and so are their scales
+        n_rivals = np.where(grows, len(slopes), n_steps) * (1.0 if steps_only else 2.0)
         with np.errstate(divide="ignore"):
-            log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, believed["wait"]) / share)
-        column = np.arange(begin.size) + begin.size * grows
-        spread = np.broadcast_arrays(column, scale, begin, grows, log_weight)
-        return cls(np.hstack([step, growth]), *(values.ravel() for values in spread))  # type: ignore[call-arg]
+            log_weight = np.log(np.clip(levels.t[begin] - levels.t[begin - 1], 0.0, scales.wait) / n_rivals)
+        profile_index = np.arange(begin.size) + begin.size * grows  # profiles of growths follow those of steps
+        fields = np.broadcast_arrays(profile_index, scale, begin, grows, log_weight)
+        return cls(np.hstack([step, growth]), *(values.ravel() for values in fields))  # type: ignore[call-arg]
 
     @classmethod
-    def single(cls, shape: Array, scale: float) -> _Changes:
-        """Make a single change of one shape (n,), with its `scale` in tau."""
-        first, one = np.zeros(1, dtype=np.int64), np.ones(1)
-        return cls(shape[:, None], first, scale * one, first, one > 0.0, 0.0 * one)
+    def from_profile(cls, profile: Array, scale: float) -> _Changes:
+        """Make one growth with a profile (n,) from the first recording on, whose amplitude has the `scale` in tau."""
+        first = np.zeros(1, dtype=np.int64)
+        return cls(
+            profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
+        )
 
 
 class _Node(NamedTuple):
-    """A pair (tau, r) of the grid, with all recordings whitened by it.
+    """Likelihoods at one pair (tau, r) of the grid.
 
-    `log` (n,): logarithm of its prior and of the likelihood without a change, after each recording; `a`, `b` (n, m) of
-    m shapes of changes; of the last group's mean `mean`, `variance`, and by how much it `yields` (m,) to each change.
+    `log_null` (n,): logarithm of prior times likelihood without a change, after each recording; `a`, `b` (n, m): of the
+    likelihood ratio of m profiles; `mean`, `variance` of the last group's level without a change; `mean_slope` (m,):
+    decrease of that mean per unit of a change.
     """
 
     tau: float
-    log: Array
+    log_null: Array
     a: Array
     b: Array
     mean: float
     variance: float
-    yields: Array
+    mean_slope: Array
 
 
-def _nodes(levels: Levels, shapes: Array, *, sloping: bool = False) -> list[_Node]:
-    """Return every node of the grid, for changes (n, m); `sloping`: the level may have grown evenly before."""
+def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
+    """Compute the likelihoods at all nodes (tau, r) of the grid for changes of the `profiles` (n, m).
+
+    `may_grow`: the level may have grown evenly from the first recording on. The values have the covariance
+    shared + tau^2 (r C + (1 - r) I) + error^2, C the correlation over the time between recordings and r the fraction of
+    the scatter that lasts. Vectors are whitened by its Cholesky factor L: z the values, u the unit level of the last
+    group, G the profiles. Up to each recording a = sum G^2 and b = sum G z.
+    """
     from scipy.linalg import solve_triangular
 
-    believed, prior = priors("trend")["between"], levels.prior
-    last, later = outlier_excess(levels)
-    values = levels.value - levels.value[0] - later
-    reach = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
-    wide_variance = (_WIDE * reach) ** 2
-    mean = wide_variance * (levels.group == levels.group[-1])
-    shared = wide_variance * (levels.group[:, None] == levels.group) + levels.slope_sd**2 * np.outer(
-        *(levels.covariate,) * 2
-    )
-    if sloping:
-        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])
+    between, prior = TREND.between, levels.prior
+    excess_as_last, excess = outlier_excess(levels)
+    values = levels.value - levels.value[0] - excess
+    max_scatter = max(prior.scale, 0.3 * float(np.ptp(levels.value)))
+    wide_variance = (_WIDE * max_scatter) ** 2
+    mean_covariance = wide_variance * (levels.group == levels.group[-1])  # of the values with the last group's level
+    # covariance that does not depend on tau: of the groups' levels, the covariate's coefficient, and the growth
+    shared = wide_variance * (levels.group[:, None] == levels.group)
+    shared = shared + levels.slope_sd**2 * np.outer(levels.covariate, levels.covariate)
+    if may_grow:
+        growth = 10.0 * levels.scatter / levels.interval * (levels.t - levels.t[0])  # a wide prior
         shared += np.outer(growth, growth)
     waits = np.abs(levels.t[:, None] - levels.t)
-    correlation = np.mean([np.exp(-waits / time) for time in believed["times"]], axis=0)
-    right = np.column_stack([values, mean, shapes])
+    correlation = np.mean([np.exp(-waits / time) for time in between.times], axis=0)
+    right_sides = np.column_stack([values, mean_covariance, profiles])
     nodes = []
-    for tau in np.geomspace(0.1 * prior.scale, 10.0 * reach, believed["nodes"]):
-        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
-        for share in believed["lasts"]:
-            covariance = shared + tau**2 * share * correlation
-            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - share + _TINY) + levels.error**2
+    for tau in np.geomspace(0.1 * prior.scale, 10.0 * max_scatter, between.nodes):
+        log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)  # scaled inverse chi-square
+        for lasting in between.lasts:
+            covariance = shared + tau**2 * lasting * correlation
+            covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - lasting + _JITTER) + levels.error**2
             L = np.linalg.cholesky(covariance)
-            z, u, g = np.split(solve_triangular(L, right, lower=True, check_finite=False), [1, 2], axis=1)
-            held = z - ((last - later) / L.diagonal())[:, None]  # the value counts so while it is the last
-            square = np.cumsum(z**2) - (z**2 - held**2)[:, 0]
-            log = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
-            a, b = np.cumsum(g**2, axis=0), np.cumsum(g * z, axis=0) - g * (z - held)
-            base = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * held[-1, 0])
-            nodes.append(_Node(float(tau), log, a, b, base, wide_variance - float(u[:, 0] @ u[:, 0]), g.T @ u[:, 0]))
+            z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
+            # while a recording is the last one, more of it is ignored as an outlier, which changes its own row only
+            z_as_last = z - ((excess_as_last - excess) / L.diagonal())[:, None]
+            square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
+            log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
+            a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
+            level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
+            variance = wide_variance - float(u[:, 0] @ u[:, 0])
+            nodes.append(_Node(float(tau), log_null, a, b, level, variance, G.T @ u[:, 0]))
     return nodes
 
 
-def _log_ratio(a: Array, b: Array, scale: Array) -> Array:
-    """Return log E[exp(b delta - a delta^2/2)] for delta > 0, half-normal of a scale.
+def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
+    """Compute the log mean likelihood ratio, log E[exp(b delta - a delta^2/2)], for a half-normal delta of scale k.
 
-    ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
+    The expectation is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
     """
     from scipy.special import log_ndtr
 
@@ -230,82 +258,94 @@ def _log_ratio(a: Array, b: Array, scale: Array) -> Array:
     return np.asarray(log_factor + 0.5 * b * b * v, dtype=float)
 
 
-class Path(NamedTuple):
-    """The sequential test after each recording (n,): `log_R`, and `first`: which shows the likeliest change first."""
+class ChangeScores(NamedTuple):
+    """Logarithm of R after each recording (n,), and the `begin` (n,) of the change that is most probable then."""
 
     log_R: Array
-    first: IntArray
+    begin: IntArray
 
-    def alarm(self, days: float) -> int | None:
-        """Find the first recording with R over a mean time to a false alarm; None where there is none."""
-        over = np.flatnonzero(self.log_R > math.log(days))
-        return int(over[0]) if over.size else None
+    def find_alarm(self, days: float) -> int | None:
+        """Find the first recording whose R exceeds the mean time to a false alarm [days]."""
+        alarms = np.flatnonzero(self.log_R > math.log(days))
+        return int(alarms[0]) if alarms.size else None
 
 
-def search(levels: Levels, known: int = 1, *, falls: bool = False, sloping: bool = False) -> Path:
-    """Run the sequential test for a rise (a step or a growth), or for a fall (a step).
+def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
+    """Compute the sequential test's R for a rise (a step or a growth), or with `falls` for a fall (a step).
 
-    `known`: how many of the first recordings are known to be of a machine that has not changed; `sloping`: whether the
-    level may have grown evenly before.
+    The first `n_healthy` recordings are without a change; `may_grow`: the level may have grown evenly before.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
-    n, changes = len(levels), _Changes.after(levels, known, steps_only=falls)
-    terms, null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
+    n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
+    log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
     if not changes.begin.size:
-        return Path(null, np.zeros(n, dtype=np.int64))
-    for node in _nodes(levels, changes.shape, sloping=sloping):
-        null = np.logaddexp(null, node.log)
-        a, b = node.a[:, changes.column], node.b[:, changes.column]
-        terms = np.logaddexp(terms, node.log[:, None] + _log_ratio(a, b, changes.scale * node.tau))
-    terms += changes.log_weight - null[:, None]
-    terms[np.arange(n)[:, None] < changes.begin] = -np.inf
-    return Path(np.logaddexp.reduce(terms, axis=1), changes.begin[np.argmax(terms, axis=1)])
+        return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
+    for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
+        log_null = np.logaddexp(log_null, node.log_null)
+        a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
+        log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
+    # w_j LR_j(n) of each change, averaged over the grid of tau and r; changes that begin later do not count yet
+    log_terms += changes.log_weight - log_null[:, None]
+    log_terms[np.arange(n)[:, None] < changes.begin] = -np.inf
+    return ChangeScores(np.logaddexp.reduce(log_terms, axis=1), changes.begin[np.argmax(log_terms, axis=1)])
+
+
+def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
+    """Draw from normal distributions (d,), with `positive` cut off below 0, by the inverse distribution function."""
+    from scipy.special import ndtr, ndtri
+
+    p_negative = ndtr(-mean / sd) if positive else np.zeros(len(mean))
+    p = p_negative + (1.0 - p_negative) * random.random(len(mean))
+    return np.asarray(mean + sd * ndtri(np.clip(p, 1e-300, 1.0 - 1e-16)))  # clipped, so that it is finite
 
 
 class _Draws(NamedTuple):
-    """Draws (d,) from the posterior after all recordings: `tau`, which `change`, its `size`, mean before it `base`."""
+    """Draws (d,) from the posterior: `tau`, index and amplitude of the change, and mean level before it."""
 
     tau: Array
     change: IntArray
-    size: Array
-    base: Array
+    amplitude: Array
+    mean_before: Array
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Return draws; `signed`: the size may be of either sign, its prior flat."""
-        from scipy.special import ndtr, ndtri
-
-        random, count = np.random.default_rng(20), 4000
-        nodes = _nodes(levels, changes.shape)
-        a, b = (np.stack([getattr(node, name)[-1][changes.column] for node in nodes]) for name in ("a", "b"))
+        """Draw from the posterior; `signed`: the amplitude has a flat prior and either sign, else a half-normal one."""
+        random = np.random.default_rng(20)  # a fixed seed, so that results repeat
+        nodes = _evaluate_grid(levels, changes.profiles)
+        a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
         v = 1.0 / (a + scale**-2)
-        ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_ratio(a, b, scale)
-        log_weight = np.array([[node.log[-1]] for node in nodes]) + ratio + changes.log_weight
+        log_ratio = 0.5 * (np.log(v) + b * b * v) if signed else _log_mean_ratio(a, b, scale)
+        log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
         weight = np.exp(log_weight - log_weight.max())
-        chosen = random.choice(weight.size, count, p=weight.ravel() / weight.sum())
-        node, change = np.unravel_index(chosen, weight.shape)
-        mean, deviation = (b * v)[node, change], np.sqrt(v)[node, change]
-        low = np.zeros(count) if signed else ndtr(-mean / deviation)  # of a normal number that is known to be positive
-        size = mean + deviation * ndtri(np.clip(low + (1.0 - low) * random.random(count), 1e-300, 1.0 - 1e-16))
-        tau, base, variance = np.array([(node_of.tau, node_of.mean, node_of.variance) for node_of in nodes])[node].T
-        yields = np.stack([node_of.yields[changes.column] for node_of in nodes])[node, change]
-        spread = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(count)
-        return cls(tau, change, size, base - yields * size + spread)
+        flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel() / weight.sum())
+        node_number, change = np.unravel_index(flat_index, weight.shape)
+        mean, sd = (b * v)[node_number, change], np.sqrt(v)[node_number, change]
+        amplitude = _draw_normal(random, mean, sd, positive=not signed)
+        tau, level, variance = np.array([(node.tau, node.mean, node.variance) for node in nodes])[node_number].T
+        slope = np.stack([node.mean_slope[changes.profile_index] for node in nodes])[node_number, change]
+        error = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(_N_DRAWS)
+        return cls(tau, change, amplitude, level - slope * amplitude + error)
+
+    def last_rises(self, changes: _Changes) -> Array:
+        """Compute the rises (d,) of the last recording's level by the drawn changes, whose hypotheses are `changes`."""
+        return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
 class Wear(NamedTuple):
-    """Course of a segment of recordings.
+    """Level, change and time to the limit after the last of some recordings.
 
-    `now`: level after the last recording, without the day's own scatter; `growth`: by a month; `step`: size of a step,
-    None where a growth is likelier, or nothing changed; `onset`: time of the change [days], None where there is none;
-    `healthy`: where a recording of the machine before the change lies, in 95 of 100, about its mean; `scatter`:
-    deviation between recordings; `limit`: the mean before the change and the rise that is allowed, None where none is
-    stated; `reach`: days from the last recording until the level reaches it, infinite where it does not.
+    `total`: level without the last recording's scatter; `leak`: its rise since the change, below `bound` with a
+    probability of 95 %; `growth` per month; `step`: its size, None if a growth is more probable or nothing changed;
+    `onset`: time of the change [days], None if nothing changed; `healthy`: mean before the change, and range of 95 % of
+    the recordings then; `scatter`: standard deviation between recordings; `limit`: mean before the change plus the
+    allowed rise, None if no rise is stated; `reach`: days from the last recording to the limit, infinite if never.
     """
 
-    now: Interval
+    total: Interval
+    leak: Interval
+    bound: float
     growth: Interval
     step: Interval | None
     onset: Interval | None
@@ -315,84 +355,123 @@ class Wear(NamedTuple):
     reach: Interval | None
 
 
-def _interval(draws: Array) -> Interval:
-    """Return median and 95 % interval of draws; of several that are not finite, the order still counts."""
-    low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
-    return Interval(float(middle), float(low), float(high))
+def _interval_of_draws(draws: Array) -> Interval:
+    """Compute median and 95 % interval of draws, of which some may be infinite."""
+    low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
+    return Interval(float(median), float(low), float(high))
 
 
-def describe(levels: Levels, allowed: float | None, alarmed: int | None) -> Wear:
-    """Return level, growth and time to a limit after the last recording.
+def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int | None) -> Wear:
+    """Estimate level, growth and time to the limit after the last recording.
 
-    `allowed`: rise of the level at which a repair is due, None where none is stated; `alarmed`: first recording that
-    shows the change, as the test sees it; None where it did not alarm: then the even growth over all recordings is
-    estimated, of either sign and with a wide prior. Recordings of less than a day state no growth by a month.
+    `allowed_rise`: rise of the level above the healthy one at which a repair is due, None if there is no limit;
+    `change_begin`: first recording after the change, as the test dates it. If it is None, an even growth over all
+    recordings is estimated, of either sign and with a wide prior. Recordings that span less than a day have no growth
+    per month.
     """
-    spans, rises = levels.t[-1] - levels.t[0] >= 1.0, alarmed is not None
-    even = (levels.t - levels.t[0]) / DAYS_PER_MONTH if spans else np.zeros(len(levels))
-    changes = _Changes.after(levels, 1) if rises else _Changes.single(even, _WIDE * DAYS_PER_MONTH / levels.interval)
-    draws = _Draws.sample(levels, changes, signed=not rises)
-    grows = changes.grows[draws.change]
-    now = draws.base + draws.size * changes.shape[-1, changes.column[draws.change]]
-    slope, growing = np.where(grows, draws.size, 0.0), float(np.mean(grows)) >= 0.5
-    before = levels.part(slice(0, alarmed))
-    usual = _Draws.sample(before, _Changes.single(np.zeros(len(before)), 1.0))
-    error = float(np.mean(before.error[before.group == before.group[-1]] ** 2))
-    noise = np.random.default_rng(21).standard_normal(usual.tau.size)
-    healthy = _interval(usual.base + np.sqrt(usual.tau**2 + error) * noise)._replace(value=float(usual.base.mean()))
+    is_changed, is_long = change_begin is not None, levels.t[-1] - levels.t[0] >= 1.0
+    # without a change the growth may begin with the first recording
+    months = (levels.t - levels.t[0]) / DAYS_PER_MONTH if is_long else np.zeros(len(levels))
+    even_growth = _Changes.from_profile(months, _WIDE * DAYS_PER_MONTH / levels.interval)
+    changes = _Changes.enumerate(levels, 1) if is_changed else even_growth
+    draws = _Draws.sample(levels, changes, signed=not is_changed)
+    leak, leak_upper_95 = Interval(0.0, -math.inf, math.inf), math.inf
+    if len(levels) > 1:
+        # without a change, the rise that the levels allow bounds a leak
+        rises = changes if is_changed else _Changes.enumerate(levels, 1)
+        leak_draws = (draws if is_changed else _Draws.sample(levels, rises)).last_rises(rises)
+        leak, leak_upper_95 = _interval_of_draws(leak_draws), float(np.quantile(leak_draws, 0.95))
+    current_level = draws.mean_before + draws.last_rises(changes)
+    is_growth = changes.grows[draws.change]
+    growth, mostly_grows = np.where(is_growth, draws.amplitude, 0.0), float(np.mean(is_growth)) >= 0.5
+    healthy, scatter = _estimate_healthy_range(levels.select(slice(0, change_begin)))
     limit = reach = None
+    if allowed_rise is not None:
+        limit = healthy.value + allowed_rise
+        days = _days_to_limit(current_level, growth, limit)
+        reach = _interval_of_draws(days) if is_long else Interval(math.nan, 0.0, math.inf)
     unknown = Interval(math.nan, -math.inf, math.inf)
-    if allowed is not None:
-        limit = healthy.value + allowed
-        with np.errstate(divide="ignore", invalid="ignore"):
-            wait = np.where(slope > 0.0, (limit - now) / slope, math.inf) * DAYS_PER_MONTH
-        reach = _interval(np.where(now >= limit, 0.0, wait)) if spans else unknown._replace(low=0.0)
     return Wear(
-        now=_interval(now),
-        growth=_interval(slope[grows] if growing else slope) if spans else unknown,
-        step=None if growing else _interval(draws.size[~grows]),
-        onset=_interval(levels.t[changes.begin[draws.change]]) if rises else None,
+        total=_interval_of_draws(current_level),
+        leak=leak,
+        bound=leak_upper_95,
+        growth=_interval_of_draws(growth[is_growth] if mostly_grows else growth) if is_long else unknown,
+        step=None if mostly_grows else _interval_of_draws(draws.amplitude[~is_growth]),
+        onset=_interval_of_draws(levels.t[changes.begin[draws.change]]) if is_changed else None,
         healthy=healthy,
-        scatter=math.sqrt(float(np.mean(usual.tau**2))),
+        scatter=scatter,
         limit=limit,
         reach=reach,
     )
 
 
-class Episode(NamedTuple):
-    """A stretch of recordings between two repairs: rows `begin` to `end` (exclusive) of the judged ones.
+def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
+    """Compute the days (d,) in which levels (d,) reach a limit by their `growth` (d,) per month; infinite if never."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        days = np.where(growth > 0.0, (limit - level) / growth, math.inf) * DAYS_PER_MONTH
+    return np.where(level >= limit, 0.0, days)
 
-    `alarm`: the row after which the test alarmed, None where it did not; `wear`: what the stretch says at its end;
-    `fell`: whether the stretch began with a fall of the level.
+
+def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
+    """Estimate the mean of unchanged recordings with the range of 95 % of them, and their standard deviation."""
+    draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
+    error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
+    noise = np.random.default_rng(21).standard_normal(draws.tau.size)
+    interval = _interval_of_draws(draws.mean_before + np.sqrt(draws.tau**2 + error) * noise)
+    return interval._replace(value=float(draws.mean_before.mean())), math.sqrt(float(np.mean(draws.tau**2)))
+
+
+class Episode(NamedTuple):
+    """Recordings between two repairs: rows `begin` to `end` (exclusive) of the judged ones.
+
+    `alarm`: the row after which the test alarmed, or None; `log_days`: logarithm of the largest mean time to a false
+    alarm [days] at which it would have alarmed; `wear`: at the end; `fell`: it began with a fall of the level.
     """
 
     begin: int
     end: int
     alarm: int | None
+    log_days: float
     wear: Wear
     fell: bool
 
 
-def episodes(levels: Levels, *, years: float, known: int = 1, allowed: float | None = None) -> list[Episode]:
-    """Return the stretches between repairs, each with its alarm.
+def find_episodes(
+    levels: Levels, *, years: float, n_healthy: int = 1, allowed_rise: float | None = None
+) -> list[Episode]:
+    """Divide the recordings at repairs, and test and estimate the wear of each part.
 
-    `years`: a healthy machine has one false alarm in so many, on average or less often; `known`: how many of the first
-    recordings are of a healthy machine; `allowed`: rise at which a repair is due. A repair is a fall of the level that
-    the same test finds; the level starts anew there, and the scatter seen before is kept in the prior.
+    `years`: mean time to a false alarm, at least; `n_healthy`: how many of the first recordings are of a healthy
+    machine; `allowed_rise`: at which a repair is due. A repair is a fall of the level that the same test finds. After
+    it a new level is estimated; the scatter before it becomes the prior.
     """
-    days, begin, result = years * DAYS_PER_YEAR, 0, list[Episode]()
+    days, begin, episodes = years * DAYS_PER_YEAR, 0, list[Episode]()
     while begin < len(levels):
-        part = levels.part(slice(begin, None))
-        rise, fall = search(part, known), search(part, known, falls=True)
-        alarm, dropped, first = rise.alarm(days), fall.alarm(days), 0
-        if alarm is not None and (dropped is None or alarm < dropped):  # worn: what falls back to its beginning
-            first = int(rise.first[alarm])
-            fall = search(part.part(slice(first, None)), 2, falls=True, sloping=True)
-            dropped = fall.alarm(days)
-        end = len(part) if dropped is None else max(first + int(fall.first[dropped]), 1)
-        alarm = None if alarm is None or alarm >= end else alarm
-        wear = describe(part.part(slice(0, end)), allowed, None if alarm is None else int(rise.first[end - 1]))
-        result.append(Episode(begin, begin + end, None if alarm is None else begin + alarm, wear, bool(result)))
-        levels = replace(levels, prior=DayToDay(wear.scatter, levels.prior.freedom + min(end - 1, 20)))
-        begin, known = begin + end, 1
-    return result
+        remaining = levels.select(slice(begin, None))
+        rise = score_changes(remaining, n_healthy)
+        alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
+        if alarm is not None and alarm >= end:  # of the next episode
+            alarm = None
+        change_begin = None if alarm is None else int(rise.begin[end - 1])
+        wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
+        alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
+        episodes.append(Episode(begin, begin + end, alarm_row, log_days, wear, fell=bool(episodes)))
+        prior = ScatterPrior(wear.scatter, levels.prior.freedom + min(end - 1, _MAX_FREEDOM))
+        levels = replace(levels, prior=prior)
+        begin, n_healthy = begin + end, 1
+    return episodes
+
+
+def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
+    """Find the first recording after the first repair; the number of recordings if there is none.
+
+    `days`: mean time to a false alarm. After an alarm of the `rise` the level is compared with the worn machine's.
+    """
+    fall, worn_from = score_changes(levels, n_healthy, falls=True), 0
+    alarm, repair = rise.find_alarm(days), fall.find_alarm(days)
+    if alarm is not None and (repair is None or alarm < repair):
+        worn_from = int(rise.begin[alarm])
+        # two recordings at least show the worn level
+        fall = score_changes(levels.select(slice(worn_from, None)), n_healthy=2, falls=True, may_grow=True)
+        repair = fall.find_alarm(days)
+    return len(levels) if repair is None else max(worn_from + int(fall.begin[repair]), 1)

@@ -12,38 +12,36 @@ import numpy as np
 
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
-from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, beside_the_pump, severity
+from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
 from sealscope.diagnosis.verdict.states import MachineState, action_of, state_of
 from sealscope.errors import InputError, MissingExtra
-from sealscope.recordings.formats.headings.preamble import remarks_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_values import plain
-from sealscope.units import LITRE_PER_MINUTE
+from sealscope.storage.plain_values import to_plain
 
 if TYPE_CHECKING:
     import matplotlib.axes
     import pandas
 
-#: Columns of a table of diagnoses, beside those of the intervals.
+#: Columns of a table of diagnoses, without those of the intervals.
 _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
-#: What a diagnosis as JSON begins with, by the names of its fields.
-_FIRST = (
+#: Fields that a diagnosis as JSON begins with.
+_FIRST_FIELDS = (
     *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
     *("unused", "false_alarm_probability", "score", "threshold"),
 )
-#: What the file of a recording may call its machine.
-_MACHINES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
+#: Names in a recording's preamble that state its machine, in the order of preference.
+_MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "rig", "test rig", "maschine", "prüfstand")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(Evidence):
     """Verdict on one recording: the fused evidence of all detectors.
 
-    Beside the fields of `Evidence`, `parts` of which holds every detector's own, that of the judge first:
+    In addition to the fields of `Evidence`, whose `parts` are every detector's, that of the judge first:
 
     Parameters
     ----------
@@ -60,9 +58,9 @@ class Diagnosis(Evidence):
     limit : RepairLimit
         Leak from which the machine is to be repaired.
     about : mapping of str to str
-        What the file says of its recording: operator, machine, oil temperature.
+        Statements in the recording's file: operator, machine, oil temperature.
     start : str, optional
-        When the recording began, as ISO 8601, where the file says so.
+        When the recording began, as ISO 8601, if the file states it.
     unused : tuple of str
         Recorded pressures, positions, speeds and flows that no channel is made of.
     pressure_unit : str
@@ -87,68 +85,66 @@ class Diagnosis(Evidence):
     quality: tuple[Finding, ...] = ()
     baselines: int = 0
     machine: AssumedMachine | None = None
-    limit: RepairLimit = field(default_factory=lambda: RepairLimit.of(None))
+    limit: RepairLimit = field(default_factory=lambda: RepairLimit.parse(None))
     about: Mapping[str, str] = field(default_factory=dict)
     start: str | None = None
     unused: tuple[str, ...] = ()
     pressure_unit: str = "bar"
 
     @classmethod
-    def of(
-        cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **stated: Any
+    def from_evidence(
+        cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **fields: Any
     ) -> Diagnosis:
         """Make the diagnosis of a recording from its evidence and the file's own statements.
 
-        `file`: name of the recording, by default that of its file; `stated`: the other fields.
+        `file`: name of the recording, by default that of its file; `fields`: the other ones.
         """
         if evidence.relative is None:
-            evidence = replace(evidence, relative=beside_the_pump(evidence, recording, machine))
+            evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
         start = recording.provenance.get("start")
         return cls(
             **vars(evidence),
             file=file or str(recording.provenance.get("file", "recording")),
             machine=machine,
-            about=remarks_of(recording.provenance),
+            about=recording.remarks,
             start=None if start is None else str(start),
             unused=recording.unused,
             pressure_unit=recording.pressure_unit,
-            **stated,
+            **fields,
         )
 
     @property
     def severity(self) -> Severity | None:
-        """Severity of the leak; None where there is none, or nothing is known of its size."""
+        """Severity of the leak; None if there is none, or its size is unknown."""
         return severity(self, self.limit)
 
     @property
     def limit_lpm(self) -> float | None:
         """Repair limit as a flow past the piston [L/min]; None for a speed of a piston whose area is not stated."""
-        limit, machine = self.limit, self.machine
-        if limit.kind == "flow":
-            return limit.value / LITRE_PER_MINUTE
-        return None if machine is None or not machine.area_stated else limit.value * machine.area / LITRE_PER_MINUTE
+        is_stated = self.machine is not None and self.machine.area_stated
+        return self.limit.flow_lpm(self.machine.area if is_stated else None)  # type: ignore[union-attr]
 
     @property
     def repair_lpm(self) -> float | None:
-        """Repair limit on the axis of the leak's course [L/min]; None where it cannot be stated as a flow.
+        """Repair limit on the axis of the leak over time [L/min]; None if it cannot be stated as a flow.
 
-        It counts from the healthy level: the median of the course before the onset, where the course is the total.
+        It counts from the healthy level if the total leakage is drawn: from its median before the onset.
         """
-        course, level = self.course, self.limit_lpm
-        if course is None or level is None or not course.whole:
-            return None if course is None else level
+        course, limit = self.course, self.limit_lpm
+        if course is None or limit is None or not course.whole:
+            return None if course is None else limit
         onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
-        before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
-        if not before.size:
+        lpm_before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
+        if not lpm_before.size:
             return None
-        healthy = float(np.median(before))
+        usual_lpm = float(np.median(lpm_before))
         if self.verdict == LEAK and self.onset_s is None:  # it leaks from the first sample on
-            return None if self.leak_lpm is None else level + max(0.0, healthy - self.leak_lpm)
-        return level + healthy
+            return None if self.leak_lpm is None else limit + max(0.0, usual_lpm - self.leak_lpm)
+        return limit + usual_lpm
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Displacement over area as measured, over the assumed one, and its interval; None where not measured."""
+        """Displacement over area as measured, over the assumed one, and its interval; None if not measured."""
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
                 return decision.ratio, decision.ratio_interval
@@ -156,8 +152,8 @@ class Diagnosis(Evidence):
 
     @property
     def machine_name(self) -> str | None:
-        """The machine's name in the file; None where there is none."""
-        return machine_name_of(self.about)
+        """The machine's name in the file; None if there is none."""
+        return find_machine_name(self.about)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
@@ -166,7 +162,7 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """The condition of `states.toml` that the verdict is."""
+        """The condition of `states.toml` that corresponds to the verdict."""
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -175,7 +171,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause named by the verdict, a leak's for `leak`, else another event's; None where it names none."""
+        """Cause named by the verdict, a leak's for `leak`, else another event's; None if it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -186,61 +182,59 @@ class Diagnosis(Evidence):
 
     @property
     def state(self) -> MachineState:
-        """State of the machine as NAMUR NE 107 names it, a failure where the leak is surely over the repair limit.
+        """State of the machine as NAMUR NE 107 names it, a failure if the leak is surely over the repair limit.
 
-        Every surface shows this state: name, letter, colour and severity of page, terminal, JSON and metrics.
+        Page, terminal, JSON and metrics state its name, letter, colour and severity.
         """
-        over = self.severity is not None and self.severity.level == "repair"
-        condition = "leak over the limit" if over else self._condition
-        return state_of(condition, self.named_cause, since_s=plain(self.onset_s), action=self.next_check)
+        is_over_limit = self.severity is not None and self.severity.level == "repair"
+        condition = "leak over the limit" if is_over_limit else self._condition
+        return state_of(condition, self.named_cause, since_s=to_plain(self.onset_s), action=self.next_check)
 
     @property
     def known_healthy(self) -> bool:
-        """True if leak-free recordings or the rig show that the level is that of a healthy machine."""
-        by_rig = self.total_leakage is not None and self.total_leakage.healthy
-        return self.verdict == NO_LEAK and (self.baselines > 0 or by_rig)
+        """True if the level is that of a healthy machine, by leak-free recordings or by the rig."""
+        is_healthy_by_rig = self.total_leakage is not None and self.total_leakage.healthy
+        return self.verdict == NO_LEAK and (self.baselines > 0 or is_healthy_by_rig)
 
     @property
     def is_baseline(self) -> bool:
-        """True if the recording may serve as a baseline, its total shown to be like the healthy recordings'."""
-        against = self._question(AGAINST)
-        if self.verdict != NO_LEAK or self.cause is not None or against is None or not _is_usual(against):
+        """True if the recording may serve as a baseline, its total leakage being usual among the healthy recordings."""
+        comparison = self._find_test(AGAINST)
+        if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
             return False
         total = self.total_leakage
         if total is None or total.lpm is None or total.interval_lpm is None or self.bound_lpm is None:
             return True
-        return total.interval_lpm[0] <= 0.0 or self.bound_lpm < total.lpm  # else all of it may be a leak
+        return total.interval_lpm[0] <= 0.0 or self.bound_lpm < total.lpm  # otherwise all of the total may be a leak
 
     @property
     def rises_within(self) -> bool:
         """True if the leakage probably rose within the recording, though no onset is stated."""
-        within = self._question(WITHIN)
-        return self.onset_s is None and within is not None and not _is_usual(within)
+        step_test = self._find_test(WITHIN)
+        return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
-    def _question(self, name: str) -> Evidence | None:
-        """Return the judging detector's answer to one of its questions; None where it was not asked."""
+    def _find_test(self, name: str) -> Evidence | None:
+        """Find the evidence of one of the judging detector's tests; None if it was not made."""
         judge = self.parts[0].parts if self.parts else ()
         return next((part for part in judge if part.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as plain JSON values, keys in the order of the output contract.
-
-        A number that is not finite becomes null.
-        """
-        ratio, total = self.measured_ratio or (None, None), self.total_leakage and dict(vars(self.total_leakage))
-        if total:
+        """Return the diagnosis as plain JSON values in the output contract's order; numbers not finite become null."""
+        ratio, ratio_interval = self.measured_ratio or (None, None)
+        total = None if self.total_leakage is None else dict(vars(self.total_leakage))
+        if total is not None:
             total["pressure_Pa"] = total.pop("pressure")
         methods = [
             {"name": method.detector, "score": method.score, "threshold": method.threshold, "verdict": method.verdict}
             | {"reason": method.reason, "chance": method.stated_chance, "odds": method.odds}
             for method in self.methods
         ]
-        names = ("code", "channel", "count", "first_t", "severity", "text")
-        return plain(  # type: ignore[no-any-return]
+        finding_names = ("code", "channel", "count", "first_t", "severity", "text")
+        return to_plain(  # type: ignore[no-any-return]
             {
-                **{name: getattr(self, name) for name in _FIRST},
+                **{name: getattr(self, name) for name in _FIRST_FIELDS},
                 "methods": methods,
-                "quality": [{name: getattr(warning, name) for name in names} for warning in self.quality],
+                "quality": [{name: getattr(finding, name) for name in finding_names} for finding in self.quality],
                 "cause": self.cause,
                 "next_check": self.next_check,
                 "total_leakage": total,
@@ -257,8 +251,8 @@ class Diagnosis(Evidence):
                     "detector": self.detector or None,
                     "share": self.share,
                     "baselines": self.baselines,
-                    "ratio": ratio[0],
-                    "ratio_interval": ratio[1],
+                    "ratio": ratio,
+                    "ratio_interval": ratio_interval,
                     "refuses": sorted(self.refuses),
                 },
                 "state": self.state,
@@ -268,16 +262,16 @@ class Diagnosis(Evidence):
     def to_frame(self) -> pandas.DataFrame:
         """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins several.
 
-        Raises MissingExtra where pandas is not installed.
+        Raises MissingExtra if pandas is not installed.
         """
         try:
             import pandas
         except ImportError:
             raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
-        whole = self.as_dict()
-        row = {name: whole[name] for name in _COLUMNS}
+        values = self.as_dict()
+        row = {name: values[name] for name in _COLUMNS}
         for name in ("onset_interval_s", "leak_interval_lpm"):
-            row[f"{name}_low"], row[f"{name}_high"] = whole[name] or (None, None)
+            row[f"{name}_low"], row[f"{name}_high"] = values[name] or (None, None)
         return pandas.DataFrame([row])
 
     def plot(self, ax: matplotlib.axes.Axes | None = None) -> matplotlib.axes.Axes:
@@ -331,6 +325,7 @@ class Diagnosis(Evidence):
         """Return the diagnosis as a table for notebooks."""
 
         def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
+            """Format a number, with its interval if there is one; "" for None."""
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 
@@ -351,12 +346,12 @@ class Diagnosis(Evidence):
         return f"<table><caption>{escape(self.file)}: {escape(self.verdict)}</caption>{body}</table>"
 
 
-def _is_usual(question: Evidence) -> bool:
-    """Test whether a question's chance is that of 19 of 20 healthy recordings."""
-    return question.chance is None or question.chance >= 0.05
+def _is_usual(test: Evidence) -> bool:
+    """Test whether 19 of 20 healthy recordings score lower than this test's evidence, or its chance is not stated."""
+    return test.chance is None or test.chance >= 0.05
 
 
-def machine_name_of(preamble: Mapping[str, str]) -> str | None:
-    """Return the machine's name in the preamble of a file; None where there is none."""
+def find_machine_name(preamble: Mapping[str, str]) -> str | None:
+    """Return the machine's name in the preamble of a file; None if there is none."""
     names = {name.lower(): text for name, text in preamble.items()}
-    return next((names[name] for name in _MACHINES if name in names), None)
+    return next((names[name] for name in _MACHINE_NAMES if name in names), None)

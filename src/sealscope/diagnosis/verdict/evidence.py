@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.recordings.recording import Array
 
 Verdict = Literal["leak", "no leak", "cannot tell"]
@@ -23,19 +23,18 @@ Cause = Literal[
     "sensor fault",
     "changed duty",
 ]
-#: Why no flow is stated where it rests on a rig that nobody stated.
-NO_RIG = "L/min is not stated: no rig was stated (--rig)"
 #: Figures that a detector may refuse to state.
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`: piston and pump lie in parallel, often no channel separates them, and
-#: without a position what is lost to the outside shows alike.
+#: without a position a loss to the outside looks the same.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "leak inside or outside")
-#: What a detector asks of the leakage: did it rise here, is it more than in healthy recordings?
+#: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest chance that is stated.
-RAREST: float = priors("verdict")["false_alarm"]["rarest"]
-#: The detector that judges where no other can: it sees that something changed, and states no size.
-RMS_CHANGE = "rms change"
+RAREST: float = VERDICT.false_alarm.rarest
+#: The built-in detectors: by the balance of volumes, by a model of the pressures, and by changes of the pressures'
+#: details, which judges where no other can and states no size.
+VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure response", "rms change"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +54,13 @@ class LeakCourse:
 
 @dataclass(frozen=True)
 class TotalLeakage:
-    """Flow past pump and piston together over a whole recording, with any leak that was there from the start.
+    """Flow past pump and piston together over a whole recording, with any leak from before its start.
 
-    `lpm`: mean flow, and its 95 % interval [L/min], None where the machine's size is not known; `pressure`: mean size
-    of the pressure difference at which it flows [Pa]; `findable_lpm`: smallest step of that flow that would have been
-    found [L/min], None where a step was found; `healthy_lpm`: the most that a healthy machine passes at that pressure
-    [L/min], None where the rig does not say; `pump_share`, `findable_share`: the flow, and the smallest step, over the
-    pump's mean flow.
+    `lpm`: mean flow, and its 95 % interval [L/min], None if the machine's size is not known; `pressure`: mean size of
+    the pressure difference at which it flows [Pa]; `findable_lpm`: smallest step of that flow that would have been
+    found [L/min], None if a step was found; `healthy_lpm`: largest flow of a healthy machine at that pressure [L/min],
+    None if the rig does not state it; `pump_share`, `findable_share`: the flow, and the smallest step, over the pump's
+    mean flow.
     """
 
     lpm: float | None
@@ -74,18 +73,18 @@ class TotalLeakage:
 
     @property
     def healthy(self) -> bool:
-        """True if the flow is surely no more than a healthy machine's."""
+        """True if the upper end of the flow's interval is at most the largest flow of a healthy machine."""
         is_known = self.healthy_lpm is not None and self.interval_lpm is not None
         return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 
 
 @dataclass(frozen=True)
 class RelativeLeak:
-    """A leak relative to the recording's own measurements: known without area and displacement.
+    """A leak relative to other measurements of the recording, known without area and displacement.
 
-    `pump_share`: leak over the pump's mean flow, None where the pump's motion is not recorded; `creep`: leak over the
-    piston's area, the speed at which it would creep with its lines shut [m/s], None where the position has no unit;
-    each with its 95 % interval.
+    `pump_share`: leak over the pump's mean flow, None if the pump's motion is not recorded; `creep`: leak over the
+    piston's area, the speed at which it would creep with its lines shut [m/s], None if the position has no unit; each
+    with its 95 % interval.
     """
 
     pump_share: float | None = None
@@ -104,7 +103,7 @@ class Evidence:
     reason : str
         Why, in one line.
     score, threshold : float, optional
-        A leak is reported where the score exceeds the threshold.
+        A leak is reported if the score exceeds the threshold.
     onset_s, onset_interval_s : float and pair of floats, optional
         Time since when oil leaks, on the recording's time axis, and its 95 % interval [s].
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
@@ -112,8 +111,8 @@ class Evidence:
     parts : tuple of Evidence
         The detector's own parts, each with a score and a threshold; of a fused verdict, the evidence of every detector.
     cause : str, optional
-        What the change is attributed to. A detector that attributes one to something other than a piston leak says
-        `no leak` or `cannot tell`, and the cause.
+        Cause of the change. With a cause other than a leak past piston or pump, the verdict is `no leak` or `cannot
+        tell`.
     course : LeakCourse, optional
         The leak over the recording, where the detector follows it.
     refuses : frozenset of {"onset_s", "leak_lpm"}
@@ -122,19 +121,22 @@ class Evidence:
         What pump and piston pass together, where the detector measures it.
     share : float
         Share of the recording, 0 to 1, that the verdict rests on.
+    judged_until : float
+        When the last judged sample was taken, as a share of the recording's time. A leak stays once it began, so that
+        only the rest after it may hide one.
     detector : str
-        Name of the detector, or of the part; of a fused verdict, the detector that judged, "" where none did.
+        Name of the detector, or of the part; of a fused verdict, the detector that judged, "" if none did.
     usable : bool
         Whether the recording had what the detector needs.
     chance : float, optional
         Probability that a leak-free recording scores as high, by the detector's own null distribution; at most the
         false-alarm probability where the score is over the threshold.
     relative : RelativeLeak, optional
-        The leak beside what the recording itself measures; stated also where L/min is refused.
+        The leak relative to the recording's own measurements; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
         Displacement over area as measured, over the assumed one, and its 95 % interval.
     bound_lpm : float, optional
-        95 % upper bound of a leak [L/min] where none is reported.
+        95 % upper bound of a leak [L/min] if none is reported.
     """
 
     verdict: Verdict
@@ -151,6 +153,7 @@ class Evidence:
     refuses: frozenset[Figure] = frozenset()
     total_leakage: TotalLeakage | None = None
     share: float = 1.0
+    judged_until: float = 1.0
     detector: str = ""
     usable: bool = True
     chance: float | None = None
@@ -166,12 +169,12 @@ class Evidence:
 
     @property
     def abstains(self) -> bool:
-        """True if the next detector judges: `cannot tell`, and no change was seen."""
+        """True if the next detector has to judge: `cannot tell`, and no change was detected."""
         return self.verdict == CANNOT_TELL and self.cause is None and not self.alarmed
 
     @property
     def summary(self) -> str:
-        """The verdict in words; a change with another cause than a leak past piston or pump stands before it."""
+        """The verdict in words, with the cause of a change that is no leak past piston or pump."""
         if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
         if self.verdict == CANNOT_TELL:
@@ -180,15 +183,16 @@ class Evidence:
 
     @property
     def stated_chance(self) -> float | None:
-        """`chance`, no smaller than it is known."""
+        """`chance`, at least `RAREST`, as smaller values are not known."""
         return None if self.chance is None else max(RAREST, self.chance)
 
     @property
     def odds(self) -> str | None:
-        """Share of healthy recordings that look like this one, in words; None where it is not stated."""
+        """Fraction of healthy recordings that look like this one, in words; None if it is not stated."""
         if self.stated_chance is None:
             return None
         if self.stated_chance >= 0.2:
             return "more than 1 in 5 healthy recordings look like this"
-        times = f"{float(f'{1.0 / self.stated_chance:.2g}'):,.0f}".replace(",", " ")
-        return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {times} healthy recordings looks like this"
+        rounded = float(f"{1.0 / self.stated_chance:.2g}")  # to two digits
+        count = f"{rounded:,.0f}".replace(",", " ")
+        return f"{'fewer than ' if self.stated_chance == RAREST else ''}1 in {count} healthy recordings looks like this"

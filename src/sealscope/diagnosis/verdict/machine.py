@@ -12,9 +12,9 @@ from sealscope.parameters.rig import ASSUMED
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Recording
 
-#: Who stated the rig: the caller, the recording's own provenance, or nobody.
+#: Who stated the rig: the caller, the recording's provenance, or nobody.
 StatedBy = Literal["call", "recording", "nobody"]
-#: What turns a motion into a flow; the rig that is assumed where none is stated, and why.
+#: Parameters that convert a motion to a flow; the rig assumed if none is stated, and the reason.
 _GEOMETRY = ("cylinder.A_A", "cylinder.A_B", "pump.q_b")
 _DEFAULT, _REASON = "thesis", "no rig was stated"
 
@@ -23,7 +23,7 @@ _DEFAULT, _REASON = "thesis", "no rig was stated"
 class AssumedMachine:
     """Assumptions of a diagnosis about the machine.
 
-    `rig`: its name; `stated_by` the call (`--rig` or a Rig), the provenance of a recording of our own, or nobody;
+    `rig`: its name; `stated_by` the call (`--rig` or a Rig), the recording's provenance, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
     `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether flows are a
     meter's, `q_pump`, and rest on neither; `areas` of sides A and B [m^2]; `bypass`: whether a flow meter in a bypass
@@ -42,7 +42,7 @@ class AssumedMachine:
 
     @property
     def stated(self) -> bool:
-        """True if area and displacement are both stated."""
+        """True if area and displacement are both stated, not assumed."""
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
@@ -60,16 +60,16 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Return the rig assumed by detectors, and its statements about the machine.
+    """Return the rig that detectors assume, and what it states of the machine.
 
-    Without a `rig` it is that of the thesis: stated where the recording's own provenance says that it was made with the
-    same area and displacement, else each of its values is a mere assumption (`Rig.states`).
+    Without a `rig` it is the thesis's. That is stated if the recording's provenance names a rig of the same areas and
+    displacement, else all its values are assumptions (`Rig.states`).
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
     if rig is None:
-        stated_by = "recording" if _is_simulated_with(recording.provenance, used_rig) else "nobody"
-        used_rig = used_rig if stated_by == "recording" else unstated()
+        stated_by = "recording" if _names_rig_of_same_geometry(recording.provenance, used_rig) else "nobody"
+        used_rig = used_rig if stated_by == "recording" else used_rig.as_assumed(_REASON)
     elif not states_rig(used_rig):
         stated_by = "nobody"
     return used_rig, AssumedMachine(
@@ -86,35 +86,36 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Test whether a rig is somebody's, not the default one with only area or displacement stated."""
+    """Test whether a rig was stated, not the default one with only area or displacement stated."""
+    # nobody states the mass alone: it is assumed for want of a rig, or it is the rig's
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Test whether a meter reads the flow to the cylinder in its unit, and no angle or speed of a pump is read."""
+    """Test whether the flow to the cylinder is a meter's, in m^3/s, and not computed from the pump's angle or speed."""
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
     """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)]; 0 if stated for another pump.
 
-    What a file assumes of its own pump counts; not what is left of another rig's where only the displacement is stated.
+    A value that a rig's file assumes for its own pump counts; that of the default rig does not if only the displacement
+    is stated.
     """
-    healthy, pump = rig.entry("pump.G_healthy"), rig.entry("pump.q_b")
-    assumed_of_it = states_rig(rig) and rig.states("pump.q_b") and healthy.place == pump.place
-    is_known = rig.states("pump.G_healthy") or assumed_of_it
-    return rig.pump.G_healthy if is_known else 0.0
+    is_same_place = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
+    is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_same_place
+    return rig.pump.G_healthy if rig.states("pump.G_healthy") or is_of_this_pump else 0.0
 
 
-def unstated() -> Rig:
+def unstated_rig() -> Rig:
     """Return the default rig, with each value marked as an assumption."""
     return load_rig(_DEFAULT).as_assumed(_REASON)
 
 
-def _is_simulated_with(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Test whether the rig of a simulated recording has the area and displacement of this one."""
+def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
+    """Test whether a recording's provenance names a packaged rig with the area and displacement of this one."""
     experiment = provenance.get("experiment")
-    if provenance.get("origin") != "simulation" or not isinstance(experiment, Mapping):
+    if not isinstance(experiment, Mapping):
         return False
     name, overrides = experiment.get("rig"), experiment.get("overrides")
     if name not in rig_names() or not isinstance(overrides, Mapping) or set(_GEOMETRY) & set(overrides):

@@ -8,16 +8,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.diagnosis.verdict.evidence import LEAK, Evidence, RelativeLeak
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE, parse_quantity
 
-#: How much of the limit a leak takes: surely all of it, maybe half of it or more, surely less than half of it.
+#: Leak relative to the limit: surely over it ("repair"), surely under half of it ("monitor"), else "plan".
 Level = Literal["repair", "plan", "monitor"]
-#: A figure with its 95 % interval, None where it is not known.
+#: A figure with its 95 % interval, None if it is not known.
 _Figure = tuple[float, float, float] | None
 
 
@@ -25,10 +25,8 @@ _Figure = tuple[float, float, float] | None
 class RepairLimit:
     """Leak from which a machine is to be repaired.
 
-    By default the creep of `priors.toml`: as a speed it holds for a piston of any area.
-
     `value`: flow [m^3/s], or speed at which the piston creeps with its lines shut [m/s], by `kind`; `stated` by the
-    caller.
+    caller, else the creep of `priors.toml`, which applies to a piston of any area.
     """
 
     value: float
@@ -36,16 +34,17 @@ class RepairLimit:
     stated: bool
 
     @classmethod
-    def of(cls, text: str | None) -> RepairLimit:
-        """Parse a repair limit, a flow or a speed with its unit; the default one for None."""
+    def parse(cls, text: str | None) -> RepairLimit:
+        """Parse a repair limit, a flow or a speed with its unit; return the default one for None."""
         if text is None:
-            return cls(priors("verdict")["repair"]["creep"] * MM_PER_MINUTE, "creep", stated=False)
+            return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
             except InputError:
                 continue
-            if not isinstance(text, str) or not any(sign.isalpha() for sign in text) or not value > 0:
+            has_unit = isinstance(text, str) and any(character.isalpha() for character in text)
+            if not (has_unit and value > 0):
                 break
             return cls(value, kind, stated=True)  # type: ignore[arg-type]
         raise InputError(f"limit must be a flow or a speed > 0 with its unit, such as 5 mL/min or 8 mm/min, got {text}")
@@ -54,6 +53,12 @@ class RepairLimit:
         if self.kind == "flow":
             return f"{self.value / ML_PER_MINUTE:.3g} mL/min"
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
+
+    def flow_lpm(self, area: float | None) -> float | None:
+        """Convert the limit to L/min; a speed needs the piston's area [m^2], None if that is not stated."""
+        if self.kind == "flow":
+            return self.value / LITRE_PER_MINUTE
+        return None if area is None else self.value * area / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
         """Return the limit as plain JSON values; the kind not stated is null."""
@@ -66,11 +71,11 @@ class RepairLimit:
 
 @dataclass(frozen=True)
 class Severity:
-    """Severity of a leak, as far as recording and machine tell.
+    """Severity of a leak, as far as it is known.
 
-    Each figure is None, where it is not known, or the figure and its 95 % interval: `mL_per_min`, mean flow while the
-    leak is open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston
-    would creep with its lines shut under the same pressure difference; `of_limit`, the leak over the repair limit.
+    Each figure is given with its 95 % interval, or None if it is not known: `mL_per_min`, mean flow while the leak is
+    open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston would
+    creep with its lines shut under the same pressure difference; `of_limit`, the leak over the repair limit.
     """
 
     mL_per_min: _Figure
@@ -80,9 +85,9 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the interval: `repair` if all over the limit, `monitor` if all under half of it.
+        """Level by the leak's interval: `repair` if all over the limit, `monitor` if under half of it, else `plan`.
 
-        Else `plan`; None where the leak cannot be held against the limit.
+        None if the leak is not known in the limit's unit.
         """
         if self.of_limit is None:
             return None
@@ -100,36 +105,39 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Compute the severity of the leak in the evidence; None without a leak, or without its size."""
+    """Compute the severity of the leak in the evidence; None if there is no leak, or its size is unknown."""
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
-    flow = _figure(evidence.leak_lpm, evidence.leak_interval_lpm, LITRE_PER_MINUTE)
-    creep = _figure(relative.creep, relative.creep_interval)
+    flow_lpm, creep = (evidence.leak_lpm, evidence.leak_interval_lpm), (relative.creep, relative.creep_interval)
+    if limit.kind == "flow":
+        of_limit = _convert_figure(*flow_lpm, LITRE_PER_MINUTE / limit.value)
+    else:
+        of_limit = _convert_figure(*creep, 1.0 / limit.value)
     return Severity(
-        mL_per_min=_over(flow, ML_PER_MINUTE),
-        pump_share=_figure(relative.pump_share, relative.pump_share_interval),
-        creep_mm_per_min=_over(creep, MM_PER_MINUTE),
-        of_limit=_over(flow if limit.kind == "flow" else creep, limit.value),
+        mL_per_min=_convert_figure(*flow_lpm, LITRE_PER_MINUTE / ML_PER_MINUTE),
+        pump_share=_convert_figure(relative.pump_share, relative.pump_share_interval),
+        creep_mm_per_min=_convert_figure(*creep, 1.0 / MM_PER_MINUTE),
+        of_limit=of_limit,
     )
 
 
-def beside_the_pump(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
-    """Compare a leak of a stated L/min with the assumed pump's flow; compute its speed of the assumed piston.
+def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
+    """Express a leak in L/min as a fraction of the assumed pump's flow, and as a speed of the assumed piston.
 
-    None where no L/min is stated; without the share of the pump where neither its speed nor its angle is recorded.
+    None if no L/min is stated; the fraction is None if neither speed nor angle of the pump is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
-    ends = LITRE_PER_MINUTE * np.array([evidence.leak_lpm, *evidence.leak_interval_lpm])
-    pump = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
-    creep, *creeps = (ends / machine.area).tolist()
-    share, *shares = (ends / pump).tolist() if pump > 0.0 else (None,)
-    return RelativeLeak(share, tuple(shares) or None, creep, tuple(creeps))
+    flows = LITRE_PER_MINUTE * np.array([evidence.leak_lpm, *evidence.leak_interval_lpm])
+    pump_flow = _mean_speed(recording) / (2.0 * math.pi) * machine.displacement
+    creep, *creep_ends = (flows / machine.area).tolist()
+    share, *share_ends = (flows / pump_flow).tolist() if pump_flow > 0.0 else (None,)
+    return RelativeLeak(share, tuple(share_ends) or None, creep, tuple(creep_ends))
 
 
 def _mean_speed(recording: Recording) -> float:
-    """Return the mean size of the pump's speed [rad/s], 0 where it is not recorded in its unit."""
+    """Compute the pump's mean absolute speed [rad/s]; 0 if neither speed nor angle is recorded in SI units."""
     if "omega" in recording and recording.units["omega"] == "rad/s":
         return float(np.nanmean(np.abs(recording["omega"])))
     if "theta" in recording and recording.units["theta"] == "rad" and len(recording) > 1:
@@ -137,12 +145,8 @@ def _mean_speed(recording: Recording) -> float:
     return 0.0
 
 
-def _figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Return a figure with its interval, times a factor; None where a number is missing or infinite."""
+def _convert_figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
+    """Multiply a value and its interval by a factor; return None if a number is missing or infinite."""
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]
-
-
-def _over(figure: _Figure, unit: float) -> _Figure:
-    return figure and (figure[0] / unit, figure[1] / unit, figure[2] / unit)

@@ -26,8 +26,8 @@ class MachineState:
 
     `name`: good, check function, out of specification, maintenance required or failure; `symbol`: its letter; `health`:
     its number in DeviceHealthEnumeration; `severity`: 1 to 1000, as of an event of OPC UA, 0 for good; `condition` that
-    it follows from, such as "leak" or "no data"; `since_s`: clock of the samples since when it holds [s], None where
-    not known; `cause` that the change is taken for; `action`: what is to be done.
+    it follows from, such as "leak" or "no data"; `since_s`: clock of the samples when it began [s], None if
+    unknown; `cause` of the change; `action`: what is to be done.
     """
 
     name: str
@@ -46,6 +46,7 @@ class MachineState:
 
 @cache
 def _tables() -> Mapping[str, Mapping[str, Any]]:
+    """Read `states.toml`."""
     return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
 
 
@@ -59,8 +60,8 @@ def state_of(
     pump; `since_s`: clock [s]; `action`: in place of the table's.
     """
     tables = _tables()
-    by_condition, by_cause = tables["conditions"][condition], tables["causes"].get(cause or "", {})
-    name = by_condition["state"] if condition in LEAKING else by_cause.get("state", by_condition["state"])
+    condition_row, cause_row = tables["conditions"][condition], tables["causes"].get(cause or "", {})
+    name = condition_row["state"] if condition in LEAKING else cause_row.get("state", condition_row["state"])
     action = action or action_of(condition, cause)
     return MachineState(
         name=name, **tables["states"][name], condition=condition, since_s=since_s, cause=cause, action=action
@@ -70,9 +71,9 @@ def state_of(
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action for a condition, or for the cause of a change; KeyError as for `state_of`.
 
-    `parts`: what the machine has that leaks like a worn seal, and is looked at before its leak.
+    `parts`: components that leak like a worn seal, such as a bypass valve; their checks come first.
     """
     tables = _tables()
     action: str = tables["causes"].get(cause or "", tables["conditions"][condition])["action"]
-    first = [str(tables["parts"][part]) for part in parts] if condition in LEAKING else []
-    return " ".join([*first, action])
+    part_checks = [str(tables["parts"][part]) for part in parts] if condition in LEAKING else []
+    return " ".join([*part_checks, action])

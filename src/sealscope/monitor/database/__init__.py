@@ -1,8 +1,8 @@
-"""What a monitor keeps in its database."""
+"""The database of a monitor."""
 
 from sealscope.errors import MissingExtra
 
 try:
-    import sqlalchemy  # noqa: F401 (asked for before what needs it)
+    import sqlalchemy  # noqa: F401 (checked before the modules that need it)
 except ImportError:
     raise MissingExtra("the monitor's database needs SQLAlchemy: pip install 'sealscope[serve]'") from None

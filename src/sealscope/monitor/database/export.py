@@ -1,4 +1,4 @@
-"""What persons said of alarms, as labelled data: tables of alarms and of estimates."""
+"""Export of alarms and estimates as labelled data; the labels are the marks of persons."""
 
 from __future__ import annotations
 
@@ -17,52 +17,61 @@ ALARM_COLUMNS = (
     "by_chance_per_1000_h",
 )
 ESTIMATE_COLUMNS = ("actuator", "t", "status", *FIGURES, "label", "alarm")
-#: What a person may say of an alarm -> what its estimates are then.
+#: Mark of an alarm -> label of its estimates.
 _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write `alarms.csv` and `estimates.csv` into a folder, and return how many rows each has.
+    """Write `alarms.csv` and `estimates.csv` into a folder, and return their numbers of rows.
 
-    An estimate is labelled `leak` from the start of an alarm's onset interval on until it was marked `repaired` or
-    `valid`, and `healthy` until it was marked `invalid`; what nobody said anything of has no label.
+    The estimates from the start of an alarm's onset interval until its last mark are labelled `leak` if the mark is
+    `repaired` or `valid`, and `healthy` if it is `invalid`. Other estimates have no label.
     """
+    events = _events_by_alarm(store)
+    # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
+    rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
+    for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
+        history = events[alarm["id"]]
+        last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)
+        onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
+        comments = (f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"])
+        row = {
+            "marked_by": None if last_mark is None else last_mark["by"],
+            "marked_s": None if last_mark is None else last_mark["t"],
+            "comments": "; ".join(comments),
+            **dict(zip(("onset_low_s", "onset_high_s"), onset, strict=True)),
+            **dict(zip(("leak_low_lpm", "leak_high_lpm"), leak, strict=True)),
+        }
+        rows.append({**alarm, **row})
+        if last_mark is not None:
+            start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[last_mark["event"]]
+            labels = {"label": label, "alarm": alarm["id"]}
+            labelled[alarm["actuator"]].append((start, last_mark["t"], labels))
+
+    n_estimates = 0
+
+    def estimates() -> Iterator[dict[str, Any]]:
+        """Yield the rows of the estimates, and count them."""
+        nonlocal n_estimates
+        for n_estimates, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
+            labels = [labels for start, stop, labels in labelled[row["actuator"]] if start <= row["t"] <= stop]
+            yield _select_columns({**row, **(labels[-1] if labels else {})}, ESTIMATE_COLUMNS)
+
+    write_csv(folder / "alarms.csv", ALARM_COLUMNS, [_select_columns(row, ALARM_COLUMNS) for row in rows])
+    write_csv(folder / "estimates.csv", ESTIMATE_COLUMNS, estimates())
+    return len(rows), n_estimates
+
+
+def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any]]]:
+    """Read all events in their order, by the id of their alarm."""
     events, number = defaultdict[str, list[dict[str, Any]]](list), 0
     while batch := store.events_since(number):
         number = batch[-1][0]
         for _, event in batch:
             events[event["alarm"]["id"]].append(event)
-    rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
-    for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
-        history = events[alarm["id"]]
-        judged = next((event for event in reversed(history) if event["event"] in _LABELS), None)
-        onset, leak = alarm["onset_interval_s"] or (None, None), alarm["leak_interval_lpm"] or (None, None)
-        row = {
-            "marked_by": None if judged is None else judged["by"],
-            "marked_s": None if judged is None else judged["t"],
-            "comments": "; ".join(
-                f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"]
-            ),
-            **dict(zip(("onset_low_s", "onset_high_s"), onset, strict=True)),
-            **dict(zip(("leak_low_lpm", "leak_high_lpm"), leak, strict=True)),
-        }
-        rows.append({**alarm, **row})
-        if judged is not None:
-            start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[judged["event"]]
-            labelled[alarm["actuator"]].append((start, judged["t"], {"label": label, "alarm": alarm["id"]}))
-
-    count = 0
-
-    def estimates() -> Iterator[dict[str, Any]]:
-        nonlocal count
-        for count, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
-            known = [label for start, stop, label in labelled[row["actuator"]] if start <= row["t"] <= stop]
-            yield _cells({**row, **(known[-1] if known else {})}, ESTIMATE_COLUMNS)
-
-    write_csv(folder / "alarms.csv", ALARM_COLUMNS, [_cells(row, ALARM_COLUMNS) for row in rows])
-    write_csv(folder / "estimates.csv", ESTIMATE_COLUMNS, estimates())
-    return len(rows), count
+    return events
 
 
-def _cells(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+def _select_columns(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
+    """Return the values of these columns, None for missing ones."""
     return {name: row.get(name) for name in columns}

@@ -1,4 +1,4 @@
-"""What persons say of alarms, in the file of the commissioned machine that an actuator's `rig` is."""
+"""Marks of alarms, written to the file of the commissioned machine that an actuator's `rig` names."""
 
 from __future__ import annotations
 
@@ -18,46 +18,48 @@ from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import read_toml
 
 
-def pass_on(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
-    """Write a person's mark of an alarm into a machine's file, and return a line about the change.
+def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
+    """Write a person's mark of an alarm into a machine's file, and return a line that states the result.
 
-    An `invalid` alarm's `samples`, the last ones before the mark, are taught as healthy; the machine's file refuses
-    those that it judges leaking. From the onset of a `valid` one on no recording is, until a repair. "" where `mark` is
-    another one, or `rig` no machine's file.
+    The `samples` before an `invalid` mark are added as a healthy recording, unless the machine judges them leaking.
+    After a `valid` mark no recording from the onset on becomes healthy until a repair. Returns "" for any other mark,
+    and if `rig` is not a machine's file.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
         return ""
-    name, reason = printable(alarm.id), printable(alarm.reason)  # one line each, where the file is shown
+    name, reason = printable(alarm.id), printable(alarm.reason)  # one line each, as the file is shown as text
     try:
         if "machine" not in read_toml(path, "a machine's file", rig):
             return ""
+        # a machine's file has times since 1970; the samples' clock may start anywhere
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
-        leak = None if mark == "invalid" else alarm.leak_lpm
-        judged = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak, reason)
-        done = "written down"
+        leak_lpm = None if mark == "invalid" else alarm.leak_lpm
+        judged = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak_lpm, reason)
+        outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
-            nonlocal done
+            """Add the alarm to a machine, and after an invalid one its samples as healthy."""
+            nonlocal outcome
             machine = replace(machine, alarms=(*machine.alarms, judged))
             if mark == "invalid":
                 try:
-                    machine = machine.with_healthy(_recording(samples, shift), file=name)
-                    done = "taught as healthy"
+                    machine = machine.with_healthy(_combine_samples(samples, shift), file=name)
+                    outcome = "taught as healthy"
                 except SealscopeError as error:
-                    done = f"not taught: {error}"
+                    outcome = f"not taught: {error}"
             return machine
 
         update_machine(path, add_mark)
     except (SealscopeError, ValueError, OverflowError, OSError) as error:
-        done = f"not written: {error}"
-    return f"{path.name}: {done}"
+        outcome = f"not written: {error}"
+    return f"{path.name}: {outcome}"
 
 
-def _recording(samples: Sequence[Recording], shift: float) -> Recording:
-    """Return samples as one recording that begins at 0 s of a date, their clock and `shift` [s since 1970]."""
+def _combine_samples(samples: Sequence[Recording], shift: float) -> Recording:
+    """Join samples to one recording that starts at 0 s; its date is the first time plus `shift` [s since 1970]."""
     if not samples:
         raise SealscopeError("no samples of the alarm are kept: add its recording by sealscope commission --add")
-    whole = join(samples) if len(samples) > 1 else samples[0]
-    start = datetime.fromtimestamp(float(whole.t[0]) + shift, UTC).replace(tzinfo=None)
-    return replace(whole, t=whole.t - whole.t[0], provenance={"start": start.isoformat(timespec="milliseconds")})
+    joined = join(samples) if len(samples) > 1 else samples[0]
+    start = datetime.fromtimestamp(float(joined.t[0]) + shift, UTC).replace(tzinfo=None)
+    return replace(joined, t=joined.t - joined.t[0], provenance={"start": start.isoformat(timespec="milliseconds")})

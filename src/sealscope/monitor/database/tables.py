@@ -18,27 +18,29 @@ FIGURES = (
 _TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double": Float(53), "bytes": LargeBinary()}
 
 
-def _table(name: str, columns: str, *more: Index) -> Table:
-    """Return a table of columns: name, type or most letters, and whether it is of the key, indexed or may be null."""
+def _table(name: str, columns: str, *indexes: Index) -> Table:
+    """Make a table from comma-separated columns, each with its name, its type or longest text, then its roles.
+
+    Roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null`` (may be null).
+    """
     table_columns: list[Column[Any]] = []
     for column, kind, *roles in map(str.split, columns.split(",")):
-        known = _TYPES[kind] if kind in _TYPES else String(int(kind))
+        datatype = _TYPES[kind] if kind in _TYPES else String(int(kind))
         key, null, index = "key" in roles or "counted" in roles, "null" in roles, "indexed" in roles
-        counts: Literal["auto"] | bool = "auto" if "counted" in roles else False
-        table_columns.append(Column(column, known, primary_key=key, autoincrement=counts, nullable=null, index=index))
-    return Table(name, metadata, *table_columns, *more)
+        auto: Literal["auto"] | bool = "auto" if "counted" in roles else False
+        table_columns.append(Column(column, datatype, primary_key=key, autoincrement=auto, nullable=null, index=index))
+    return Table(name, metadata, *table_columns, *indexes)
 
 
 facts = _table("facts", "name 40 key, value text")
 #: Blocks that are stored, by identity.
-blocks = _table(
-    "blocks", "actuator 120 key, identity 120 key, number int", Index("blocks_in_order", "actuator", "number")
-)
-#: Samples since the checkpoint, which a restart goes through once more.
+_block_order = Index("blocks_in_order", "actuator", "number")
+blocks = _table("blocks", "actuator 120 key, identity 120 key, number int", _block_order)
+#: Samples since the checkpoint, which a restart judges again.
 pending = _table("pending", "actuator 120 key, number int key, samples bytes")
 #: State of the detector and of the alarm, as of the checkpoint, in JSON.
 actuators = _table("actuators", "actuator 120 key, settings text, checkpoint text")
-#: What each actuator shows now: a row of its own, for one is written whole, and a state is large.
+#: Summary of each actuator, apart from the state: rows are written whole, and a state is large.
 summaries = _table("summaries", "actuator 120 key, summary text")
 _FIGURES = ", ".join(f"{name} double null" for name in FIGURES)
 estimates = _table("estimates", f"actuator 120 key, number int key, t double, status 160, {_FIGURES}")

@@ -1,1 +1,1 @@
-"""Where alarms go: JSON lines, Prometheus, a broker."""
+"""Outputs of alarms and states: JSON lines, webhook, Prometheus, Sparkplug B."""

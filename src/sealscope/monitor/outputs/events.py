@@ -1,6 +1,6 @@
-"""Events as JSON: lines on a stream, posts to a web address; in their order, after a crash once more rather than never.
+"""Events as JSON lines on a stream and as posts to a web address, in order and at least once.
 
-How far an output is stands in the store; an event that went out just before a crash goes out again, with its number.
+The store has the position of each output. An event sent just before a crash is sent again, with the same number.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ import httpx
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.supervisor import PartAway
 
-logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells each request
-#: Events that a shelved alarm keeps to itself.
-_BY_ITSELF = ("raised", "error", "warning", "returned")
+logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
+#: Events of the detector, which are not announced while an alarm is shelved.
+_DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
 
 def _is_announced(event: dict[str, Any]) -> bool:
-    """Test whether an event is announced: of a shelved alarm only a person's acts are."""
-    return event["event"] not in _BY_ITSELF or not event["alarm"]["shelved"]
+    """Test whether an event is announced; for a shelved alarm only the marks of persons are."""
+    return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
 class EventLines:
-    """Writes the events of a store to a stream of text, or to nowhere where there is none.
+    """Write the events of a store to a text stream.
 
-    A stream that takes no more, or a part of a line, gets the rest later: no line is cut off or written twice.
+    If the stream accepts only a part of a line, the rest follows later: no line is cut off or written twice.
     """
 
     def __init__(self, store: MonitorStore, stream: TextIO | None) -> None:
         self._store, self._stream = store, stream
-        self._left, self._number = b"", 0  # of the line under way, and its event
+        self._unwritten, self._number = b"", 0  # rest of the line under way, and the number of its event
 
-    def pass_on(self) -> None:
-        """Write the new events. Raise PartAway if the stream accepts no more."""
-        self._store.pass_on("lines", self._write_line)
+    def deliver(self) -> None:
+        """Write the new events; raise PartAway if the stream is closed or refuses them."""
+        self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write a line to the stream's file, past its buffer: what a full disk refuses must not stay in there."""
+        """Write a line to the stream's file without its buffer, which would keep what a full disk refuses."""
         if event["number"] != self._number:
-            self._left, self._number = (json.dumps(event) + "\n").encode(), event["number"]
+            self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
             if not _is_announced(event):
                 return True
@@ -52,21 +52,21 @@ class EventLines:
             try:
                 file = self._stream.fileno()
             except (OSError, ValueError):  # a stream in memory
-                self._stream.write(self._left.decode())
+                self._stream.write(self._unwritten.decode())
                 return True
             self._stream.flush()
-            while self._left:
-                self._left = self._left[os.write(file, self._left) :]
+            while self._unwritten:
+                self._unwritten = self._unwritten[os.write(file, self._unwritten) :]
         except (OSError, ValueError) as error:
             raise PartAway(getattr(error, "strerror", None) or error) from None
         return True
 
 
 class Webhook:
-    """Posts the events of a store, each as the JSON object of its line, to an address.
+    """Post the events of a store to a web address, each as the JSON object of its line.
 
-    An answer of 200 to 299 means that it has arrived. `Idempotency-Key` is the event's number. The token, sent as
-    `Authorization: Bearer`, stands in no log, and no redirect is followed with it. `timeout`: of an exchange [s].
+    Status 200 to 299 confirms an event. `Idempotency-Key` is its number. The token is sent as `Authorization: Bearer`;
+    it is never logged, and redirects are not followed. `timeout`: limit of a request with its answer [s].
     """
 
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
@@ -75,24 +75,26 @@ class Webhook:
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
 
-    def pass_on(self) -> None:
-        """Post the new events. Raise PartAway if one does not arrive."""
-        self._store.pass_on("webhook", self._posted)
+    def deliver(self) -> None:
+        """Post the new events; raise PartAway if one is not confirmed."""
+        self._store.deliver("webhook", self._send_post)
 
-    def _posted(self, event: dict[str, Any]) -> bool:
+    def _send_post(self, event: dict[str, Any]) -> bool:
+        """Post an event if it is announced; raise PartAway if it is not confirmed."""
         if not _is_announced(event):
             return True
         try:
             asyncio.run(self._post(event))
         except TimeoutError:
             raise PartAway(f"no answer within {self._timeout:g} s") from None
-        except httpx.RemoteProtocolError:  # its text is what the other side sent
+        except httpx.RemoteProtocolError:  # its text is what the server sent
             raise PartAway("an answer that is no HTTP") from None
         except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
             raise PartAway((str(error).splitlines() or [""])[0][:200] or type(error).__name__) from None
         return True
 
     async def _post(self, event: dict[str, Any]) -> None:
+        """Send one request; raise OSError if its status is not 200 to 299."""
         headers = {**self._headers, "Idempotency-Key": str(event["number"])}
         client = httpx.AsyncClient(timeout=None)
         async with (

@@ -1,4 +1,4 @@
-"""A dashboard of Grafana for the metrics of `/metrics`, as the JSON that it imports; the panels: `grafana.toml`."""
+"""A Grafana dashboard for the metrics of `/metrics`; its panels are in `grafana.toml`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 
 def dashboard() -> dict[str, Any]:
-    """Return the dashboard; it asks for the Prometheus at its import, and for the actuators on top."""
+    """Build the dashboard, with the actuator as a variable, in the JSON form of Grafana."""
     tables: dict[str, Any] = tomllib.loads((files("sealscope.monitor.outputs") / "grafana.toml").read_text("utf-8"))
-    panels, x, y, row = [], 0, 0, 0
+    panels, x, y, row_height = [], 0, 0, 0
     for number, (title, kind, query, legend, unit, width, height) in enumerate(tables["panels"], 1):
-        if x + width > 24:
-            x, y, row = 0, y + row, 0
+        if x + width > 24:  # columns of Grafana's grid
+            x, y, row_height = 0, y + row_height, 0
         expression = query.replace("%s", 'actuator=~"$actuator"')
         panels.append(
             {
@@ -26,5 +26,5 @@ def dashboard() -> dict[str, Any]:
                 "fieldConfig": {"defaults": {"unit": f"suffix: {unit}" if unit else "short"}, "overrides": []},
             }
         )
-        x, row = x + width, max(row, height)
+        x, row_height = x + width, max(row_height, height)
     return {**tables["dashboard"], "panels": panels}

@@ -1,4 +1,4 @@
-"""The actuators as metrics that Prometheus reads (text exposition format 0.0.4)."""
+"""The metrics of a monitor for Prometheus (text exposition format 0.0.4)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Any
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
+from sealscope.monitor.bounded_queue import QueueLoad
+
 #: Content type of the text.
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-#: Metric of an actuator -> help, and where it is in its summary. A name that ends in `_total` is a counter.
-_OF_ACTUATORS = {
+#: Metric of an actuator -> help text, and key in its summary. A name that ends in `_total` is a counter.
+_ACTUATOR_METRICS = {
     "sealscope_leak_lpm": ("Leak beyond the healthy machine over the cycles seen [L/min]", "leak_lpm"),
     "sealscope_leak_low_lpm": ("Lower end of its 95 % interval [L/min]", "leak_low"),
     "sealscope_leak_high_lpm": ("Upper end of its 95 % interval [L/min]", "leak_high"),
@@ -24,34 +26,34 @@ _OF_ACTUATORS = {
     "sealscope_blocks_total": ("Blocks since the beginning", "blocks"),
     "sealscope_block_time_seconds": ("Clock at the end of the last block", "t"),
 }
-#: Metric of a part of the monitor, or of what waits -> help.
-_OF_PARTS = {
+#: Metric of a part of the monitor, or of its queue -> help text.
+_PART_METRICS = {
     "sealscope_reached": "1 while a part of the monitor or what it needs is reached, 0 in an outage",
     "sealscope_outages_total": "Outages since the start",
     "sealscope_outage_seconds_total": "How long outages lasted since the start",
 }
-_OF_WAITING = {
+_QUEUE_METRICS = {
     "sealscope_waiting_blocks": "Blocks that wait to be stored",
     "sealscope_waiting_bytes": "Bytes of the blocks that wait to be stored",
     "sealscope_source_waits_total": "How often a source had to wait because too many blocks waited",
 }
 
 
-def metrics_text(
+def format_metrics(
     summaries: Mapping[str, Mapping[str, Any]],
     counters: Mapping[str, int],
     parts: Mapping[str, tuple[bool, int, float]] | None = None,
-    waiting: tuple[int, int, int] = (0, 0, 0),
+    queue_load: QueueLoad | None = None,
 ) -> str:
-    """Return the metrics of all actuators, and of the monitor itself.
+    """Format the metrics of all actuators and of the monitor as text.
 
-    `counters`: what it dropped, by reason; `parts`: of what it needs, such as its database, whether it is reached, how
-    many outages it had, and how long they lasted [s]; `waiting`: blocks that are to be stored, their bytes, and how
-    often a source had to wait for them.
+    `counters`: numbers of dropped messages and blocks, by reason; `parts`: for each part, such as the database, whether
+    it is reached, its number of outages, and their length [s].
     """
     families: dict[str, Any] = {}
 
     def add(name: str, text: str, value: float | None, **labels: str) -> None:
+        """Add a value with its labels to the metric `name` of help `text`, unless it is None."""
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))
@@ -59,8 +61,8 @@ def metrics_text(
     for actuator, summary in summaries.items():
         values = {**summary, **{f"state.{name}": value for name, value in summary.get("state", {}).items()}}
         values["leak_low"], values["leak_high"] = summary.get("leak_interval_lpm") or (None, None)
-        for name, (text, place) in _OF_ACTUATORS.items():
-            add(name, text, values.get(place), actuator=actuator)
+        for name, (text, key) in _ACTUATOR_METRICS.items():
+            add(name, text, values.get(key), actuator=actuator)
         if "by" in summary:
             text = "What an actuator is watched by: volumes, or pressures"
             add("sealscope_watched", text, 1, actuator=actuator, by=summary["by"])
@@ -69,11 +71,12 @@ def metrics_text(
             add("sealscope_passed_over_total", text, count, actuator=actuator, reason=reason)
     for reason, count in counters.items():
         add("sealscope_dropped_blocks_total", "Messages dropped by reason", count, reason=reason)
-    for part, measured in (parts or {}).items():
-        for (name, text), value in zip(_OF_PARTS.items(), measured, strict=True):
+    for part, outage_total in (parts or {}).items():
+        for (name, text), value in zip(_PART_METRICS.items(), outage_total, strict=True):
             add(name, text, value, part=part)
-    for (name, text), value in zip(_OF_WAITING.items(), waiting, strict=True):
+    for (name, text), value in zip(_QUEUE_METRICS.items(), queue_load or QueueLoad(), strict=True):
         add(name, text, value)
     registry = CollectorRegistry(auto_describe=False)
+    # a collector is an object with a method `collect`
     registry.register(type("Families", (), {"collect": lambda self: families.values()})())
     return generate_latest(registry).decode()

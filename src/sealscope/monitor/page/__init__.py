@@ -1,9 +1,9 @@
-"""The monitor's page: the fleet, one actuator's life, and what a person says of its alarm."""
+"""The monitor's page: the fleet, the history of one actuator, and the marks of its alarm."""
 
 from sealscope.errors import MissingExtra
 
 try:
-    import prometheus_client  # noqa: F401 (asked for before what needs them)
+    import prometheus_client  # noqa: F401 (checked before the modules that need them)
     import starlette  # noqa: F401
     import uvicorn  # noqa: F401
 except ImportError:

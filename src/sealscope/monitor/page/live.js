@@ -2,6 +2,7 @@
 "use strict";
 
 let news = null;
+const replaced = [];
 let heard = "";
 let paused = false;
 let latest = null;
@@ -18,18 +19,33 @@ function listen() {
   }
   const address = document.hidden ? "" : `/api/changes?${query}`;
   if (address === heard && news && news.readyState !== EventSource.CLOSED) return;
-  if (news) news.close();
+  if (news) replaced.push(news);
   heard = address;
-  news = null;
-  if (!address) return;
-  news = new EventSource(address);
-  news.onmessage = soon;
-  news.addEventListener("live", (event) => showLive(JSON.parse(event.data)));
-  news.onerror = () => {
+  news = address ? new EventSource(address) : null;
+  if (!news) {
+    closeReplaced();
+    return;
+  }
+  const stream = news;
+  stream.onmessage = () => {
+    // not before: the monitor keeps the samples of an actuator while somebody looks at it
+    if (stream === news) closeReplaced();
+    soon();
+  };
+  stream.addEventListener("live", (event) => {
+    if (stream === news) showLive(JSON.parse(event.data));
+  });
+  stream.onerror = () => {
+    if (stream !== news) return;
+    closeReplaced();
     byId("overall").textContent = "the monitor does not answer";
     // a refused stream is closed for good: ask again
-    if (news && news.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
+    if (stream.readyState === EventSource.CLOSED) setTimeout(listen, 3000);
   };
+}
+
+function closeReplaced() {
+  for (const stream of replaced.splice(0)) stream.close();
 }
 
 const bar = (value) => (value === null || value === undefined ? "–" : value.toFixed(value < 99.95 ? 1 : 0));

@@ -152,7 +152,7 @@ function facts(alarm, judged) {
     ["Since", `${clock(alarm.onset_s)} (${clock(alarm.onset_interval_s[0])} to ${clock(alarm.onset_interval_s[1])})`],
     ["Raised", clock(alarm.raised_s)],
     ["Evidence", alarm.evidence],
-    ["By chance", judged ? judged.odds : byChance(alarm)],
+    ["By chance", judged && judged.verdict === "leak" ? judged.odds : byChance(alarm)],
     ["Reason", alarm.reason],
     ["Number", `${alarm.diagnostic_number}${alarm.baseline ? `, baseline ${alarm.baseline}` : ""}`],
   ];
@@ -232,7 +232,6 @@ function draw(course, events) {
             context.strokeStyle = colour("--quiet");
             context.fillStyle = colour("--ink");
             context.font = `${11 * devicePixelRatio}px system-ui`;
-            context.textAlign = "left";
             context.setLineDash([4, 4]);
             marks.forEach((event, k) => {
               const x = plot.valToPos(event.t, "x", true);
@@ -241,7 +240,9 @@ function draw(course, events) {
               context.moveTo(x, plot.bbox.top);
               context.lineTo(x, plot.bbox.top + plot.bbox.height);
               context.stroke();
-              context.fillText(event.event, x + 4, plot.bbox.top + (12 + 12 * (k % 4)) * devicePixelRatio);
+              const wide = x + 4 + context.measureText(event.event).width > plot.bbox.left + plot.bbox.width;
+              context.textAlign = wide ? "right" : "left";
+              context.fillText(event.event, x + (wide ? -4 : 4), plot.bbox.top + (12 + 12 * (k % 4)) * devicePixelRatio);
             });
             context.restore();
           },

@@ -1,11 +1,11 @@
 """Blocks from an MQTT 5 broker, acknowledged when they are stored; alarms to it, retained.
 
-The session outlives the connection (QoS 1, no clean start): what was in flight at a crash comes again, and is known by
-its identity. The thread of the connection only takes messages in; another one decodes them and waits where the service
-does. That the decoding of a large or repeated message begins is stored until it ends: one during which the process has
-died twice is refused unread. Of QoS 0 those are dropped and counted for which there is no room. Where a broker sends
-more of QoS 1 than agreed (as mosquitto 2.0.11 does), that one and all after it are left to it, and come again in order
-over a new connection.
+The session outlives the connection (QoS 1, no clean start): messages in flight at a crash are sent again, and their
+blocks recognised by identity. The thread of the connection only queues messages; another thread decodes them and waits
+for the service. The start of decoding a large or repeated message is stored until it ends: a message during which the
+process has died twice is refused unread. Messages of QoS 0 that find the queue full are dropped and counted. If a
+broker sends more messages of QoS 1 than agreed (as mosquitto 2.0.11 does), the excess stays unacknowledged and is sent
+again in order over a new connection.
 """
 
 from __future__ import annotations
@@ -24,44 +24,44 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from sealscope.monitor.bounded_queue import BoundedQueue
 from sealscope.monitor.mqtt_client import MqttLink, check_mqtt
-from sealscope.monitor.settings import BrokerSettings, secret_of, topic_part
+from sealscope.monitor.settings import BrokerSettings, read_secret, topic_level
 from sealscope.monitor.sources.source_block import (
     UNENDED,
     BlockReceiver,
     RefusedMessage,
     SourceBlock,
-    decoded,
-    digest_of,
+    compute_digest,
+    decode_message,
 )
 from sealscope.monitor.sources.sparkplug_host import SparkplugHost
 from sealscope.monitor.sparkplug import NAMESPACE
 from sealscope.monitor.supervisor import BROKER
-from sealscope.monitor.waiting import Waiting
 
 _log = logging.getLogger(__name__)
-#: How long the broker keeps the session [s], messages in flight at most, and the largest one [bytes].
-_SESSION_S, _IN_FLIGHT, _LARGEST = 30 * 86_400, 256, 16_000_000
-#: Messages that wait to be decoded and their bytes, at most, as one more of QoS 0 is taken in, and as one of QoS 1 is.
-_ROOM, _ROOM_BYTES = 256, 64_000_000
-_ASSURED_ROOM, _ASSURED_BYTES = 2048, 192_000_000
-#: Messages whose decoding is noted: larger ones [bytes], and those that come again; how often it is begun at most.
-_LARGE, _ATTEMPTS = 256_000, 2
+#: Lifetime of the session without a connection [s]; most messages in flight; largest message [bytes].
+_SESSION_S, _IN_FLIGHT, _MAX_PACKET_BYTES = 30 * 86_400, 256, 16_000_000
+#: Queued messages and their bytes up to which one more of QoS 0 is accepted, and up to which one of QoS 1 is.
+_MAX_QUEUE, _MAX_QUEUE_BYTES = 256, 64_000_000
+_MAX_QOS1_QUEUE, _MAX_QOS1_BYTES = 2048, 192_000_000
+#: Size above which the start of decoding a message is stored [bytes], and the largest number of starts.
+_NOTED_BYTES, _MAX_ATTEMPTS = 256_000, 2
 _NAME = "mqtt"
-#: How long the decoder is waited for at the end [s].
+#: How long `run` waits for the decoder at its end [s].
 _END_S = 2.0
-#: How often events are looked for [s].
+#: How often new events are published [s].
 _LOOK_S = 0.05
-#: How often the states of the actuators are looked at [s].
+#: How often changed states of the actuators are published [s].
 _STATES_S = 2.0
-#: What messages are counted under that find no room.
+#: Counters of messages that find the queue full.
 _NO_ROOM = "messages of QoS 0 that found no room"
 _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 
 
-def broker_of(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
-    """Return the source of a broker's messages; raises InputError for a secret that cannot be read."""
-    password = secret_of(settings.password_file, "mqtt.password_file")
+def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
+    """Return the source of a broker's messages; raise InputError if a secret cannot be read."""
+    password = read_secret(settings.password_file, "mqtt.password_file")
     check_mqtt()
     return lambda service: _Connection(settings, password, service).run()
 
@@ -75,118 +75,125 @@ class _Connection:
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
         self._units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
         self._name = settings.client_id
-        will = None if settings.host_id is None else self._offline
+        will = None if settings.host_id is None else self._offline_message
         self._link = MqttLink(settings, self._name, password, will, retain=True)
         self._client = self._link.client
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
             self._host = SparkplugHost(service.settings.actuator, self._client.publish, service.count)
-        self._online = self._connection = 0  # when the connection was made [ms], and its number
-        self._refusing = -1  # the connection whose further messages are left to the broker
-        self._to_close: Any = None  # the line of that connection
+        self._connected_ms = self._connection = 0  # time of the connection [ms since 1970], and its number
+        self._refusing = -1  # the connection whose further messages stay unacknowledged
+        self._to_close: Any = None  # the socket of that connection
         self._ended = threading.Event()
-        self._states: dict[str, str] = {}  # as they were published
+        self._published_states: dict[str, str] = {}
         self._states_due = 0.0
-        self._arrived: Waiting[Any] = Waiting(_ROOM, _ROOM_BYTES)
+        self._arrived: BoundedQueue[Any] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
         self._client.on_connect_fail = self._on_connect_fail
         self._client.on_connect = self._on_connect
-        self._client.on_message = self._message
+        self._client.on_message = self._on_message
         self._client.on_disconnect = self._on_disconnect
 
     def run(self) -> None:
-        """Hand messages over and pass alarms on until the service stops."""
+        """Submit messages as blocks and publish alarms until the service stops."""
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = _SESSION_S
         properties.ReceiveMaximum = _IN_FLIGHT
-        properties.MaximumPacketSize = _LARGEST
-        decoding = self._service.supervisor.start("MQTT decoder", self._decode)
+        properties.MaximumPacketSize = _MAX_PACKET_BYTES
+        decoding = self._service.supervisor.start("MQTT decoder", self._submit_arrived)
         alarms = self._service.supervisor.part("MQTT alarms")
         self._link.open(clean_start=False, properties=properties)
         try:
             while not self._service.stopping.wait(_LOOK_S):
-                self._link.check()
-                alarms.attempt(self._pass_on)
+                self._link.check_thread()
+                alarms.attempt(self._deliver)
             self._states_due = 0.0
-            alarms.attempt(self._pass_on)
+            alarms.attempt(self._deliver)
         finally:
             self._ended.set()
             decoding.join(_END_S)
             self._link.close()
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+        """Publish the state of the host and subscribe, or begin an outage if the broker refuses the connection."""
         self._connection += 1
         if reason.is_failure:
             self._broker.begin_outage(f"{self._settings.host} refuses the connection: {reason}")
             return
         self._broker.end_outage()
-        self._states.clear()
+        self._published_states.clear()
         if self._settings.host_id is not None:
-            client.publish(*self._state(online=True), qos=1, retain=True)
+            client.publish(*self._state_message(online=True), qos=1, retain=True)
         for topic in (*self._names, *(self._host.topics if self._host is not None else ())):
             client.subscribe(topic, qos=1)
         self._arrived.put((self._connection, None), 0, always=True)
 
-    def _offline(self) -> tuple[str, str]:
-        """Return the will of a primary host of Sparkplug; it has the time of the connection to come."""
-        self._online = round(1000.0 * time.time())
-        return self._state(online=False)
+    def _offline_message(self) -> tuple[str, str]:
+        """Return the last will of a Sparkplug primary host, with the time of the connection about to be made."""
+        self._connected_ms = round(1000.0 * time.time())
+        return self._state_message(online=False)
 
-    def _state(self, *, online: bool) -> tuple[str, str]:
-        """Return topic and payload of the state of a primary host."""
-        state = json.dumps({"online": online, "timestamp": self._online})
+    def _state_message(self, *, online: bool) -> tuple[str, str]:
+        """Return topic and payload of the STATE message of a Sparkplug primary host."""
+        state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
     def _on_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
+        """Begin an outage, unless this side has ended the connection."""
         if not self._service.stopping.is_set() and self._refusing != self._connection:
             self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _on_connect_fail(self, client: Any, userdata: Any) -> None:
+        """Begin an outage with the reason why no connection was made."""
         error = sys.exc_info()[1]  # paho calls while it handles the error
         reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
         if isinstance(error, ssl.SSLCertVerificationError):
             reason = f"its certificate is not trusted ({error.verify_message})"
-        self._broker.begin_outage(
-            f"no connection to {self._settings.host}:{self._settings.port}: {reason}".removesuffix(": ")
-        )
+        place = f"{self._settings.host}:{self._settings.port}"
+        self._broker.begin_outage(f"no connection to {place}: {reason}".removesuffix(": "))
 
-    def _message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Take a message in; must not wait, for the connection would be lost meanwhile."""
+    def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
+        """Queue a message without blocking, which would let the connection time out."""
         arrived, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
             if not self._arrived.put(arrived, size):
                 self._service.count(_NO_ROOM)
             return
-        messages, held = self._arrived.waiting()
-        full = messages >= _ASSURED_ROOM or held + size > _ASSURED_BYTES
-        if full and self._refusing != self._connection:
+        n_messages, n_bytes = self._arrived.size()
+        is_full = n_messages >= _MAX_QOS1_QUEUE or n_bytes + size > _MAX_QOS1_BYTES
+        if is_full and self._refusing != self._connection:
             self._refusing, self._to_close = self._connection, self._client.socket()
         if self._refusing == self._connection:
             self._service.count(_ASKED_AGAIN)
         else:
             self._arrived.put(arrived, size, always=True)
 
-    def _decode(self) -> None:
-        """Hand the messages over that were taken in, in their order."""
+    def _submit_arrived(self) -> None:
+        """Decode and submit the queued messages in their order until the service stops.
+
+        Once the queue is empty, a connection whose messages were refused is closed, so that they are sent again.
+        """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
-            arrived = self._arrived.take(1, 0.5)
+            arrived = self._arrived.pop(1, 0.5)
             for connection, message in arrived:
                 if message is not None:
-                    self._hand(connection, message)
+                    self._submit(connection, message)
                 elif self._host is not None:  # a connection was made
-                    self._host.ask_all()
-            if not arrived and (line := self._to_close) is not None:
+                    self._host.request_all_births()
+            if not arrived and (refusing_socket := self._to_close) is not None:
                 self._to_close = None
-                with suppress(OSError):
-                    line.shutdown(socket.SHUT_RDWR)  # paho connects again, and the broker sends what it was left
+                with suppress(OSError):  # paho reconnects
+                    refusing_socket.shutdown(socket.SHUT_RDWR)
 
-    def _hand(self, connection: int, message: Any) -> None:
+    def _submit(self, connection: int, message: Any) -> None:
+        """Decode a message and submit its block, or its refusal; acknowledge it when that is stored."""
         number, qos = message.mid, message.qos
 
-        def done() -> None:
-            # after a lost connection the number may be another message's, and the broker sends this one again
+        def acknowledge() -> None:
+            """Acknowledge the message on the connection by which it came."""
+            # on a new connection the number may be that of another message, and the broker sends this one again
             if qos and connection == self._connection:
                 self._client.ack(number, qos)
 
@@ -195,54 +202,57 @@ class _Connection:
             with suppress(UnicodeDecodeError):
                 topic = message.topic
             with self._note_decoding(message):
-                block = self._decoded(topic, message.payload)
-        except RefusedMessage as error:  # it would be no better a second time: it is kept, and acknowledged
-            self._service.hand(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, done))
+                block = self._decode(topic, message.payload)
+        except RefusedMessage as error:  # stored and acknowledged, as it would fail again
+            self._service.submit(RefusedMessage(error.reason, f"{topic[:100]}: {error}", message.payload, acknowledge))
         else:
-            done() if block is None else self._service.hand(replace(block, done=done))
+            acknowledge() if block is None else self._service.submit(replace(block, done=acknowledge))
 
-    def _decoded(self, topic: str, payload: bytes) -> SourceBlock | None:
-        """Return the block of a message, None for one of Sparkplug without; raises RefusedMessage."""
+    def _decode(self, topic: str, payload: bytes) -> SourceBlock | None:
+        """Decode a message to its block, None for a Sparkplug message without samples; refuse an invalid one."""
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
             return self._host.receive(topic, payload)
-        return decoded(payload, self._names.get(topic), self._units_of)
+        return decode_message(payload, self._names.get(topic), self._units_of)
 
     @contextmanager
     def _note_decoding(self, message: Any) -> Iterator[None]:
-        """Store, while a message is decoded that is large or comes again, that this was begun.
+        """Note in the database that the decoding of a large or repeated message is under way, until it ends.
 
-        Raises RefusedMessage where it was begun twice before and never ended: the process died meanwhile.
+        Raises RefusedMessage if it has begun twice without an end, as the process died both times.
         """
-        if not message.qos or not (message.dup or len(message.payload) > _LARGE):
+        if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
             return
-        store, digest, before = self._service.store, digest_of(message.payload), 0
-        with suppress(SQLAlchemyError):  # it is away: storing waits for it, and says so
-            before = store.begin_decoding(self._name, digest)
+        store, digest, n_starts = self._service.store, compute_digest(message.payload), 0
+        with suppress(SQLAlchemyError):  # the storage of the block reports the outage
+            n_starts = store.begin_decoding(self._name, digest)
         try:
-            if before >= _ATTEMPTS:
-                raise RefusedMessage(UNENDED, f"a message must be decoded in {_ATTEMPTS} attempts, got no end of them")
+            if n_starts >= _MAX_ATTEMPTS:
+                rule = f"a message must be decoded in {_MAX_ATTEMPTS} attempts"
+                raise RefusedMessage(UNENDED, f"{rule}, got no end of them")
             yield
         finally:
             with suppress(SQLAlchemyError):
                 store.end_decoding(self._name, digest)
 
-    def _pass_on(self) -> None:
-        """Publish the alarms of new events, and the states that have changed, each retained."""
-        store = self._service.store
+    def _deliver(self) -> None:
+        """Publish the alarms of new events and the changed states as retained messages."""
         if self._settings.alarms_topic is None or not self._client.is_connected():
             return
-        store.pass_on(
-            _NAME, lambda event: self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
-        )
+
+        def publish_alarm(event: dict[str, Any]) -> bool:
+            """Publish the alarm of an event."""
+            return self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
+
+        self._service.store.deliver(_NAME, publish_alarm)
         if time.monotonic() >= self._states_due:
             self._states_due = time.monotonic() + _STATES_S
-            for name, summary in self._service.plain().items():
+            for name, summary in self._service.summaries().items():
                 state = json.dumps(summary["state"])
-                if self._states.get(name) != state and self._publish(name, "state", state):
-                    self._states[name] = state
+                if self._published_states.get(name) != state and self._publish(name, "state", state):
+                    self._published_states[name] = state
 
-    def _publish(self, actuator: str, what: str, message: str) -> bool:
-        """Publish a retained message of an actuator; return whether the broker has it."""
-        topic = f"{self._settings.alarms_topic}/{topic_part(actuator)}/{what}"
-        return self._link.published(topic, message, qos=1, retain=True)
+    def _publish(self, actuator: str, kind: str, message: str) -> bool:
+        """Publish a retained message of an actuator, an "alarm" or "state"; return whether it was acknowledged."""
+        topic = f"{self._settings.alarms_topic}/{topic_level(actuator)}/{kind}"
+        return self._link.publish(topic, message, qos=1, retain=True)

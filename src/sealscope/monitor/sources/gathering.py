@@ -1,7 +1,7 @@
-"""Single values, each with its own clock, gathered into blocks on one time axis.
+"""Single values, each with its own time, gathered into blocks on one time axis.
 
-A source that sends what changes (OPC UA) says nothing of a channel that stays as it is: a sample that is missing has
-the value before it. A block ends where every channel is known; one that says nothing for `SILENT_S` stays as it is.
+A source that reports changes (OPC UA) sends nothing for a constant channel: a missing sample repeats the value before
+it. A block is complete when every channel has reached its end; a channel silent for `SILENT_S` counts as constant.
 """
 
 from __future__ import annotations
@@ -13,45 +13,46 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sealscope.monitor.sources.message_limits import MOST_SAMPLES
+from sealscope.monitor.sources.message_limits import MAX_SAMPLES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
-#: How long a channel may say nothing before it counts as unchanged [s].
+#: Silence after which a channel counts as constant [s].
 SILENT_S = 3.0
-#: Values that lie further from the newest one than this [s] begin a new block: after a pause, or with a clock set back.
+#: Largest step from the newest value [s]; a larger one is a pause, or a clock set back, and starts a new block.
 _AHEAD_S = 60.0
 LATE = "values that came after their block"
 
 
 @dataclass
 class _Channel:
-    """One channel: `values` by their number on the time axis, and `held`, the one before them.
+    """One channel: `values` by index on the time axis, and `previous`, the value before them.
 
-    `heard`: when a value came last [s]; `newest`: number of the newest value since the beginning.
+    `arrival`: time at which the last value arrived [s]; `newest`: index of the newest value so far.
     """
 
     values: dict[int, float] = field(default_factory=dict)
-    held: float | None = None
-    heard: float = -math.inf
+    previous: float | None = None
+    arrival: float = -math.inf
     newest: int | None = None
 
-    def last(self) -> float | None:
-        return self.values[max(self.values)] if self.values else self.held
+    def last_value(self) -> float | None:
+        """Return the newest value, None if there is none."""
+        return self.values[max(self.values)] if self.values else self.previous
 
     def pop_values(self, first: int, stop: int) -> Array:
-        """Remove and return the values from `first` to `stop`; a missing one repeats the value before it."""
+        """Remove and return the samples from index `first` up to `stop`; a missing one repeats the value before it."""
         known = sorted(k for k in self.values if k < stop)
-        places = np.searchsorted(known, np.arange(first, stop), side="right")
-        held = math.nan if self.held is None else self.held
-        samples = np.array([held, *(self.values.pop(k) for k in known)])[places]
-        self.held = float(samples[-1])
+        n_known_before = np.searchsorted(known, np.arange(first, stop), side="right")  # up to each sample
+        previous = math.nan if self.previous is None else self.previous
+        samples = np.array([previous, *(self.values.pop(k) for k in known)])[n_known_before]
+        self.previous = float(samples[-1])
         return samples
 
 
 class ValueGatherer:
     """The values of one actuator at a rate [Hz], gathered into blocks of `block_s` [s].
 
-    `count`: counts what was dropped, by a reason; `now`: returns a clock [s] that is never set.
+    `count`: called with the reason for each dropped value; `now`: returns a monotonic clock [s].
     """
 
     def __init__(
@@ -63,69 +64,79 @@ class ValueGatherer:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.rate, self._length = rate, max(1, round(block_s * rate))
-        self._ahead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
+        self._max_lead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
         self._channels = {name: _Channel() for name in channels}
         self._start: int | None = None
         self._newest: int | None = None
 
-    def take(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Take samples of a channel in SI units, the first one at the clock `t` [s]; return the blocks they complete.
+    def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
+        """Add samples of a channel in SI units from time `t` [s] on; return the blocks that they complete.
 
-        NaN is a value that is not known.
+        NaN is an unknown value.
         """
-        if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MOST_SAMPLES:
+        if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
         first, target = round(t * self.rate), self._channels[channel]
         lead = 0 if self._newest is None else first - self._newest
-        if lead > self._ahead:  # after a pause, with the values as they are
-            held = {
-                name: _Channel(held=gathered.last(), heard=gathered.heard) for name, gathered in self._channels.items()
-            }
-            self.interrupted()
-            self._channels = held
-        elif lead < -self._ahead:
-            if target.last() is None:  # it has not changed for long
-                target.held, target.heard = values[-1], self._now()
-                return self._whole_blocks()
-            self.interrupted()  # the clock was set back
-        target = self._channels[channel]
+        if lead < -self._max_lead and target.last_value() is None:
+            # its first value, dated by its last change long ago: it has not changed since
+            target.previous, target.arrival = values[-1], self._now()
+        else:
+            if lead > self._max_lead:
+                self._continue_after_pause()
+            elif lead < -self._max_lead:  # the clock was set back: start again
+                self.discard_values()
+            self._add_values(self._channels[channel], first, values)
+        return self._pop_blocks()
+
+    def _continue_after_pause(self) -> None:
+        """Start again with the last value of each channel as the one before the next."""
+        before = self._channels
+        self.discard_values()
+        for name, gathered in before.items():
+            self._channels[name] = _Channel(previous=gathered.last_value(), arrival=gathered.arrival)
+
+    def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
+        """Add values to a channel from index `first` on; drop and count those before the next block."""
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
             else:
                 target.values[k] = value
-        while self._start is None and len(target.values) > self._ahead:  # another channel has never come
-            target.held = target.values.pop(next(iter(target.values)))
+        while self._start is None and len(target.values) > self._max_lead:  # another channel may never arrive
+            target.previous = target.values.pop(next(iter(target.values)))
         last = first + len(values) - 1
         self._newest = last if self._newest is None else max(self._newest, last)
-        target.heard, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
-        return self._whole_blocks()
+        target.arrival, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
 
-    def interrupted(self) -> None:
-        """Discard the waiting samples, for example after a lost connection with unknown samples in between."""
+    def discard_values(self) -> None:
+        """Discard all values, for example after a lost connection, in which values may have been lost."""
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
 
-    def _whole_blocks(self) -> list[Recording]:
+    def _pop_blocks(self) -> list[Recording]:
+        """Remove and return the blocks that are complete in every channel that is not silent."""
         channels = self._channels.values()
         if self._start is None:
-            if any(channel.last() is None for channel in channels) or not any(channel.values for channel in channels):
+            if any(channel.last_value() is None for channel in channels) or not any(
+                channel.values for channel in channels
+            ):
                 return []
-            # every channel has a value from there on
-            unknown = [min(channel.values) for channel in channels if channel.held is None]
-            self._start = (
-                max(unknown) if unknown else min(min(channel.values) for channel in channels if channel.values)
-            )
-        newest = [channel.newest for channel in channels if channel.heard >= self._now() - SILENT_S]
+            # start at the first index at which every channel has a value
+            first_indices = [min(channel.values) for channel in channels if channel.previous is None]
+            if not first_indices:
+                first_indices = [min(min(channel.values) for channel in channels if channel.values)]
+            self._start = max(first_indices)
+        newest = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
         if not newest or None in newest:
             return []
         blocks: list[Recording] = []
-        known = min(last for last in newest if last is not None) + 1
-        while known - self._start >= self._length:
-            clock = np.arange(self._start, self._start + self._length)
-            samples = {name: values.pop_values(clock[0], clock[-1] + 1) for name, values in self._channels.items()}
+        known_stop = min(index for index in newest if index is not None) + 1
+        while known_stop - self._start >= self._length:
+            stop = self._start + self._length
+            samples = {name: channel.pop_values(self._start, stop) for name, channel in self._channels.items()}
             units = {name: CHANNEL_UNITS[name] for name in samples}
-            blocks.append(Recording(clock / self.rate, samples, units, self.rate))
-            self._start += self._length
+            blocks.append(Recording(np.arange(self._start, stop) / self.rate, samples, units, self.rate))
+            self._start = stop
         return blocks

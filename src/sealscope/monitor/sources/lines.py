@@ -5,24 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import BinaryIO
 
-from sealscope.monitor.sources.source_block import LARGEST, OVERSIZED, BlockReceiver, RefusedMessage, decoded
+from sealscope.monitor.sources.source_block import (
+    MAX_MESSAGE_BYTES,
+    OVERSIZED,
+    BlockReceiver,
+    RefusedMessage,
+    decode_message,
+)
 
 
-def lines_of(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
-    """Return the source of a stream's lines; empty ones are passed over."""
+def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
+    """Return the source that submits a stream's lines; empty lines are skipped."""
 
-    def hand_lines(service: BlockReceiver) -> None:
+    def submit_lines(service: BlockReceiver) -> None:
+        """Submit the block or refusal of each line until the stream ends or the service stops."""
         units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
-        while not service.stopping.is_set() and (line := stream.readline(LARGEST + 1)):
-            if len(line) > LARGEST:
-                refused = RefusedMessage(OVERSIZED, f"a line must have at most {LARGEST} bytes, got more", line)
-                while line and not line.endswith(b"\n"):
-                    line = stream.readline(LARGEST)
-                service.hand(refused)
+        while not service.stopping.is_set() and (line := stream.readline(MAX_MESSAGE_BYTES + 1)):
+            if len(line) > MAX_MESSAGE_BYTES:
+                rule = f"a line must have at most {MAX_MESSAGE_BYTES} bytes, got more"
+                refused = RefusedMessage(OVERSIZED, rule, line)
+                while line and not line.endswith(b"\n"):  # skip the rest of the line
+                    line = stream.readline(MAX_MESSAGE_BYTES)
+                service.submit(refused)
             elif line := line.strip():
                 try:
-                    service.hand(decoded(line, units_of=units_of))
+                    service.submit(decode_message(line, units_of=units_of))
                 except RefusedMessage as error:
-                    service.hand(RefusedMessage(error.reason, error, line))
+                    service.submit(RefusedMessage(error.reason, error, line))
 
-    return hand_lines
+    return submit_lines

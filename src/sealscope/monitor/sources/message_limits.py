@@ -1,8 +1,8 @@
-"""Limits of a message that hold before anything is built of it: what a decoder of JSON or CBOR may be given.
+"""Limits of JSON and CBOR messages, checked before decoding so that decoding takes time linear in their length.
 
-One pass over the bytes of a message of CBOR (RFC 8949) counts its depth, lists, pairs, texts and samples, and finds
-keys that are no texts and tags that are no typed arrays of floats (RFC 8746). A message that passes costs its decoder a
-time that goes with its length. Of JSON the quotation marks and brackets are counted. `source_block.decoded` calls both.
+One pass over the bytes of a CBOR message (RFC 8949) counts its depth, lists, pairs, texts and samples, and finds keys
+that are not texts and tags that are not typed arrays of floats (RFC 8746). In JSON the quotation marks and brackets are
+counted. `source_block.decode_message` calls both.
 """
 
 from __future__ import annotations
@@ -14,24 +14,28 @@ import numpy as np
 from sealscope.compiled import kernel, law
 
 #: Most samples of a channel.
-MOST_SAMPLES = 1_000_000
-#: How deep containers lie in one another, and how many containers, pairs and pieces of text and bytes there are, at
-#: most; longest key [bytes].
-DEEPEST, MOST_CONTAINERS, MOST_PAIRS, MOST_TEXTS, LONGEST_KEY = 4, 64, 64, 1000, 200
-#: Quotation marks and brackets of JSON, at most: those in texts count as well.
-_MOST_QUOTES, _MOST_BRACKETS = 1000, 500
+MAX_SAMPLES = 1_000_000
+#: Largest depth of nested containers; largest numbers of containers, of pairs, and of pieces of text or bytes; longest
+#: key [bytes].
+MAX_DEPTH, MAX_CONTAINERS, MAX_PAIRS, MAX_TEXTS, MAX_KEY_BYTES = 4, 64, 64, 1000, 200
+#: Quotation marks and brackets of JSON, at most, including those in texts.
+_MAX_QUOTES, _MAX_BRACKETS = 1000, 500
+#: Major types of CBOR, and the additional information of an item of unknown length, or of its end (RFC 8949, 3.1).
+_BYTES, _TEXT, _LIST, _MAPPING, _TAG, _SIMPLE, _UNKNOWN_LENGTH = 2, 3, 4, 5, 6, 7, 31
 #: Tags of arrays of floats: big endian of 4 and 8 bytes, little endian of 4 and 8 bytes.
 FLOAT_ARRAYS = (81, 82, 85, 86)
-_TOO_LONG = 1
-#: What breaks a rule, by the code that `_walk` returns.
+#: Codes that `_scan_items` returns for a broken rule, and the rules in the order of the codes.
+(
+    _NO_FAULT, _LONG_LIST, _DEPTH, _CONTAINERS, _PAIRS, _TEXTS, _KEY, _TAG_FAULT, _VALUE, _INCOMPLETE, _TRAILING,
+) = range(11)  # fmt: skip
 _RULES = (
     "",
-    f"lists must have at most {MOST_SAMPLES} items",
-    f"containers must lie at most {DEEPEST} deep",
-    f"there must be at most {MOST_CONTAINERS} containers",
-    f"there must be at most {MOST_PAIRS} pairs",
-    f"there must be at most {MOST_TEXTS} texts",
-    f"keys must be texts of at most {LONGEST_KEY} bytes",
+    f"lists must have at most {MAX_SAMPLES} items",
+    f"containers must lie at most {MAX_DEPTH} deep",
+    f"there must be at most {MAX_CONTAINERS} containers",
+    f"there must be at most {MAX_PAIRS} pairs",
+    f"there must be at most {MAX_TEXTS} texts",
+    f"keys must be texts of at most {MAX_KEY_BYTES} bytes",
     f"tags must be {', '.join(map(str, FLOAT_ARRAYS))}, each of bytes",
     "values must be numbers, texts, bytes, true, false or null",
     "items must be complete",
@@ -40,7 +44,7 @@ _RULES = (
 
 
 class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
-    """A message breaks a rule; `oversized`: by the length of a list."""
+    """A message breaks a rule; `oversized`: True if a list is too long."""
 
     def __init__(self, rule: str, *, oversized: bool = False) -> None:
         super().__init__(rule)
@@ -48,67 +52,74 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Count the pairs of a CBOR message. Raise MessageLimit if it breaks a rule."""
-    code, place, pairs = _walk(np.frombuffer(payload, dtype=np.uint8))
-    if code:
-        raise MessageLimit(f"{_RULES[code]} (byte {place})", oversized=code == _TOO_LONG)
-    return int(pairs)
+    """Check the limits of a CBOR message; return its number of pairs. Raises MessageLimit if it breaks a rule."""
+    code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
+    if code != _NO_FAULT:
+        raise MessageLimit(f"{_RULES[code]} (byte {position})", oversized=code == _LONG_LIST)
+    return int(n_pairs)
 
 
 def check_json(payload: bytes) -> int:
-    """Return the number of colons of a message of JSON, in texts and outside.
+    """Check the limits of a JSON message; return its number of colons, in texts and outside.
 
-    Raises MessageLimit where it has more quotation marks or brackets than a decoder may be given.
+    Raises MessageLimit if it has too many quotation marks or brackets.
     """
-    quotes, brackets, colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
-    if quotes > _MOST_QUOTES:
-        raise MessageLimit(f"there must be at most {_MOST_QUOTES} quotation marks, got {quotes}")
-    if brackets > _MOST_BRACKETS:
-        raise MessageLimit(f"there must be at most {_MOST_BRACKETS} brackets, got {brackets}")
-    return int(colons)
+    n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
+    if n_quotes > _MAX_QUOTES:
+        raise MessageLimit(f"there must be at most {_MAX_QUOTES} quotation marks, got {n_quotes}")
+    if n_brackets > _MAX_BRACKETS:
+        raise MessageLimit(f"there must be at most {_MAX_BRACKETS} brackets, got {n_brackets}")
+    return int(n_colons)
 
 
-def check_json_keys(values: Any, payload: bytes, colons: int) -> None:
-    """Raise MessageLimit where a key of JSON stood twice in one mapping; `values`: what the JSON was decoded to."""
-    if _shallow_pairs(values) != colons:
-        outside = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # of texts
-        check_keys(values, sum(part.count(b":") for part in outside))
+def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
+    """Check that no mapping of a JSON message, decoded to `values`, repeats a key; raise MessageLimit otherwise.
+
+    Each pair has a colon outside texts; a repeated key leaves fewer pairs in `values` than colons in the `payload`.
+    """
+    if _count_shallow_pairs(values) != n_colons:  # quick test: unequal also if a text contains a colon
+        unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
+        check_keys(values, sum(part.count(b":") for part in unquoted))
 
 
-def check_keys(values: Any, pairs: int) -> None:
-    """Raise MessageLimit where a message of so many pairs was decoded to fewer: a key stood twice in one mapping."""
-    if _shallow_pairs(values) != pairs and (known := _pairs(values)) != pairs:
-        raise MessageLimit(f"keys must differ, got {pairs - known} again")
+def check_keys(values: Any, n_pairs: int) -> None:
+    """Check that all `n_pairs` of a message were decoded; fewer mean a repeated key, which raises MessageLimit."""
+    if _count_shallow_pairs(values) != n_pairs and (n_decoded := _count_pairs(values)) != n_pairs:
+        raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} again")
 
 
-def _shallow_pairs(values: Any) -> int:
-    """Return the number of pairs of a mapping and of the mappings that are its values; no list is gone through."""
+def _count_shallow_pairs(values: Any) -> int:
+    """Count the pairs of a mapping and of the mappings that are its values, without going through lists."""
     if not isinstance(values, dict):
         return 0
     return len(values) + sum(len(value) for value in values.values() if isinstance(value, dict))
 
 
-def _pairs(values: Any) -> int:
-    """Return the number of pairs of all mappings."""
+def _count_pairs(values: Any) -> int:
+    """Count the pairs of all mappings, however deep."""
     if isinstance(values, dict):
-        return len(values) + sum(map(_pairs, values.values()))
-    return sum(map(_pairs, values)) if isinstance(values, list) else 0
+        return len(values) + sum(map(_count_pairs, values.values()))
+    return sum(map(_count_pairs, values)) if isinstance(values, list) else 0
 
 
 @kernel
 def _count_marks(data: Any) -> tuple[int, int, int]:
     """Count the quotation marks, the opening brackets and braces, and the colons among bytes."""
-    quotes, brackets, colons = 0, 0, 0
+    n_quotes, n_brackets, n_colons = 0, 0, 0
     for byte in data:
-        quotes += byte == 34
-        brackets += (byte == 91) | (byte == 123)
-        colons += byte == 58
-    return quotes, brackets, colons
+        n_quotes += byte == 34  # "
+        n_brackets += (byte == 91) | (byte == 123)  # [ {
+        n_colons += byte == 58  # :
+    return n_quotes, n_brackets, n_colons
 
 
 @law
-def _argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Return the argument of an item whose head ends before byte `position`, and the next byte, -1 if it is cut off."""
+def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
+    """Return the argument of a CBOR item and the position of the byte after it, -1 if the data end before.
+
+    `position`: first byte after the item's initial byte, whose low 5 bits are `info`: the argument itself below 24,
+    else the number of bytes that contain it: 1, 2, 4 or 8 for 24 to 27.
+    """
     if info < 24:
         return info, position
     width = 1 << (info - 24)
@@ -120,86 +131,98 @@ def _argument(data: Any, position: int, info: int) -> tuple[int, int]:
     return number, position + width
 
 
-@kernel
-def _walk(data: Any) -> tuple[int, int, int]:
-    """Walk through the items; return the number of the broken rule (0: none), its byte, and the count of pairs.
+@law
+def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int) -> tuple[int, int, int]:
+    """Skip the pieces, all of type `major`, of the text or bytes of unknown length whose item begins at `start`.
 
-    Each byte is looked at once. Of each container `left` holds how many items it still has, below 0 for an unknown
-    number; `turn` is 0 in a list, in a mapping 1 before a key and 2 before its value; `counts`: items so far.
+    Returns the broken rule's code (0: none), the position of the fault or else after the end, and the texts so far.
+    """
+    while True:
+        n_texts += 1
+        if n_texts > MAX_TEXTS or position >= len(data):
+            return (_TEXTS if n_texts > MAX_TEXTS else _INCOMPLETE), start, n_texts
+        if data[position] == 255:  # the end
+            return _NO_FAULT, position + 1, n_texts
+        if int(data[position]) >> 5 != major or int(data[position]) & 31 > 27:
+            return _INCOMPLETE, position, n_texts
+        number, position = _read_argument(data, position + 1, int(data[position]) & 31)
+        if position < 0 or not 0 <= number <= len(data) - position:
+            return _INCOMPLETE, start, n_texts
+        position += number
+
+
+@kernel
+def _scan_items(data: Any) -> tuple[int, int, int]:
+    """Check a CBOR message in one pass; return the broken rule's code (0: none), its byte, and the number of pairs.
+
+    Arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is unknown;
+    `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items`: items so far.
     """
     size, position, depth = len(data), 0, 0
-    left, turn = np.zeros(DEEPEST + 1, dtype=np.int64), np.zeros(DEEPEST + 1, dtype=np.int64)
-    counts = np.zeros(DEEPEST + 1, dtype=np.int64)
-    containers, pairs, texts, tagged = 0, 0, 0, False
+    n_left, role = np.zeros(MAX_DEPTH + 1, dtype=np.int64), np.zeros(MAX_DEPTH + 1, dtype=np.int64)
+    n_items = np.zeros(MAX_DEPTH + 1, dtype=np.int64)
+    n_containers, n_pairs, n_texts, is_tagged = 0, 0, 0, False
     while True:
-        while depth > 0 and left[depth] == 0:
+        while depth > 0 and n_left[depth] == 0:
             depth -= 1
-        if depth == 0 and position > 0 and not tagged:
-            return (0 if position == size else 10), position, pairs
+        if depth == 0 and position > 0 and not is_tagged:
+            return (_NO_FAULT if position == size else _TRAILING), position, n_pairs
         if position >= size:
-            return 9, position, pairs
-        place, major, info = position, int(data[position]) >> 5, int(data[position]) & 31
+            return _INCOMPLETE, position, n_pairs
+        start, major, info = position, int(data[position]) >> 5, int(data[position]) & 31
         position += 1
-        if major == 7 and info == 31:  # the end of a container of unknown length
-            if depth == 0 or left[depth] > 0 or turn[depth] == 2 or tagged:
-                return 9, place, pairs
+        if major == _SIMPLE and info == _UNKNOWN_LENGTH:  # the end of a container of unknown length
+            if depth == 0 or n_left[depth] > 0 or role[depth] == 2 or is_tagged:
+                return _INCOMPLETE, start, n_pairs
             depth -= 1
             continue
-        endless, number = info == 31 and 2 <= major <= 5, -1
-        if info > 27 and not endless:
-            return 9, place, pairs
-        if not endless:
-            number, position = _argument(data, position, info)
-            if position < 0 or (2 <= major <= 5 and not 0 <= number <= size - position):  # an item takes a byte or more
-                return 9, place, pairs
-        if tagged and major != 2:
-            return 7, place, pairs
-        if turn[depth] == 1 and (major != 3 or endless or number > LONGEST_KEY):
-            return 6, place, pairs
-        if major == 6:
-            if not (81 <= number <= 82 or 85 <= number <= 86):
-                return 7, place, pairs
-            tagged = True
+        is_sized, number = _BYTES <= major <= _MAPPING, -1  # its argument is a length
+        has_unknown_length = is_sized and info == _UNKNOWN_LENGTH
+        if info > 27 and not has_unknown_length:
+            return _INCOMPLETE, start, n_pairs
+        if not has_unknown_length:
+            number, position = _read_argument(data, position, info)
+            if position < 0 or (is_sized and not 0 <= number <= size - position):  # an item takes a byte or more
+                return _INCOMPLETE, start, n_pairs
+        if is_tagged and major != _BYTES:
+            return _TAG_FAULT, start, n_pairs
+        if role[depth] == 1 and (major != _TEXT or has_unknown_length or number > MAX_KEY_BYTES):
+            return _KEY, start, n_pairs
+        if major == _TAG:
+            if number not in FLOAT_ARRAYS:
+                return _TAG_FAULT, start, n_pairs
+            is_tagged = True
             continue
-        tagged = False
+        is_tagged = False
         if depth > 0:
-            left[depth] -= 1
-            counts[depth] += 1
-            if turn[depth] == 0 and counts[depth] > MOST_SAMPLES:
-                return 1, place, pairs
-            pairs += turn[depth] == 1
-            if pairs > MOST_PAIRS:
-                return 4, place, pairs
-            turn[depth] = 3 - turn[depth] if turn[depth] else 0
-        if 2 <= major <= 3:
-            texts += 1
-            if not endless:
+            n_left[depth] -= 1
+            n_items[depth] += 1
+            if role[depth] == 0 and n_items[depth] > MAX_SAMPLES:
+                return _LONG_LIST, start, n_pairs
+            n_pairs += role[depth] == 1
+            if n_pairs > MAX_PAIRS:
+                return _PAIRS, start, n_pairs
+            role[depth] = 3 - role[depth] if role[depth] else 0  # a key and a value take turns
+        if major in (_BYTES, _TEXT):
+            n_texts += 1
+            if has_unknown_length:
+                code, position, n_texts = _skip_pieces(data, start, position, major, n_texts)
+                if code != _NO_FAULT:
+                    return code, position, n_pairs
+            else:
                 position += number
-            while endless:  # pieces of the same kind up to an end
-                texts += 1
-                if texts > MOST_TEXTS or position >= size:
-                    return (5 if texts > MOST_TEXTS else 9), place, pairs
-                if data[position] == 255:
-                    position += 1
-                    break
-                if int(data[position]) >> 5 != major or int(data[position]) & 31 > 27:
-                    return 9, position, pairs
-                number, position = _argument(data, position + 1, int(data[position]) & 31)
-                if position < 0 or not 0 <= number <= size - position:
-                    return 9, place, pairs
-                position += number
-            if texts > MOST_TEXTS:
-                return 5, place, pairs
-        elif 4 <= major <= 5:
-            containers += 1
-            if depth == DEEPEST:
-                return 2, place, pairs
-            if containers > MOST_CONTAINERS:
-                return 3, place, pairs
-            if number > (MOST_SAMPLES if major == 4 else MOST_PAIRS):
-                return (1 if major == 4 else 4), place, pairs
+            if n_texts > MAX_TEXTS:
+                return _TEXTS, start, n_pairs
+        elif major in (_LIST, _MAPPING):
+            n_containers += 1
+            if depth == MAX_DEPTH:
+                return _DEPTH, start, n_pairs
+            if n_containers > MAX_CONTAINERS:
+                return _CONTAINERS, start, n_pairs
+            if number > (MAX_SAMPLES if major == _LIST else MAX_PAIRS):
+                return (_LONG_LIST if major == _LIST else _PAIRS), start, n_pairs
             depth += 1
-            left[depth] = number if major == 4 or endless else 2 * number
-            turn[depth], counts[depth] = major - 4, 0
-        elif major == 7 and not (20 <= info <= 22 or 25 <= info <= 27):
-            return 8, place, pairs
+            n_left[depth] = number if major == _LIST or has_unknown_length else 2 * number
+            role[depth], n_items[depth] = major - _LIST, 0
+        elif major == _SIMPLE and not (20 <= info <= 22 or 25 <= info <= 27):  # false, true, null, floats
+            return _VALUE, start, n_pairs

@@ -1,6 +1,6 @@
 """A block of samples of one actuator with its identity, and its form as a message of JSON or CBOR.
 
-A message that holds no block is a RefusedMessage, whose reason is one of few: messages from outside are counted by it.
+A message without a valid block raises RefusedMessage, whose reason is one of `REASONS`; messages are counted by reason.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.errors import InputError, MissingExtra
 from sealscope.monitor.sources.message_limits import (
     FLOAT_ARRAYS,
-    MOST_SAMPLES,
+    MAX_SAMPLES,
     MessageLimit,
     check_cbor,
     check_json,
     check_json_keys,
     check_keys,
 )
-from sealscope.monitor.supervisor import place_of
+from sealscope.monitor.supervisor import describe_error
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
 from sealscope.recordings.recording import Recording
 from sealscope.units import to_si
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from sealscope.monitor.verdicts import RecordingVerdict
 
 #: Largest message [bytes].
-LARGEST = 16_000_000
-#: Tags of CBOR for arrays of numbers -> how their bytes are to be read.
-_TYPED = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True))
-#: Bytes of a refused message that are kept.
-_BEGINNING = 4000
-_KNOWN = {"actuator", "t", "rate", "units", "id", *CHANNELS}
+MAX_MESSAGE_BYTES = 16_000_000
+#: Tags of CBOR for arrays of numbers -> their NumPy data types.
+_ARRAY_DTYPES = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True))
+#: Leading bytes of a refused message that are kept.
+_N_KEPT_BYTES = 4000
+_KNOWN_NAMES = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
 class BlockReceiver(Protocol):
@@ -55,41 +55,43 @@ class BlockReceiver(Protocol):
     settings: MonitorSettings
     supervisor: Supervisor
 
-    def hand(self, block: SourceBlock | RefusedMessage) -> None:
-        """Take a block, or the error of a message that holds none; may wait."""
+    def submit(self, block: SourceBlock | RefusedMessage) -> None:
+        """Queue a block for storage, or count a refused message; may block."""
 
     def count(self, reason: str, number: int = 1) -> None:
-        """Count something that was dropped."""
+        """Add `number` to the counter of `reason`, usually of dropped messages or blocks."""
 
-    def plain(self) -> dict[str, dict[str, Any]]:
-        """Return the present summary of each actuator."""
+    def summaries(self) -> dict[str, dict[str, Any]]:
+        """Return the last summary of each actuator."""
 
 
-def nothing() -> None:
-    """Do nothing."""
+def do_nothing() -> None:
+    """Accept a call without effect."""
 
 
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
-    """A message or a file holds no block.
+    """A message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size` of its `contents`, of which the `beginning` of so many `bytes` is kept; `done`:
-    called when that is stored.
+    `reason`: one of `REASONS`; `size`: length of the `contents`; `beginning`: their leading bytes, `bytes` in number,
+    which are stored; `done`: called when they are.
     """
 
-    def __init__(self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = nothing) -> None:
+    def __init__(
+        self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = do_nothing
+    ) -> None:
         super().__init__(message)
         self.reason, self.done = reason, done
-        self.size, self.beginning = len(contents), contents[:_BEGINNING]
+        self.size, self.beginning = len(contents), contents[:_N_KEPT_BYTES]
         self.bytes = len(self.beginning)
 
     def row(self) -> dict[str, Any]:
-        """Return the row for the table of refused messages, with texts for any database."""
+        """Return the row for the table of refused messages; the text is escaped for any database."""
         message = str(self).encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
         values = {"reason": self.reason, "message": message, "size": self.size, "beginning": self.beginning}
         return {"at": time.time(), **values}
 
 
-#: Why a message holds no block: what it is counted under.
+#: Reasons to refuse a message, under which it is counted.
 REASONS = (
     OVERSIZED := "oversized messages",
     UNREADABLE := "messages that are no JSON or CBOR",
@@ -108,97 +110,98 @@ REASONS = (
 
 
 @contextmanager
-def refusing() -> Iterator[None]:
-    """Make a RefusedMessage of whatever else decoding raises: a message must end no decoder."""
+def raising_refused_message() -> Iterator[None]:
+    """Convert any other error of decoding to a RefusedMessage, so that no message ends its decoder."""
     try:
         yield
     except (RefusedMessage, MissingExtra):
         raise
     except Exception as error:
-        raise RefusedMessage(UNFORESEEN, f"a message must raise no error, got {place_of(error)}") from error
+        raise RefusedMessage(UNFORESEEN, f"a message must raise no error, got {describe_error(error)}") from error
 
 
 @dataclass(frozen=True, eq=False)
 class SourceBlock:
     """Samples of one actuator.
 
-    `identity`: what tells the block from every other of the actuator, also after a restart; `samples`: None where there
-    are none to take, only the identity to keep; `follows`: False where the clock begins anew; `done`: called when the
-    block is stored; `verdict`: on the whole recording that the samples are, None where it is not judged as such.
+    `identity`: text that no other block of the actuator has, also after a restart; `samples`: None if only the identity
+    is to be stored; `follows`: False if the samples do not continue those before; `done`: called when the block is
+    stored; `verdict`: on the whole recording, None if the samples are not judged as a recording.
     """
 
     actuator: str
     identity: str
     samples: Recording | None
     follows: bool = True
-    done: Callable[[], None] = nothing
+    done: Callable[[], None] = do_nothing
     verdict: RecordingVerdict | None = None
 
     @property
     def bytes(self) -> int:
-        """About how many bytes its samples take."""
-        return 0 if self.samples is None else bytes_of(self.samples)
+        """Approximate number of bytes of the samples."""
+        return 0 if self.samples is None else count_bytes(self.samples)
 
 
-@refusing()
-def decoded(
+@raising_refused_message()
+def decode_message(
     payload: bytes, actuator: str | None = None, units_of: Mapping[str, Mapping[str, str]] = MappingProxyType({})
 ) -> SourceBlock:
     """Decode the block of a message: JSON if it begins with ``{``, else CBOR.
 
-    Its mapping has ``t``, the clock of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers,
-    null where one is missing, or in CBOR a typed array of floats (RFC 8746), NaN where one is missing; a channel that
-    changes slowly (``T_oil``) may be a single number; ``units`` names those that are not SI; ``actuator`` where the
-    source does not say; ``id`` where the contents are not the identity. `units_of`: units by actuator where a message
-    names none.
-    Raises RefusedMessage for anything else.
+    The mapping has ``t``, the time of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers with
+    null for missing samples, or in CBOR a typed array of floats (RFC 8746) with NaN for missing samples. A slow channel
+    (``T_oil``) may be a single number. Optional: ``units`` of channels that are not in SI; ``actuator``, needed if the
+    source does not state it; ``id``, else a digest of the message is the identity.
+
+    `actuator`: name stated by the source; `units_of`: default units by actuator. Raises RefusedMessage if a rule is
+    broken.
     """
-    if len(payload) > LARGEST:
-        raise RefusedMessage(OVERSIZED, f"a message must have at most {LARGEST} bytes, got {len(payload)}")
-    values = _mapping(payload)
-    unknown = sorted(_brief(name) for name in values if name not in _KNOWN)
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise RefusedMessage(OVERSIZED, f"a message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
+    values = _parse_mapping(payload)
+    unknown = sorted(_abbreviate(name) for name in values if name not in _KNOWN_NAMES)
     if unknown:
-        raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN))}, got {unknown[0]!r}")
+        raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN_NAMES))}, got {unknown[0]!r}")
     name, units = values.get("actuator", actuator), values.get("units", {})
     if not isinstance(name, str) or (actuator is not None and name != actuator):
-        raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {_brief(name)!r}")
+        raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {_abbreviate(name)!r}")
     if not isinstance(units, Mapping):
         raise RefusedMessage(WRONG_UNITS, "a message's units must be a mapping")
-    t, rate = _number(values, "t"), _number(values, "rate")
+    t, rate = _parse_number(values, "t"), _parse_number(values, "rate")
     if not rate > 0.0:
         raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
     units = {**units_of.get(name, {}), **units}
-    channels = {channel: _channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
+    channels = {channel: _parse_channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
     sizes = {values.size for channel, values in channels.items() if channel not in SLOW}
-    if sizes and max(sizes) > MOST_SAMPLES:
-        raise RefusedMessage(OVERSIZED, f"a channel must have at most {MOST_SAMPLES} samples, got {max(sizes)}")
+    if sizes and max(sizes) > MAX_SAMPLES:
+        raise RefusedMessage(OVERSIZED, f"a channel must have at most {MAX_SAMPLES} samples, got {max(sizes)}")
     if len(sizes) != 1 or not min(sizes):
-        raise RefusedMessage(NO_SAMPLES, f"channels must have equally many samples, 1 to {MOST_SAMPLES}")
-    count = sizes.pop()
+        raise RefusedMessage(NO_SAMPLES, f"channels must have equally many samples, 1 to {MAX_SAMPLES}")
+    n_samples = sizes.pop()
     for channel in SLOW & channels.keys():
-        if channels[channel].size not in (1, count):
-            raise RefusedMessage(NO_SAMPLES, f"channel {channel} must have 1 or {count} samples")
-        channels[channel] = np.broadcast_to(channels[channel], count)
-    with np.errstate(over="ignore"):  # times beyond floating point are dropped by the stream
-        clock = t + np.arange(count) / rate
-    for array in (clock, *channels.values()):  # a Recording takes what is read-only without a copy
+        if channels[channel].size not in (1, n_samples):
+            raise RefusedMessage(NO_SAMPLES, f"channel {channel} must have 1 or {n_samples} samples")
+        channels[channel] = np.broadcast_to(channels[channel], n_samples)
+    with np.errstate(over="ignore"):  # the stream drops samples with infinite times
+        times = t + np.arange(n_samples) / rate
+    for array in (times, *channels.values()):  # a Recording does not copy read-only arrays
         array.setflags(write=False)
-    samples = Recording(clock, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
-    return SourceBlock(name, _identity(values.get("id")) or digest_of(payload), samples)
+    samples = Recording(times, channels, {channel: CHANNEL_UNITS[channel] for channel in channels}, rate)
+    return SourceBlock(name, _parse_identity(values.get("id")) or compute_digest(payload), samples)
 
 
-def bytes_of(samples: Recording) -> int:
-    """Return about how many bytes samples take."""
+def count_bytes(samples: Recording) -> int:
+    """Return the approximate number of bytes of samples."""
     return 8 * len(samples) * (1 + len(samples.channels))
 
 
-def digest_of(payload: bytes) -> str:
-    """Return the digest that identifies contents."""
+def compute_digest(payload: bytes) -> str:
+    """Compute the digest of contents that serves as their identity."""
     return blake2b(payload, digest_size=16).hexdigest()
 
 
-def _identity(value: Any) -> str:
-    """Return the stated identity of a message, "" without one. Refuse one that a database cannot hold."""
+def _parse_identity(value: Any) -> str:
+    """Convert the `id` of a message to text, "" if it is None; refuse an id that a database cannot store."""
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
@@ -211,61 +214,63 @@ def _identity(value: Any) -> str:
     return identity
 
 
-def _brief(value: Any) -> str:
-    """Return the beginning of a text or a number as text, of anything else its kind: it may be deep, or endless."""
+def _abbreviate(value: Any) -> str:
+    """Format a text or number in at most 40 characters, anything else, which may be deeply nested, as its type."""
     try:
         return str(value)[:40] if isinstance(value, (str, int, float, type(None))) else type(value).__name__
-    except ValueError:  # CBOR has whole numbers of more digits than Python writes
+    except ValueError:  # CBOR integers may exceed Python's limit of digits
         return type(value).__name__
 
 
-def _mapping(payload: bytes) -> Mapping[str, Any]:
+def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
+    """Parse JSON or CBOR after checking its limits; refuse anything but a mapping."""
     try:
         if payload.lstrip()[:1] == b"{":
             import orjson
 
-            colons = check_json(payload)
+            n_colons = check_json(payload)
             values = orjson.loads(payload)
-            check_json_keys(values, payload, colons)
+            check_json_keys(values, payload, n_colons)
         else:
             import cbor2
 
-            pairs = check_cbor(payload)
+            n_pairs = check_cbor(payload)
             values = cbor2.loads(payload)
-            check_keys(values, pairs)
+            check_keys(values, n_pairs)
     except ImportError as error:
         needed = f"a message needs {error.name}: pip install 'sealscope[serve,mqtt]'"
         raise RefusedMessage(UNREADABLE, needed) from None
     except MessageLimit as error:
-        raise RefusedMessage(
-            OVERSIZED if error.oversized else UNREADABLE, f"a message must keep its limits: {error}"
-        ) from None
-    except Exception as error:  # a damaged message makes the libraries raise whatever they like
-        reason = " ".join(str(error).split())[:80]
+        kind = OVERSIZED if error.oversized else UNREADABLE
+        raise RefusedMessage(kind, f"a message must keep its limits: {error}") from None
+    except Exception as error:  # damaged messages make the libraries raise errors of any type
+        reason = " ".join(str(error).split())[:80]  # one short line
         raise RefusedMessage(UNREADABLE, f"a message must be JSON or CBOR: {reason}") from None
     if not isinstance(values, Mapping):
         raise RefusedMessage(NO_MAPPING, f"a message must be a mapping, got {type(values).__name__}")
     return values
 
 
-def _number(values: Mapping[str, Any], name: str) -> float:
+def _parse_number(values: Mapping[str, Any], name: str) -> float:
+    """Read the entry `name` of a message as a finite number; refuse the message if it is anything else."""
     value = values.get(name)
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
-    except OverflowError:  # CBOR has whole numbers of any size
+    except OverflowError:  # CBOR has integers of any size
         number = math.inf
     if not math.isfinite(number):
-        raise RefusedMessage(NO_CLOCK, f"{name} must be a number, got {_brief(value)!r}")
+        raise RefusedMessage(NO_CLOCK, f"{name} must be a number, got {_abbreviate(value)!r}")
     return number
 
 
-def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
+def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
+    """Convert a list or typed array of a channel to SI units; refuse anything else, and infinite values."""
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
-        values = [values]
-    kind = _TYPED.get(getattr(values, "tag", None) or 0)
+        values = [values]  # a slow channel may be a single number
+    dtype = _ARRAY_DTYPES.get(getattr(values, "tag", None) or 0)
     try:
-        if kind is not None:
-            values = np.frombuffer(values.value, dtype=kind)
+        if dtype is not None:
+            values = np.frombuffer(values.value, dtype=dtype)
         elif not isinstance(values, (list, tuple)):
             raise TypeError
         array = np.array(values, dtype=np.float64)  # None becomes NaN
@@ -274,12 +279,12 @@ def _channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any
     except (TypeError, ValueError, OverflowError):
         rule = f"channel {name} must be a list of finite numbers"
         raise RefusedMessage(NO_SAMPLES, f"{rule}, or an array of whole numbers of its type") from None
-    return np.asarray(in_si(array, units.get(name), name))
+    return np.asarray(convert_to_si(array, units.get(name), name))
 
 
-def in_si(values: Any, unit: object, channel: str) -> Any:
-    """Return values of a channel in SI, in which they are without a unit; raises RefusedMessage for a wrong one."""
+def convert_to_si(values: Any, unit: object, channel: str) -> Any:
+    """Convert values of a channel to SI; None means that they are in SI. Refuse a unit of another dimension."""
     try:
-        return values if unit is None else to_si(values, _brief(unit), CHANNEL_UNITS[channel], name=channel)
+        return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:
         raise RefusedMessage(WRONG_UNITS, error) from None

@@ -1,8 +1,9 @@
-"""Blocks from edge nodes of Sparkplug B: births name the metrics, data bring the samples, deaths end it.
+"""Blocks from edge nodes of Sparkplug B: births name the metrics, data messages bring samples, deaths end the session.
 
-A node or its device is an actuator, its metrics are the channels: arrays of samples from their time on, or single ones,
-of which those left out are as they were. Times are whole milliseconds; a block that follows the one before within that
-follows it exactly. After a missing sequence number an alias may mean another metric: it waits for the birth asked for.
+A node or one of its devices is an actuator, and its metrics are the channels: arrays of samples from their timestamp
+on, or single samples, which are constant while left out. Timestamps are whole milliseconds; a block that continues the
+one before within that resolution is joined to it. After a missing sequence number an alias may stand for another
+metric, so messages with aliases are refused until the node has sent the birth that is requested.
 """
 
 from __future__ import annotations
@@ -21,20 +22,26 @@ from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import source_block as blocks
-from sealscope.monitor.sources.message_limits import MOST_SAMPLES
-from sealscope.monitor.sources.source_block import RefusedMessage, SourceBlock, digest_of, in_si, refusing
+from sealscope.monitor.sources.message_limits import MAX_SAMPLES
+from sealscope.monitor.sources.source_block import (
+    RefusedMessage,
+    SourceBlock,
+    compute_digest,
+    convert_to_si,
+    raising_refused_message,
+)
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 
 _log = logging.getLogger(__name__)
-#: What a missing sequence number is counted under: the message is taken all the same where its metrics have names.
+#: Counter of missing sequence numbers; a message after a gap is still used if its metrics have names.
 GAPS = "gaps in the sequence of a Sparkplug node"
-#: A node is asked for its birth once in so long [s].
-_ASK_AGAIN_S = 10.0
-#: Times are whole milliseconds, cut off or rounded: what was measured lies so far before and behind [s].
-_EARLY, _LATE = 0.0005, 0.001
-#: A block is moved against the end of the one before by at most so many samples, for the node's clock is not its rate.
-_YIELDS = 0.3
+#: Shortest time between two requests for the birth of a node [s].
+_REQUEST_PAUSE_S = 10.0
+#: Timestamps are truncated or rounded to whole milliseconds: largest distance of the true time before and after [s].
+_EARLY_S, _LATE_S = 0.0005, 0.001
+#: Largest shift of a block against the end of the one before [samples], as clock and rate of a node may disagree.
+_MAX_SHIFT = 0.3
 #: Name of the metric that states the sampling rate [Hz], unless `map` names another.
 _RATE = "rate"
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
@@ -44,7 +51,7 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 class _Birth:
     """The metrics of a birth that are channels or the rate.
 
-    `names`: channel -> name of its metric; `aliases`: alias -> name; `metrics`: name -> metric as it was last.
+    `names`: channel -> name of its metric; `aliases`: alias -> name; `metrics`: name -> metric with its last value.
     """
 
     names: dict[str, str] = field(default_factory=dict)
@@ -52,8 +59,8 @@ class _Birth:
     metrics: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
-        """Return the birth of an actuator: a name counts with a unit in brackets behind it, too."""
+    def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
+        """Select the metrics of an actuator's channels; a name may be followed by a unit in brackets."""
         birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
@@ -67,22 +74,25 @@ class _Birth:
                 birth.aliases[metric.alias] = name
         return birth
 
-    def complete_metric(self, metric: spb.SparkplugMetric, *, whole: bool) -> spb.SparkplugMetric | None:
-        """Complete a metric by the name, type and unit of its birth, None if it is no channel; `whole`: none missed."""
-        if metric.name is None and not whole:
+    def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
+        """Add name, type and unit of the birth to a metric; return None if it is no channel.
+
+        `is_complete`: whether no message since the birth is missing; else aliases are refused.
+        """
+        if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
         name = self.aliases.get(metric.alias) if metric.name is None else metric.name
-        born = self.metrics.get(name)
-        if born is None:
+        birth_metric = self.metrics.get(name)
+        if birth_metric is None:
             return None
         try:
-            metric = metric if metric.datatype else metric.typed(born.datatype)
+            metric = metric if metric.datatype else metric.with_datatype(birth_metric.datatype)
         except ValueError as error:
             raise RefusedMessage(blocks.NO_SAMPLES, error) from None
-        return replace(metric, name=name, unit=metric.unit or born.unit)
+        return replace(metric, name=name, unit=metric.unit or birth_metric.unit)
 
     def rate(self, actuator: ActuatorSettings) -> float:
-        """Return the sampling rate [Hz]: that of the settings, else that of the metric."""
+        """Return the sampling rate [Hz] from the settings, else from the metric `rate`; refuse a missing one."""
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
@@ -93,170 +103,195 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """An edge node: `births` of actuators by device, "" for the node; `whole`: no number is missing since its birth."""
+    """An edge node.
+
+    `births`: births of actuators by device, "" for the node itself; `birth_sequence`: bdSeq of the last birth; `seq`:
+    last sequence number, None before a birth; `is_complete`: whether no number since the birth is missing.
+    """
 
     births: dict[str, _Birth] = field(default_factory=dict)
     birth_sequence: int | None = None
     seq: int | None = None
-    whole: bool = False
+    is_complete: bool = False
 
 
 class SparkplugHost:
-    """The actuators that are nodes, or devices of nodes, of Sparkplug B; those without `sparkplug` are left out.
+    """The actuators that are nodes, or devices of nodes, of Sparkplug B; those without `sparkplug` are ignored.
 
-    `publish`: sends a topic and a payload; `count`: counts what happened, by a reason.
+    `publish`: sends a payload to a topic; `count_event`: raises the counter of an event by its name, such as `GAPS`.
     """
 
     def __init__(
         self,
         actuators: Iterable[ActuatorSettings],
         publish: Callable[[str, bytes], object],
-        count: Callable[[str], None],
+        count_event: Callable[[str], None],
     ) -> None:
-        spb.payload_class()
-        self._publish, self._count = publish, count
+        """Raise MissingExtra if protobuf is not installed."""
+        spb.payload_class()  # fails here rather than at the first message
+        self._publish, self._count_event = publish, count_event
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
+        # by (group, node) of the actuators' paths "group/node" or "group/node/device"
         self._nodes = {tuple(path.split("/")[:2]): _EdgeState() for path in self._actuators}
-        self._asked: dict[tuple[str, ...], float] = {}
-        self._follows: dict[str, float] = {}
+        self._last_requests: dict[tuple[str, ...], float] = {}
+        self._next_starts: dict[str, float] = {}
 
     @property
     def topics(self) -> list[str]:
-        """The filters of what the nodes send."""
+        """The topic filters of all messages of the nodes."""
         return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
 
-    def ask_all(self) -> None:
-        """Ask every node for its birth, as after a connection is made: something may have been missed."""
+    def request_all_births(self) -> None:
+        """Request the birth of every node, as messages may have been missed before a connection."""
         for (group, node), state in self._nodes.items():
-            state.whole = False
-            self._ask(group, node)
+            state.is_complete = False
+            self._request_birth(group, node)
 
-    def _ask(self, group: str, node: str) -> None:
-        """Ask a node for its birth, unless it was asked a moment ago."""
+    def _request_birth(self, group: str, node: str) -> None:
+        """Request the birth of a node, unless that was done within the last `_REQUEST_PAUSE_S`."""
         now = time.monotonic()
-        if now - self._asked.get((group, node), -math.inf) >= _ASK_AGAIN_S:
-            self._asked[group, node] = now
+        if now - self._last_requests.get((group, node), -math.inf) >= _REQUEST_PAUSE_S:
+            self._last_requests[group, node] = now
             _log.info("%s/%s is asked for its birth", group, node)
             rebirth = spb.SparkplugMetric(spb.REBIRTH, True, spb.BOOLEAN)
             request = spb.SparkplugPayload(round(1000.0 * time.time()), (rebirth,))
-            self._publish(spb.topic_of(group, "NCMD", node), spb.encoded(request))
+            self._publish(spb.topic_of(group, "NCMD", node), spb.encode_payload(request))
 
-    @refusing()
+    @raising_refused_message()
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
-        """Process a message; return its block, or None if it brings none.
+        """Process a message; return its block, or None if it has no samples.
 
-        Raises RefusedMessage where it is not what its topic says, or nothing of it can be used.
+        Raises RefusedMessage if the message breaks the protocol or its samples cannot be used.
         """
         match topic.split("/"):
             case [_, _, "NCMD" | "DCMD", *_]:
-                return None  # for the node, not from it
+                return None  # a command to the node, not from it
             case [_, group, "NBIRTH" | "NDATA" | "NDEATH" as kind, node]:
                 device, path = "", f"{group}/{node}"
             case [_, group, "DBIRTH" | "DDATA" | "DDEATH" as kind, node, device] if device:
                 path = f"{group}/{node}/{device}"
             case _:
                 raise RefusedMessage(blocks.WRONG_ACTUATOR, "its topic must be that of a node or a device")
-        state = self._nodes.get((group, node))
-        if state is None:
+        if (group, node) not in self._nodes:
             raise RefusedMessage(blocks.WRONG_ACTUATOR, "its topic must be that of a node of the settings")
         try:
-            payload = spb.decoded_payload(data)
+            payload = spb.decode_payload(data)
         except ValueError as error:
             raise RefusedMessage(blocks.UNREADABLE, error) from None
-        if kind in ("NBIRTH", "NDEATH"):
-            number = getattr(payload.find_metric(spb.BIRTH_SEQUENCE), "value", None)
-            number = number if isinstance(number, int) else None
-            if kind == "NDEATH" and state.birth_sequence not in (None, number):
-                raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
-            born = (number, payload.seq, True) if kind == "NBIRTH" else (None, None, False)
-            state.births, (state.birth_sequence, state.seq, state.whole) = {}, born
-        elif state.seq is None:
-            self._ask(group, node)
-            raise RefusedMessage(blocks.UNBORN, f"a message of {group}/{node} must follow its birth")
-        elif payload.seq is None:
-            raise RefusedMessage(blocks.OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
-        else:
-            if payload.seq != (state.seq + 1) % 256:
-                state.whole = False
-                self._count(GAPS)
-                self._ask(group, node)
-            state.seq = payload.seq
-        actuator = self._actuators.get(path)
+        self._follow_session(group, node, kind, payload)
+        state, actuator = self._nodes[group, node], self._actuators.get(path)
         if actuator is None or kind == "NDEATH":
             return None
         if kind.endswith("BIRTH"):
-            state.births[device] = _Birth.of(payload.metrics, actuator)
+            state.births[device] = _Birth.from_metrics(payload.metrics, actuator)
             return None
         if kind == "DDEATH":
             state.births.pop(device, None)
             return None
         birth = state.births.get(device)
         if birth is None:
-            self._ask(group, node)
+            self._request_birth(group, node)
             raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
-        known = [birth.complete_metric(metric, whole=state.whole) for metric in payload.metrics]
-        samples = self._samples(actuator, birth, [metric for metric in known if metric is not None], payload.timestamp)
+        metrics = [birth.complete_metric(metric, is_complete=state.is_complete) for metric in payload.metrics]
+        known_metrics = [metric for metric in metrics if metric is not None]
+        samples = self._build_recording(actuator, birth, known_metrics, sent_ms=payload.timestamp)
         if samples is None:
             return None
-        return SourceBlock(actuator.name, digest_of(topic.encode() + b"\0" + data), samples)
+        return SourceBlock(actuator.name, compute_digest(topic.encode() + b"\0" + data), samples)
 
-    def _samples(
-        self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent: int | None
+    def _follow_session(self, group: str, node: str, kind: str, payload: spb.SparkplugPayload) -> None:
+        """Update the state of a node with the birth, death or sequence number of a message of `kind`.
+
+        A gap in the sequence is counted and the birth requested. Raises RefusedMessage if the message has no sequence
+        number, comes before the birth, or is the death of an earlier connection.
+        """
+        state = self._nodes[group, node]
+        if kind in ("NBIRTH", "NDEATH"):
+            number = getattr(payload.find_metric(spb.BIRTH_SEQUENCE), "value", None)
+            number = number if isinstance(number, int) else None
+            if kind == "NDEATH" and state.birth_sequence not in (None, number):
+                raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
+            is_birth = kind == "NBIRTH"
+            state.births, state.is_complete = {}, is_birth
+            state.birth_sequence, state.seq = (number, payload.seq) if is_birth else (None, None)
+        elif state.seq is None:
+            self._request_birth(group, node)
+            raise RefusedMessage(blocks.UNBORN, f"a message of {group}/{node} must follow its birth")
+        elif payload.seq is None:
+            raise RefusedMessage(blocks.OUT_OF_SEQUENCE, f"a message of {group}/{node} must have a sequence number")
+        else:
+            if payload.seq != (state.seq + 1) % 256:
+                state.is_complete = False
+                self._count_event(GAPS)
+                self._request_birth(group, node)
+            state.seq = payload.seq
+
+    def _build_recording(
+        self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent_ms: int | None
     ) -> Recording | None:
-        """Return the samples of metrics, None if none of them is a channel."""
-        by_name = {name: channel for channel, name in birth.names.items() if channel != _RATE}
+        """Combine the samples of a message's metrics to a recording in SI, None if none of them is a channel.
+
+        `sent_ms`: time of sending [ms since 1970], for metrics without a time. Single values of slow channels are kept.
+        """
+        channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
         for metric in metrics:
-            name, timestamp = str(metric.name), sent if metric.timestamp is None else metric.timestamp
-            if name not in by_name or (by_name[name] in SLOW and not isinstance(metric.value, np.ndarray)):
+            name, timestamp = str(metric.name), sent_ms if metric.timestamp is None else metric.timestamp
+            if name not in channel_of or (channel_of[name] in SLOW and not isinstance(metric.value, np.ndarray)):
                 birth.metrics[name] = metric
             elif timestamp is None:
                 raise RefusedMessage(blocks.NO_CLOCK, f"the metric {name[:40]!r} must have a time, got none")
             else:
-                groups[timestamp][by_name[name]] = metric
+                groups[timestamp][channel_of[name]] = metric
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []
         for timestamp in sorted(groups):
-            piece = _piece(groups[timestamp], birth, by_name)
+            piece = _simultaneous_samples(groups[timestamp], birth, channel_of)
             size = next(iter(piece.values())).size
-            pieces.append({"t": self._clock(actuator.name, timestamp / 1000.0, size, rate), **piece})
-        if (count := sum(piece["t"].size for piece in pieces)) > MOST_SAMPLES:
-            raise RefusedMessage(blocks.OVERSIZED, f"{MOST_SAMPLES} samples are the most, got {count}")
-        values = {
-            name: np.concatenate([piece.get(name, np.full(piece["t"].size, np.nan)) for piece in pieces])
-            for name in ("t", *CHANNELS)
-            if any(name in piece for piece in pieces)
-        }
-        t = values.pop("t")
-        for name, channel in by_name.items():
-            if channel in SLOW and isinstance(known := birth.metrics[name].value, (int, float)):
-                values[channel] = np.full(count, float(known))
-        units = {channel: birth.metrics[name].unit or actuator.units.get(channel) for name, channel in by_name.items()}
-        converted = {channel: in_si(array, units.get(channel), channel) for channel, array in values.items()}
+            pieces.append({"t": self._sample_times(actuator.name, timestamp / 1000.0, size, rate), **piece})
+        if (n_samples := sum(piece["t"].size for piece in pieces)) > MAX_SAMPLES:
+            raise RefusedMessage(blocks.OVERSIZED, f"{MAX_SAMPLES} samples are the most, got {n_samples}")
+        t, values = np.concatenate([piece["t"] for piece in pieces]), {}
+        for channel in CHANNELS:  # NaN where a piece lacks the channel
+            if any(channel in piece for piece in pieces):
+                series = [piece.get(channel, np.full(piece["t"].size, np.nan)) for piece in pieces]
+                values[channel] = np.concatenate(series)
+        for name, channel in channel_of.items():
+            if channel in SLOW and isinstance(last := birth.metrics[name].value, (int, float)):
+                values[channel] = np.full(n_samples, float(last))
+        births = ((channel, birth.metrics[name]) for name, channel in channel_of.items())
+        units = {channel: metric.unit or actuator.units.get(channel) for channel, metric in births}
+        converted = {channel: convert_to_si(array, units.get(channel), channel) for channel, array in values.items()}
         return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
 
-    def _clock(self, actuator: str, t: float, size: int, rate: float) -> Array:
-        """Return the times of samples that begin at `t` [s], a whole millisecond."""
-        first, expected = t, self._follows.get(actuator, math.nan)
-        if abs(expected - t) < 3.0 * _LATE:
-            excess = min(max(expected, t - _EARLY), t + _LATE) - expected
-            first = expected + min(max(excess, -_YIELDS / rate), _YIELDS / rate)
-        self._follows[actuator] = first + size / rate
-        return np.asarray(first + np.arange(size) / rate)
+    def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
+        """Compute the times [s] of `size` samples from `t` on; if they nearly follow the block before, they join it.
+
+        The start is the end of the block before, shifted by at most `_MAX_SHIFT` samples towards the interval that the
+        rounding of `t` to milliseconds allows.
+        """
+        start, expected = t, self._next_starts.get(actuator, math.nan)
+        if abs(expected - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
+            gap = min(max(expected, t - _EARLY_S), t + _LATE_S) - expected
+            start = expected + min(max(gap, -_MAX_SHIFT / rate), _MAX_SHIFT / rate)
+        self._next_starts[actuator] = start + size / rate
+        return np.asarray(start + np.arange(size) / rate)
 
 
-def _piece(group: Mapping[str, spb.SparkplugMetric], birth: _Birth, by_name: Mapping[str, str]) -> dict[str, Array]:
-    """Return the samples (n,) of the metrics of one time; a missing single value repeats its last one."""
+def _simultaneous_samples(
+    group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
+) -> dict[str, Array]:
+    """Return the samples (n,) of the metrics of one timestamp; a channel left out repeats its last single value."""
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}
         if len(sizes) != 1 or 0 in sizes or any(values.dtype != np.float64 for values in piece.values()):
             raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
         return piece
-    birth.metrics.update({metric.name: metric for metric in group.values()})
-    known = {channel: birth.metrics[name].value for name, channel in by_name.items() if channel not in SLOW}
-    single = {channel: value for channel, value in known.items() if not isinstance(value, np.ndarray)}
-    if not all(isinstance(value, (int, float, type(None))) for value in single.values()):
+    birth.metrics.update({metric.name: metric for metric in group.values()})  # the last values
+    last_values = {channel: birth.metrics[name].value for name, channel in channel_of.items() if channel not in SLOW}
+    numbers = {channel: value for channel, value in last_values.items() if not isinstance(value, np.ndarray)}
+    if not all(isinstance(value, (int, float, type(None))) for value in numbers.values()):
         raise RefusedMessage(blocks.NO_SAMPLES, "a single sample must be a number")
-    return {channel: np.array([math.nan if value is None else float(value)]) for channel, value in single.items()}
+    return {channel: np.array([math.nan if value is None else float(value)]) for channel, value in numbers.items()}

@@ -1,4 +1,4 @@
-"""The steps of a run, by either method, and its outputs: under a command, or in a loop with a controller."""
+"""Integration of a run by either method, with its outputs: under a command, or in a loop with a controller."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ import numpy as np
 from sealscope.compiled import kernel
 from sealscope.physics.rig import RigNumbers, observe
 from sealscope.physics.solvers.imex import IMEX_NODES, implicit_step
-from sealscope.physics.solvers.loop import APART, Loop, sample_controller
+from sealscope.physics.solvers.loop import SPACING, Loop, sample_controller
 from sealscope.physics.solvers.rk4 import RK4_NODES, explicit_step
 from sealscope.physics.state import state_of
 
-#: A method as compiled code takes it: a tuple, so that the code of the other is left out.
+#: The method as a compile-time flag: numba specialises on the tuple's length, so the other method is not compiled in.
 Implicit = tuple[bool, ...]
 EXPLICIT: Implicit = ()
 IMPLICIT: Implicit = (True,)
 
 
-def nodes_of(implicit: Implicit, h: float) -> np.ndarray:
-    """Compute the times [s] within a step of h [s] at which inputs are looked up, the ends just inside it."""
+def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
+    """Compute the times [s] within a step of h [s] at which inputs are evaluated.
+
+    First and last lie just inside the step, so that an input that jumps between two steps is taken on the right side.
+    """
     nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
     return nodes * h
@@ -33,25 +36,25 @@ def advance(
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
-    p: RigNumbers,
+    numbers: RigNumbers,
     euler_integral: bool,
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Advance `y` (14,) in place by n steps of h [s], and write a row of outputs before each `every`-th step.
+    """Integrate the state `y` (14,) in place over n steps of h [s], and write outputs before each `every`-th step.
 
-    `u`, `G`, `C`: (n, nodes) command [V] and leakage coefficients at the nodes of each step (`nodes_of`); `F`: (n,
-    nodes) load [N] beside the rig's own, (0, 0) without one; `rows`: (n // every, 21). `euler_integral` takes eq. (4.2)
-    literally: I is held within an explicit step and grows by h (omega_d - omega) once after it.
+    `u`, `G`, `C`: (n, nodes) command [V] and leakage coefficients at the nodes of each step (`step_nodes`); `F`: (n,
+    nodes) load [N] in addition to the rig's own, (0, 0) without one; `rows`: (n // every, 21) outputs;
+    `euler_integral`: see `rk4_step`.
     """
     z = state_of(y)
     for step in range(u.shape[0]):
         if step % every == 0:
-            observe(z, u[step, 0], G[step, 0], C[step, 0], p, rows[step // every])
+            observe(z, u[step, 0], G[step, 0], C[step, 0], numbers, rows[step // every])
         if len(implicit) > 0:
-            z = implicit_step(z, h, u, G, C, F, step, p)
+            z = implicit_step(z, h, u, G, C, F, step, numbers)
         else:
-            z = explicit_step(z, h, u, G, C, F, step, p, euler_integral)
+            z = explicit_step(z, h, u, G, C, F, step, numbers, euler_integral)
     for m in range(len(z)):
         y[m] = z[m]
 
@@ -64,29 +67,29 @@ def advance_closed(
     G: np.ndarray,
     C: np.ndarray,
     F: np.ndarray,
-    p: RigNumbers,
+    numbers: RigNumbers,
     euler_integral: bool,
     every: int,
     start: int,
     rows: np.ndarray,
     loop: Loop,
 ) -> int:
-    """Advance as `advance` over the outputs `rows` from `start` on, under a controller.
+    """Integrate as `advance` does, with the voltage of a controller; return the number of outputs written.
 
-    Return how many outputs there are: fewer than rows where a voltage is not finite.
+    `start`: the run's output that is the first row. Fewer outputs than rows are written if a voltage is not finite.
     """
-    spacing, n = loop.whole[APART], rows.shape[0]
+    spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))
-    first = 0
-    while first < n:
-        k = (start + first) // spacing
+    first = 0  # row of the controller's next sample
+    while first < n_rows:
+        k = (start + first) // spacing  # the controller's sample
         if (start + first) % spacing == 0 and not sample_controller(loop, k, y):
             break
         u[:] = loop.volts[k]
-        last = min((k + 1) * spacing - start, n)
+        last = min((k + 1) * spacing - start, n_rows)
         begin, end = first * every, last * every
         load = F[begin:end] if F.shape[0] > 0 else F
-        volts, part = u[: end - begin], rows[first:last]
-        advance(implicit, y, h, volts, G[begin:end], C[begin:end], load, p, euler_integral, every, part)
+        volts, outputs = u[: end - begin], rows[first:last]
+        advance(implicit, y, h, volts, G[begin:end], C[begin:end], load, numbers, euler_integral, every, outputs)
         first = last
     return first

@@ -1,4 +1,4 @@
-"""How long a step may be: the fastest oscillations and decays of a rig, from its numbers."""
+"""Limits of the solver's step from a rig's numbers: its fastest oscillations and decays."""
 
 from __future__ import annotations
 
@@ -8,55 +8,56 @@ import numpy as np
 
 from sealscope.physics.rig import RigNumbers
 
-#: Most that h |lambda| may be for an oscillation that is to be resolved, and for a decay that is to stay stable
-#: (RK4's own limit: Hairer & Wanner, Solving Ordinary Differential Equations II, 1996, IV.2).
+#: Upper limit of h |lambda|: for an oscillation, so that it is resolved (one radian a step); for a decay, so that it
+#: stays stable (RK4: Hairer & Wanner, Solving Ordinary Differential Equations II, 1996, IV.2).
 OSCILLATION_LIMIT = 1.0
 DECAY_LIMIT = 2.785
 
 
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
-    """Compute the volumes (V_A, V_B) [m^3] at either end of the stroke, where one of them is smallest."""
+    """Compute the volumes (V_A, V_B) [m^3] at each end of the stroke; one pair if the volumes are constant."""
     if not p.position_dependent:
         return ((p.V_A, p.V_B),)
-    half = 0.5 * p.L
-    return (p.V_A - p.A_A * half, p.V_B + p.A_B * half), (p.V_A + p.A_A * half, p.V_B - p.A_B * half)
+    half_stroke = 0.5 * p.L
+    return (p.V_A - p.A_A * half_stroke, p.V_B + p.A_B * half_stroke), (
+        p.V_A + p.A_A * half_stroke,
+        p.V_B - p.A_B * half_stroke,
+    )
 
 
-def _longest_for_pair(damping: float, stiffness: float) -> float:
-    """Compute the longest step [s] for s^2 + damping s + stiffness = 0: a radian, or stability of a decay."""
-    square = damping * damping - 4.0 * stiffness
-    if square < 0.0:
+def _longest_mode_step(damping: float, stiffness: float) -> float:
+    """Compute the longest step [s] for the modes of s^2 + damping s + stiffness = 0; infinite if they do not decay."""
+    discriminant = damping * damping - 4.0 * stiffness
+    if discriminant < 0.0:
         return OSCILLATION_LIMIT / math.sqrt(stiffness)
-    decay = 0.5 * (damping + math.sqrt(square))
+    decay = 0.5 * (damping + math.sqrt(discriminant))
     return DECAY_LIMIT / decay if decay > 0.0 else math.inf
 
 
-def _steepest_rise(bends: np.ndarray) -> float:
-    """Compute the steepest rise [N/m] or [N s/m] of a load that is linear between bends (`force_over`), 0 if none."""
-    return max(0.0, float(np.cumsum(bends[:, 1]).max()))
+def _steepest_rise(breakpoints: np.ndarray) -> float:
+    """Compute the steepest rise [N/m] or [N s/m] of a load (`piecewise_linear_force`), or 0 if it only falls."""
+    return max(0.0, float(np.cumsum(breakpoints[:, 1]).max()))
 
 
 def stiffest_rate(p: RigNumbers) -> float:
-    """Compute the fastest decay rate [1/s] of the throttled rig.
+    """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 needs h lambda < 2.785.
 
-    It is that of a line volume against its chamber through the throttle's laminar slope at dp = 0, lambda = K_oil
-    (1/V_1 + 1/V) c / sqrt(dp_0), with the chamber at the end of the stroke where it is smallest. An explicit method is
-    stable only for h lambda below its own limit (2.785 for RK4).
+    lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): a line volume and a chamber, at the end of the stroke where it is
+    smallest, equalise through the throttle's laminar slope at dp = 0.
     """
     c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
-    smallest = min(volume for volumes in _end_volumes(p) for volume in volumes)
-    return float(p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / smallest) * c / math.sqrt(p.dp_0))
+    min_chamber = min(volume for volumes in _end_volumes(p) for volume in volumes)
+    return float(p.K_oil * (1.0 / min(p.V_1, p.V_2) + 1.0 / min_chamber) * c / math.sqrt(p.dp_0))
 
 
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Compute the longest step [s] of an explicit method for all but the throttles, for leaks up to `G`, `C`.
+    """Compute the longest step [s] of an explicit method for a rig's laws except the throttles', for leaks `G`, `C`.
 
-    The shortest of: speed loop (winding and shaft), piston between its oil columns (running, and within the linear part
-    of the friction, F_C/v_th with F_C = F_pr + F_cfr (p_A + p_B) at the charge pressure, with the load's spring and
-    damper), pump and motor between the volumes at the pump's ports, leakage between the chambers, leakage outwards and
-    make-up. An oscillation needs h |lambda| <= 1, a decay h lambda <= 2.785 (stability of RK4, which the explicit part
-    of ARK4(3)6L[2]SA exceeds).
-    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer; air only makes it softer.
+    The minimum over: speed loop (winding and shaft); piston between its oil columns, sliding, and within the linear
+    part of the friction (slope F_C/v_th, F_C at the charge pressure), with the load's spring and damper; pump and motor
+    between the volumes at the pump's ports; leakage between the chambers; external leakage and make-up. The stability
+    limit of a decay is that of RK4, which the explicit part of ARK4(3)6L[2]SA exceeds. Position-dependent volumes are
+    those at the end of the stroke with the stiffer oil; air is left out because it only makes the oil softer.
     """
     ends = _end_volumes(p)
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
@@ -65,47 +66,49 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     if len(p.lossy) > 0:  # friction at standstill, under the largest torque of the motor; slip at no pressure
         B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f
         G_pump += p.c_slip / math.sqrt(p.dp_0)
-    loop = _longest_for_pair(p.R_c / p.L_c + B_M / p.J_M, (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M))
+    loop_stiffness = (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M)
+    speed_loop_step = _longest_mode_step(p.R_c / p.L_c + B_M / p.J_M, loop_stiffness)
+    # stiffness of the oil columns and the load's spring, over the mass [1/s^2]
     column = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)
-    breakaway = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
-    breakaway += 0.0 if p.literal_bracket else p.F_v
+    friction_slope = F_C * (p.K_brk + (p.F_v * p.v_th if p.literal_bracket else 0.0)) / p.v_th
+    friction_slope += 0.0 if p.literal_bracket else p.F_v
     damper = p.d_load
     if len(p.pushed) > 1:
         column += _steepest_rise(p.pushed[0]) / p.M_eq
         damper += _steepest_rise(p.pushed[1])
-    running = _longest_for_pair((p.F_v + damper) / p.M_eq, column)
-    stuck = _longest_for_pair((max(1.0, p.backward) * breakaway + damper) / p.M_eq, column)
+    sliding_step = _longest_mode_step((p.F_v + damper) / p.M_eq, column)
+    sticking_step = _longest_mode_step((max(1.0, p.backward) * friction_slope + damper) / p.M_eq, column)
     if len(p.bristled) > 0:
-        stuck = _longest_for_pair((p.sigma_1 + p.F_v + damper) / p.M_eq, column + p.sigma_0 / p.M_eq)
-    ports = 0.0 if len(p.valved) > 0 else ports  # the pump works on the supply: see there
-    pump = _longest_for_pair(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
-    leak = _longest_for_pair(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
+        sticking_step = _longest_mode_step((p.sigma_1 + p.F_v + damper) / p.M_eq, column + p.sigma_0 / p.M_eq)
+    ports = 0.0 if len(p.valved) > 0 else ports  # the pump then feeds the supply (`_longest_valve_step`)
+    pump_step = _longest_mode_step(ports * G_pump, ports * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
+    leak_step = _longest_mode_step(chambers * (G + C / math.sqrt(p.dp_0)), 0.0)
     # Q = G dp (dp - p_crack)/p_open of a pilot-operated valve is steepest where it is fully open
     steepest = 2.0 + p.p_crack / p.p_open if len(p.piloted) > 0 else 1.0
     valves = max(p.G_check * steepest * p.made_up, p.G_relief * (len(p.relieved) > 0))
-    outward = _longest_for_pair(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)
-    fastest = min(loop, running, stuck, pump, leak, outward)
+    external_step = _longest_mode_step(chambers * max(p.G_ext_A, p.G_ext_B) + ports * valves, 0.0)
+    step = min(speed_loop_step, sliding_step, sticking_step, pump_step, leak_step, external_step)
     if len(p.valved) > 0:
-        fastest = min(fastest, _longest_of_valve(p, ends))
-    return float(fastest)
+        step = min(step, _longest_valve_step(p, ends))
+    return float(step)
 
 
-def _longest_of_valve(p: RigNumbers, ends: tuple[tuple[float, float], ...]) -> float:
+def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], ...]) -> float:
     """Compute the longest step [s] for a servo valve: its spool, a chamber behind its laminar edges, the supply."""
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
-    steepest = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of an edge at full stroke
-    most = steepest * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
-    chamber = p.K_oil * max(1.0 / volume for volumes in ends for volume in volumes)
+    edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar
+    chamber_slope = edge_slope * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
+    chamber = p.K_oil * max(1.0 / volume for volumes in end_volumes for volume in volumes)
     supply = p.K_oil / p.V_1  # the accumulator may be empty
-    spool = _longest_for_pair(2.0 * p.zeta_s * p.omega_s, p.omega_s**2)
-    edges = _longest_for_pair(most * chamber, 0.0)
-    pump = supply * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M
+    spool_step = _longest_mode_step(2.0 * p.zeta_s * p.omega_s, p.omega_s**2)
+    chamber_step = _longest_mode_step(chamber_slope * chamber, 0.0)
     slip = p.c_slip / math.sqrt(p.dp_0)
-    line = _longest_for_pair(supply * (p.G_pump + slip + p.G_set + 2.0 * most), pump)
-    return min(spool, edges, line)
+    supply_damping = supply * (p.G_pump + slip + p.G_set + 2.0 * chamber_slope)
+    supply_step = _longest_mode_step(supply_damping, supply * (p.q_b / (2.0 * math.pi)) ** 2 / p.J_M)
+    return min(spool_step, chamber_step, supply_step)
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:
-    """Compute the longest step [s] that resolves the piston against a cap: M_eq on k_stop and d_stop."""
-    return _longest_for_pair(p.d_stop / p.M_eq, p.k_stop / p.M_eq)
+    """Compute the longest step [s] that resolves the piston on an end stop: the mass M_eq on k_stop and d_stop."""
+    return _longest_mode_step(p.d_stop / p.M_eq, p.k_stop / p.M_eq)

@@ -1,1 +1,1 @@
-"""The laws over lanes: eight runs to a vector register."""
+"""Many runs at once: the laws on lanes, eight runs to a vector register."""

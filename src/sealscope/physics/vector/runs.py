@@ -1,7 +1,7 @@
-"""Runs side by side: the same laws and the same two methods over lanes, eight runs to a vector register.
+"""Integration of many runs at once: the same laws and methods on lanes, eight runs to a vector register.
 
-Arrays have their lanes last. A group is WIDTH runs of one kind (the choices of `RigNumbers` are those of all of them);
-each lane has numbers, leaks and a gain and offset of the command of its own, and the command's shape is shared.
+The last axis of an array is the lane. A group is WIDTH runs with the same choices of `RigNumbers` and the same shape of
+the command; numbers, leak, and the command's gain and offset may differ between lanes.
 """
 
 from __future__ import annotations
@@ -19,80 +19,84 @@ from sealscope.physics.solvers.imex import imex_step
 from sealscope.physics.solvers.rk4 import rk4_step
 from sealscope.physics.state import P_A, P_B, POSITION, STATES, State
 
-#: Rows that describe a leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
-#: and the G and C whose flow goes to the account (those of the leak, or of one that is being sized).
+#: Rows that describe the leak of each lane: G [m^3/(s Pa)], C [m^3/(s Pa^0.5)], start [s], slope of the opening [1/s],
+#: and the G and C whose flow is summed in the totals (those of the leak, or of one that is being sized).
 LEAK_ROWS = 6
 #: Channels that a run writes at each output: p_A, p_B [Pa].
 CHANNELS = 2
-#: Rows of a lane's account: sum of |Q_L| [m^3/s] over the outputs, sum of the leak's opening, largest |x| [m],
-#: lowest pressure [Pa], 0 while all is finite.
-ACCOUNTS = 5
+#: Rows of a lane's totals over the outputs: sum of |Q_L| [m^3/s], sum of the leak's opening, largest |x| [m], lowest
+#: pressure [Pa], and a flag that is 0 while all states are finite, NaN afterwards.
+N_TOTALS = 5
 Leak = tuple[float, float, float, float, float, float]
-Account = tuple[float, float, float, float, float]
-FLOW, OPEN, REACH, LEAST, DIVERGED = range(ACCOUNTS)
+Totals = tuple[float, float, float, float, float]
+FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile a law written as text: numba needs every element of a tuple written out."""
+    """Compile the function `law` of a source text, in which each element of a tuple is written out for numba."""
     scope["load"] = load
     exec(text, scope)
     return contracted(scope["law"])
 
 
-def _rows(count: int) -> Any:
-    """Build the compiled function (array, at), which loads `count` rows of lanes from row `at` on."""
-    return _compile(f"def law(array, at):\n    return ({', '.join(f'load(array, at + {k})' for k in range(count))})")
+def _row_loader(count: int) -> Any:
+    """Compile the function (array, row) that loads `count` rows of lanes from row `row` on."""
+    return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
 
 
-lane_state, lane_leak, lane_account = _rows(len(STATES)), _rows(LEAK_ROWS), _rows(ACCOUNTS)
-_FIELDS = [*(f"{name}=load(table, at + {row})" for row, name in enumerate(NUMBERS)), *(f"{c}=p.{c}" for c in CHOICES)]
-#: Of (table, at, p): the choices of `p`, and the group's numbers from rows at, at + 1, ..
-lane_numbers = _compile(f"def law(table, at, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
+load_state, load_leak, load_totals = _row_loader(len(STATES)), _row_loader(LEAK_ROWS), _row_loader(N_TOTALS)
+_FIELDS = [*(f"{name}=load(table, row + {k})" for k, name in enumerate(NUMBERS)), *(f"{c}=p.{c}" for c in CHOICES)]
+#: The function (table, row, p) that loads a group's numbers from row `row` on, with the choices of `p`.
+load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.join(_FIELDS)})", RigNumbers=RigNumbers)
 
 
 @contracted
-def opening(leak: Leak, t: float) -> float:
-    """Compute the opening of a leak (`LEAK_ROWS`) at t [s]: 0 to 1, rising evenly from its start."""
+def leak_opening(leak: Leak, t: float) -> float:
+    """Compute the opening of a leak (`LEAK_ROWS`) at t [s], which rises linearly from 0 at its start to 1."""
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
 
 
-def _inputs(count: int) -> Any:
-    """Build the compiled function (t, nodes, shape, k, drive, leak, p): u, G, C, F at the `count` nodes of step k."""
+def _build_inputs_law(count: int) -> Any:
+    """Compile the function (t, nodes, shape, k, drive, leak, p) that returns u, G, C, F at the `count` nodes of step k.
+
+    `t` [s]: start of the step; the other arguments are those of `advance`.
+    """
 
     def for_nodes(text: str) -> str:
-        return ", ".join(text.format(n=n, behind=count + n) for n in range(count))
+        return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
         f"""def law(t, nodes, shape, k, drive, leak, p):
-    s = ({for_nodes("opening(leak, t + nodes[{n}])")})
+    s = ({for_nodes("leak_opening(leak, t + nodes[{n}])")})
     u = ({for_nodes("drive[1] + drive[0] * shape[k, {n}]")})
     G, C = ({for_nodes("leak[0] * s[{n}]")}), ({for_nodes("leak[1] * s[{n}]")})
     F = ({for_nodes("0.0")})
     if len(p.pushed) > 0:
-        F = ({for_nodes("shape[k, {behind}]")})
+        F = ({for_nodes("shape[k, {load_column}]")})
     return u, G, C, F
 """,
-        opening=opening,
+        leak_opening=leak_opening,
     )
 
 
-_rk4_inputs, _imex_inputs = _inputs(3), _inputs(6)
+_rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 
 @contracted
-def _add_output(z: State, leak: Leak, t: float, account: Account, q: RigNumbers) -> Account:
-    """Add one output to the account of a run."""
-    flow, opened, reach, least, diverged = account
-    share = opening(leak, t)
+def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
+    """Add the state `z` at an output at t [s] to the totals (`N_TOTALS`) of runs with the numbers `q`."""
+    flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
+    opening = leak_opening(leak, t)
     p_A, p_B, p_1, p_2 = pressures_of(z, q)
-    flow = flow + abs(piston_leakage(p_A - p_B, leak[4] * share, leak[5] * share, q.dp_0))
-    least = min(least, p_A)
-    least = min(least, p_B)
+    flow_sum = flow_sum + abs(piston_leakage(p_A - p_B, leak[4] * opening, leak[5] * opening, q.dp_0))
+    min_pressure = min(min_pressure, p_A)
+    min_pressure = min(min_pressure, p_B)
     if len(q.throttled) > 0:
-        least = min(least, p_1)
-        least = min(least, p_2)
-    total = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
-    return flow, opened + share, max(abs(z[POSITION]), reach), least, diverged + 0.0 * total
+        min_pressure = min(min_pressure, p_1)
+        min_pressure = min(min_pressure, p_2)
+    state_sum = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
+    diverged = diverged + 0.0 * state_sum  # NaN once any state is not finite
+    return flow_sum, opening_sum + opening, max(abs(z[POSITION]), max_travel), min_pressure, diverged
 
 
 @contracted
@@ -112,54 +116,52 @@ def advance(
     every: int,
     pressures: np.ndarray,
     begin: int,
-    account: np.ndarray,
+    totals: np.ndarray,
 ) -> None:
-    """Advance groups of runs in place by n steps of h [s], the first of them step `start` of a run.
+    """Integrate the groups `groups[0]` <= g < `groups[1]` in place over n steps of h [s], from step `start`.
 
-    Groups `groups[0]` to before `groups[1]` are advanced, by the implicit-explicit method where `implicit`, else by
-    RK4.
-
-    `y`: (groups, 14, WIDTH); `shape`: (n, nodes) the command's shape at `nodes` [s] of each step, or (n, 2 nodes) with
-    the load [N] of all runs behind; `drive`: (groups, 2, WIDTH) gain and offset [V]; `leaks`: (groups, LEAK_ROWS,
-    WIDTH); `table`: (groups, cells, fields, WIDTH) with `bounds` (cells + 1,) the step at which each cell begins;
-    `pressures`: (groups, outputs, CHANNELS, WIDTH), written from output `begin` on, one every `every` steps, before the
-    step; `account`: (groups, ACCOUNTS, WIDTH).
+    `implicit`: implicit-explicit method, else RK4; `y`: (groups, 14, WIDTH) states; `shape`: (n, nodes) the command's
+    shape at the times `nodes` [s] within each step, or (n, 2 nodes), then followed by the load [N]; `drive`: (groups,
+    2, WIDTH) gain and offset [V] of the command; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields,
+    WIDTH) the rigs' numbers, constant within a cell, with `bounds` (cells + 1,) the steps at which cells begin; `p`:
+    the choices of the rigs; `pressures`: (groups, outputs, CHANNELS, WIDTH), written from output `begin` on, before
+    every `every`-th step; `totals`: (groups, N_TOTALS, WIDTH).
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
-        z = lane_state(y, g * states)
+        z = load_state(y, g * states)
         gain = (load(drive, 2 * g), load(drive, 2 * g + 1))
-        leak, noted = lane_leak(leaks, g * LEAK_ROWS), lane_account(account, g * ACCOUNTS)
+        leak, run_totals = load_leak(leaks, g * LEAK_ROWS), load_totals(totals, g * N_TOTALS)
         out = (g * pressures.shape[1] + begin) * CHANNELS
         for cell in range(cells):
-            q = lane_numbers(table, (g * cells + cell) * fields, p)
-            due = 0  # steps before the next output; cells begin at one
+            q = load_numbers(table, (g * cells + cell) * fields, p)
+            steps_to_output = 0  # a cell begins at an output
             for step in range(bounds[cell], bounds[cell + 1]):
                 t = (start + step) * h
-                if due == 0:
-                    due = every
+                if steps_to_output == 0:
+                    steps_to_output = every
                     store(pressures, out, vapour_floor(z[P_A], q))
                     store(pressures, out + 1, vapour_floor(z[P_B], q))
                     out += CHANNELS
-                    noted = _add_output(z, leak, t + nodes[0], noted, q)
-                due -= 1
+                    run_totals = _add_output(z, leak, t + nodes[0], run_totals, q)
+                steps_to_output -= 1
                 if len(implicit) > 0:
                     z = imex_step(z, h, *_imex_inputs(t, nodes, shape, step, gain, leak, q), q)  # type: ignore[call-arg]
                 else:
                     z = rk4_step(z, h, *_rk4_inputs(t, nodes, shape, step, gain, leak, q), q, False)  # type: ignore[call-arg]
         for m in range(states):
             store(y, g * states + m, z[m])
-        for m in range(ACCOUNTS):
-            store(account, g * ACCOUNTS + m, noted[m])
+        for m in range(N_TOTALS):
+            store(totals, g * N_TOTALS + m, run_totals[m])
 
 
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
-    """Advance by RK4, compiled for lanes (`advance`)."""
+    """Integrate groups of runs by RK4: `advance`, compiled."""
     advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
-    """Advance throttled rigs by the implicit-explicit method, compiled for lanes (`advance`)."""
+    """Integrate groups of runs of rigs with throttles by the implicit-explicit method: `advance`, compiled."""
     advance(IMPLICIT, *run)

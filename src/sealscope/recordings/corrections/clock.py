@@ -1,8 +1,8 @@
-"""An even clock for samples that a poll took at uneven times.
+"""An even clock for samples that were polled at uneven times.
 
-Rows of the weak form integrate over an even clock. Samples of an uneven one are brought to it, at the median rate, by
-straight lines between neighbours, which is the trapezoidal rule over the recorded times. Where neighbours are far apart
-samples are missing; `corrections.gaps` bridges and marks them. The inspection calls it.
+The weak form integrates over an even clock. Uneven samples are interpolated linearly to the median rate, which is the
+trapezoidal rule over the recorded times. Samples between distant neighbours become missing; `corrections.gaps` bridges
+and marks them. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -13,96 +13,92 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import priors_of
 
-_PRIORS = priors_of("sealscope.recordings")["clock"]
-#: Neighbours up to so many of the usual intervals apart are joined by a line.
-NEAR: float = _PRIORS["near"]
-#: Largest share of the samples that gaps may be without cutting the recording, and that may be late.
-MOST_LOST, MOST_LATE = _PRIORS["lost"], _PRIORS["late"]
+_PRIORS = RECORDINGS.clock
+#: Longest interval that is interpolated, in median intervals.
+MAX_INTERVAL: float = _PRIORS.near
+#: Largest fraction of the samples that gaps may take before the recording is cut, and that may be out of order.
+MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 
 
-def even_clock(recording: Recording) -> Recording:
-    """Bring the samples to an even clock, NaN where rows were lost; return the same recording if its clock is even.
+def resample_evenly(recording: Recording) -> Recording:
+    """Resample to an even clock, with NaN for lost rows; return the same recording if its clock is even.
 
-    Rows without a time, late rows and repeated times are dropped. Of recordings in one file, whose clock goes back or
-    leaps, the longest is kept.
+    Rows without a time, late rows and repeated times are dropped. If a file contains several recordings, whose clock
+    goes back or leaps, the longest is used.
     """
-    kept = _ordered_rows(recording.t)
-    kept = kept[_densest_stretch(recording.t[kept], recording.rate)]
-    if kept.size < 2:
-        return recording.samples(slice(0, kept.size))
-    t = recording.t[kept]
+    rows = _ordered_rows(recording.t)
+    rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
+    if rows.size < 2:
+        return recording.samples(slice(0, rows.size))
+    t = recording.t[rows]
     steps = np.diff(t) * recording.rate
-    whole = np.round(steps)
-    if np.sqrt(np.mean((steps - whole) ** 2)) <= _PRIORS["scatter"] and whole.min() >= 1.0:
-        if kept.size == len(recording) and whole.max() == 1.0:
+    n_steps = np.round(steps)
+    if np.sqrt(np.mean((steps - n_steps) ** 2)) <= _PRIORS.scatter and n_steps.min() >= 1.0:
+        if rows.size == len(recording) and n_steps.max() == 1.0:
             return recording
-        return _with_lost_rows(recording, kept, whole.astype(np.int64))
-    return _resampled(recording, kept)
-
-
-def is_uneven(recording: Recording) -> bool:
-    """Test whether `even_clock` would interpolate the samples of a recording."""
-    kept = _ordered_rows(recording.t)
-    steps = np.diff(recording.t[kept]) * recording.rate
-    return bool(steps.size and np.sqrt(np.mean((steps - np.round(steps)) ** 2)) > _PRIORS["scatter"])
+        return _insert_lost_rows(recording, rows, n_steps.astype(np.int64))
+    return _interpolate_rows(recording, rows)
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the rows with rising times; if many are out of order, the rows of the longest rising run."""
+    """Find the rows with increasing times; if too many are late, the rows of the longest increasing run."""
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
         return timed
-    newest = np.maximum.accumulate(t[timed])
-    late = np.r_[False, t[timed][1:] <= newest[:-1]]
-    if np.mean(late) <= MOST_LATE:
-        return np.asarray(timed[~late])
+    latest_time = np.maximum.accumulate(t[timed])
+    is_late = np.r_[False, t[timed][1:] <= latest_time[:-1]]
+    if np.mean(is_late) <= MAX_LATE_FRACTION:
+        return np.asarray(timed[~is_late])
     runs = np.split(timed, np.flatnonzero(np.diff(t[timed]) < 0.0) + 1)
     run = max(runs, key=len)
     return np.asarray(run[np.r_[True, np.diff(t[run]) > 0.0]])
 
 
-def _densest_stretch(t: Array, rate: float) -> slice:
-    """Return the stretch of times (n,) with the most samples of which gaps take no more than `MOST_LOST`."""
-    surplus = np.arange(t.size) - (1.0 - MOST_LOST) * rate * (t - t[:1].sum())
-    best_after = np.maximum.accumulate(surplus[::-1])[::-1]
-    last = np.searchsorted(-best_after, -surplus, side="right") - 1
+def _longest_dense_stretch(t: Array, rate: float) -> slice:
+    """Find the longest stretch of times (n,) of which gaps take at most `MAX_GAP_FRACTION`."""
+    # samples beyond the fewest allowed since the first row: a stretch is dense enough if it does not decrease
+    first_time = t[:1].sum()  # 0 if there is none
+    surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
+    max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
+    # per row, the last row to which the stretch from it is dense enough
+    last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1
     first = int(np.argmax(last - np.arange(t.size))) if t.size else 0
     return slice(first, int(last[first]) + 1 if t.size else 0)
 
 
-def _with_lost_rows(recording: Recording, kept: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
-    """Return the kept rows with rows of NaN where intervals of several `steps` show that some were lost."""
-    place = np.concatenate([[0], np.cumsum(steps)])
-    count = int(place[-1]) + 1
-    channels = {name: np.full(count, np.nan) for name in recording.channels}
+def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
+    """Insert rows of NaN between `rows` (k,) where the interval, `steps` (k - 1,) of the clock, is longer than one."""
+    row_index = np.concatenate([[0], np.cumsum(steps)])
+    n = int(row_index[-1]) + 1
+    channels = {name: np.full(n, np.nan) for name in recording.channels}
     for name, values in channels.items():
-        values[place] = recording[name][kept]
-    return replace(recording, t=np.interp(np.arange(count), place, recording.t[kept]), channels=channels)
+        values[row_index] = recording[name][rows]
+    return replace(recording, t=np.interp(np.arange(n), row_index, recording.t[rows]), channels=channels)
 
 
-def _resampled(recording: Recording, kept: NDArray[np.intp]) -> Recording:
-    """Return the kept rows on an even clock of the recording's rate."""
-    t = recording.t[kept]
-    even = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
+def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
+    """Interpolate the given rows to an even clock of the recording's rate."""
+    t = recording.t[rows]
+    even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
     channels = {}
     for name, values in recording.channels.items():
-        known = np.isfinite(values[kept])
-        channels[name] = _on_lines(even, t[known], values[kept][known], name in SLOW)
+        known = np.isfinite(values[rows])
+        channels[name] = _interpolate(even_times, t[known], values[rows][known], is_slow=name in SLOW)
     note = f"uneven sampling brought to {recording.rate:g} Hz by straight lines"
-    return replace(recording, t=even, channels=channels, history=(*recording.history, note))
+    return replace(recording, t=even_times, channels=channels, history=(*recording.history, note))
 
 
-def _on_lines(even: Array, t: Array, values: Array, slow: bool) -> Array:
-    """Return values (m,) at the times `even` on lines between samples (n,), NaN where these are not near."""
+def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
+    """Interpolate samples (n,) linearly at `even_times` (m,), but not across long intervals unless `is_slow`."""
     if t.size < 2:
-        return np.full(even.size, np.nan)
-    result = np.interp(even, t, values, left=np.nan, right=np.nan)
-    if not slow:
+        return np.full(even_times.size, np.nan)
+    result = np.interp(even_times, t, values, left=np.nan, right=np.nan)
+    if not is_slow:
         steps = np.diff(t)
-        after = np.clip(np.searchsorted(t, even), 1, t.size - 1)
-        far = steps > NEAR * float(np.median(steps))
-        result[far[after - 1] & (even > t[after - 1]) & (even < t[after])] = np.nan
+        next_sample = np.clip(np.searchsorted(t, even_times), 1, t.size - 1)
+        is_long = steps > MAX_INTERVAL * float(np.median(steps))
+        result[is_long[next_sample - 1] & (even_times > t[next_sample - 1]) & (even_times < t[next_sample])] = np.nan
     return result

@@ -1,11 +1,10 @@
-"""Gaps in a recording: short ones are bridged and marked, so that what lies on both sides of them can be analysed.
+"""Gaps in a recording: short ones are bridged and marked, so that the data on both sides can be analysed together.
 
-A gap is a run of rows without a value of a needed channel, or rows that a logger has lost: its clock shows them
-(`corrections.clock`), or both chamber pressures are zero (`remove_dropouts`, which a running machine's samples pass as
-well). How it is bridged depends on its length: up to `SPLINE` samples by a cubic spline; where the duty repeats, by the
-channel's own values whole cycles before or after, shifted evenly so that both ends meet; else by a straight line. What
-is bridged is no reading: `Recording.bridged` marks it. The balance gives less weight to what a hole touches (`holes`);
-other detectors leave out the blocks that are `touched`.
+A gap is a run of rows in which a needed channel has no value, or which the logger has lost: the clock shows this
+(`corrections.clock`), or both chamber pressures are zero (`remove_dropouts`). Up to `SPLINE` samples are bridged by a
+cubic spline; longer gaps, if the duty repeats, by the channel's values whole cycles before or after, with an offset so
+that both ends meet; others by a straight line. `Recording.bridged` marks these rows, which are no readings. The balance
+gives less weight to blocks with long gaps (`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
 """
 
 from __future__ import annotations
@@ -19,180 +18,190 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
-from sealscope.recordings.corrections.clock import NEAR
-from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.motion import runs_of
+from sealscope.recordings.corrections.clock import MAX_INTERVAL
+from sealscope.recordings.cycle import duty_signal, find_cycle
+from sealscope.recordings.motion import find_runs
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import flag_impossible, uniform_segments
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import priors_of
 
 Flags = NDArray[np.bool_]
 
-#: Longest gaps that are bridged by a spline [samples] and by other cycles (share of the recording).
-SPLINE, LONGEST_SHARE = 3, 0.1
-_GAPS = priors_of("sealscope.recordings")["gaps"]
-#: A block may hold this share of bridged samples: they move its sums by less than its own scatter.
-MOST_BRIDGED = 0.01
-#: Samples whose mean on either side of a gap sets the shift of another cycle.
-_END = 8
-#: Most that another cycle may differ from this one after the gap, as a share of the rms about the mean.
-_UNLIKE = 0.4
-#: Samples by which the cycle's length may be off.
+#: Longest gaps bridged by a spline [samples] and by another cycle (fraction of the recording); largest fraction of
+#: impossible samples in a channel with the right unit.
+SPLINE, MAX_CYCLE_GAP, _MAX_IMPOSSIBLE_FRACTION = 3, 0.1, 0.1
+_GAPS = RECORDINGS.gaps
+#: Largest fraction of bridged samples in a block: up to it, they change its sums less than its scatter does.
+MAX_BRIDGED_FRACTION = 0.01
+#: Samples on either side of a gap whose means set the offset of a copied cycle.
+_N_END = 8
+#: Largest rms difference of a copied cycle around the gap, relative to its rms about the mean.
+_MAX_MISMATCH = 0.4
+#: Uncertainty of the cycle's length [samples].
 _SLACK = 2
 
 
 def remove_dropouts(recording: Recording) -> Recording:
     """Mark the samples of all channels as missing where both chamber pressures are exactly zero.
 
-    A converter that is off writes zeros; two transducers with noise never read them at once. Returns the recording
-    itself where there are none.
+    A converter that is off writes zeros; two noisy transducers never read zero together. Returns the same recording if
+    there are none.
     """
     chambers = chambers_of(recording)
     if len(chambers) < 2:
         return recording
-    lost = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])
-    if not lost.any():
+    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])
+    if not is_dropout.any():
         return recording
-    channels = {name: np.where(lost, np.nan, values) for name, values in recording.channels.items()}
+    channels = {name: np.where(is_dropout, np.nan, values) for name, values in recording.channels.items()}
     return replace(recording, channels=channels)
 
 
 def remove_impossible(recording: Recording) -> Recording:
-    """Mark samples beyond the range of any sensor as missing (`quality.flag_impossible`).
+    """Mark samples beyond the range of any sensor (`quality.flag_impossible`) as missing.
 
-    Where a channel has many of them its unit is wrong: it stays. Returns the recording itself where there are none.
+    A channel with many of them has a wrong unit and stays. Returns the same recording if there are none.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
-    wrong = {name: mask & (np.mean(mask) <= LONGEST_SHARE) for name, mask in flags.items() if len(mask)}
-    if not any(mask.any() for mask in wrong.values()):
+    is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
+    if not any(mask.any() for mask in is_removed.values()):
         return recording
-    channels = {name: np.where(wrong[name], np.nan, values) for name, values in recording.channels.items()}
+    channels = {name: np.where(is_removed[name], np.nan, values) for name, values in recording.channels.items()}
     return replace(recording, channels=channels)
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with gaps of the `needed` channels bridged but for those at its ends; the same without any.
+    """Bridge the gaps of the `needed` channels, but not at the ends; return the same recording if there are none.
 
-    In bridged rows every other channel is bridged as well. Values that were recorded stay as they are. The clock is
-    even (`corrections.clock.even_clock`).
+    In bridged rows the missing values of all other channels are bridged as well; recorded values stay. The clock must
+    be even (`corrections.clock.resample_evenly`).
     """
-    known = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
-    if not len(recording) or known.all() or not known.any():
+    is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
+    if not len(recording) or is_complete.all() or not is_complete.any():
         return recording
     channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in recording.channels.items()}
     stretches = uniform_segments(recording, needed)
-    longest = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
-    cycle = None if longest is None else find_cycle(recording.samples(longest).only(needed))
-    bridged, by_spline, by_line = np.zeros((3, len(recording)), dtype=bool)
-    for first, length in runs_of(~known).tolist():
+    longest_stretch = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
+    cycle = None if longest_stretch is None else find_cycle(recording.samples(longest_stretch).only(needed))
+    bridged, spline_rows, line_rows = np.zeros((3, len(recording)), dtype=bool)
+    for first, length in find_runs(~is_complete).tolist():
         stop = first + length
         if first == 0 or stop == len(recording):
             continue
         bridged[first:stop] = True
         if length <= SPLINE:
-            by_spline[first:stop] = True
+            spline_rows[first:stop] = True
             continue
-        repeats = 0.0 if cycle is None or length > LONGEST_SHARE * len(recording) else cycle * recording.rate
-        if not (repeats and _from_other_cycle(channels, needed, first, stop, repeats)):
-            by_line[first:stop] = True
+        period = 0.0 if cycle is None or length > MAX_CYCLE_GAP * len(recording) else cycle * recording.rate
+        if not (period and _copy_other_cycle(channels, needed, first, stop, period)):
+            line_rows[first:stop] = True
     for values in channels.values():
-        _spline(values, by_spline)
-        _line(values, by_line)
+        _fill_by_spline(values, spline_rows)
+        _fill_by_line(values, line_rows)
     if not bridged.any():
         return recording
-    note = f"{np.count_nonzero(bridged)} samples in {len(runs_of(bridged))} gaps bridged"
+    note = f"{np.count_nonzero(bridged)} samples in {len(find_runs(bridged))} gaps bridged"
     return replace(recording, channels=channels, bridged=bridged, history=(*recording.history, note))
 
 
-def filled(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Return the recording with short gaps filled by a line where a channel is none of the `needed`; the same for none.
+def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
+    """Interpolate short gaps of the channels that are not `needed`; return the same recording if there are none.
 
-    Those of positions, angles, speeds and flows while a mass moves on evenly, as a slower sensor leaves between its
-    samples; those of pressures up to `SPLINE` samples.
+    A gap is short up to `SPLINE` samples for pressures, and otherwise up to the prior `motion` [s], over which a mass
+    moves evenly: a slower sensor leaves such gaps between its samples. Gaps at the ends remain.
     """
-    motion = _GAPS["motion"] * recording.rate
+    max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
     for name, values in recording.channels.items():
-        missing = ~np.isfinite(values)
-        if name in needed or not missing.any() or missing.all():
+        is_missing = ~np.isfinite(values)
+        if name in needed or not is_missing.any() or is_missing.all():
             continue
-        most = SPLINE if name.startswith("p_") else motion
-        short = np.zeros(len(values), dtype=bool)
-        for first, length in runs_of(missing).tolist():
-            short[first : first + length] = first > 0 and first + length < len(values) and length <= most
+        max_length = SPLINE if name.startswith("p_") else max_motion_gap
+        is_short = np.zeros(len(values), dtype=bool)
+        for first, length in find_runs(is_missing).tolist():
+            is_short[first : first + length] = first > 0 and first + length < len(values) and length <= max_length
         channels[name] = values.copy()
-        channels[name][short] = np.interp(np.flatnonzero(short), np.flatnonzero(~missing), values[~missing])
+        channels[name][is_short] = np.interp(np.flatnonzero(is_short), np.flatnonzero(~is_missing), values[~is_missing])
     return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
 
-def touched(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) between sample `bounds` (n + 1,) with a share of bridged samples above `MOST_BRIDGED`."""
+def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
+    """Flag the blocks (n,) between sample `bounds` (n + 1,) with over `MAX_BRIDGED_FRACTION` bridged samples."""
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
     counts = np.diff(np.concatenate([[0], np.cumsum(recording.bridged)])[bounds])
-    return np.asarray(counts > MOST_BRIDGED * np.diff(bounds))
+    return np.asarray(counts > MAX_BRIDGED_FRACTION * np.diff(bounds))
 
 
-def holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) in bridged gaps longer than a tenth of a test function."""
+def flag_holes(recording: Recording) -> Flags:
+    """Flag the rows (n,) in bridged gaps longer than the prior `hole`, a tenth of the length of a test function."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
-        seconds = max(_GAPS["hole"], NEAR / recording.rate)
-        for first, length in runs_of(recording.bridged).tolist():
-            flags[first : first + length] = length + 1 > seconds * recording.rate
+        max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
+        for first, length in find_runs(recording.bridged).tolist():
+            flags[first : first + length] = length + 1 > max_gap * recording.rate
     return flags
 
 
-def _mean(values: Array) -> float:
+def _finite_mean(values: Array) -> float:
+    """Average the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else math.nan
 
 
-def _from_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, cycle: float) -> bool:
-    """Bridge a gap of all channels by the nearest cycle in which the duty beside it repeats, to within `_SLACK`."""
-    half = round(0.5 * cycle)
-    least = math.ceil((stop - first + half) / cycle)
-    for shift in (sign * round(times * cycle) for times in (least, least + 1) for sign in (-1, 1)):
-        near = range(shift - _SLACK, shift + _SLACK + 1)
-        unlike = [_unlike(channels, needed, first, stop, other, half) for other in near]
-        best = int(np.argmin(unlike))
-        if unlike[best] <= _UNLIKE:
+def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
+    """Bridge a gap of all channels by the nearest cycle with the same duty around it; return True if there is one.
+
+    `period`: of the duty [samples], known to within `_SLACK`.
+    """
+    half_cycle = round(0.5 * period)
+    min_cycles = math.ceil((stop - first + half_cycle) / period)
+    for shift in (sign * round(n_cycles * period) for n_cycles in (min_cycles, min_cycles + 1) for sign in (-1, 1)):
+        shifts = range(shift - _SLACK, shift + _SLACK + 1)
+        mismatches = [_cycle_mismatch(channels, needed, first, stop, candidate, half_cycle) for candidate in shifts]
+        best = int(np.argmin(mismatches))
+        if mismatches[best] <= _MAX_MISMATCH:
             for values in channels.values():
-                _copy(values, first, stop, near[best])
+                _copy_shifted(values, first, stop, shifts[best])
             return True
     return False
 
 
-def _unlike(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half: int) -> float:
-    """Compute the relative rms difference of the duty beside a gap from that `shift` samples away; inf for unknown."""
-    count = next(iter(channels.values())).size
-    window = slice(max(first - half, -shift, 0), min(stop + half, count - shift, count))
-    if window.start > first - _END or window.stop < stop + _END:
+def _cycle_mismatch(
+    channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
+) -> float:
+    """Compute the relative rms difference between the duty around a gap and `shift` samples away; inf if unknown."""
+    n = next(iter(channels.values())).size
+    # half a cycle on either side of the gap, as far as it exists here and there
+    window = slice(max(first - half_cycle, -shift, 0), min(stop + half_cycle, n - shift, n))
+    if window.start > first - _N_END or window.stop < stop + _N_END:
         return math.inf
     if not all(np.isfinite(channels[name][first + shift : stop + shift]).all() for name in needed):
         return math.inf
-    signals = [channels[name] for name in (("u",) if "u" in needed else chambers_of(needed))]
-    signal = signals[0] - signals[1] if len(signals) == 2 else signals[0]
-    here, there = signal[window], signal[window.start + shift : window.stop + shift]
-    known = np.isfinite(here) & np.isfinite(there)
-    if np.count_nonzero(known) < _END:
+    names = ("u",) if "u" in needed else chambers_of(needed)
+    signal = duty_signal([channels[name] for name in names])
+    around_gap, shifted = signal[window], signal[window.start + shift : window.stop + shift]
+    known = np.isfinite(around_gap) & np.isfinite(shifted)
+    if np.count_nonzero(known) < _N_END:
         return math.inf
-    here, there = here[known] - here[known].mean(), there[known] - there[known].mean()
-    return float(np.sqrt(np.mean((here - there) ** 2))) / max(float(np.std(there)), np.finfo(float).tiny)
+    around_gap, shifted = around_gap[known] - around_gap[known].mean(), shifted[known] - shifted[known].mean()
+    return float(np.sqrt(np.mean((around_gap - shifted) ** 2))) / max(float(np.std(shifted)), np.finfo(float).tiny)
 
 
-def _copy(values: Array, first: int, stop: int, shift: int) -> None:
-    """Set missing values from `first` to `stop` to those `shift` samples away, shifted so that both ends meet."""
-    ends = (slice(first - _END, first), slice(stop, stop + _END))
-    before, after = (_mean(values[end]) - _mean(values[end.start + shift : end.stop + shift]) for end in ends)
-    other = values[first + shift : stop + shift] + np.linspace(before, after, stop - first)
+def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
+    """Fill missing values from `first` to `stop` by those `shift` samples away, offset so that both ends meet."""
+    ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
+    offset_before, offset_after = (
+        _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends
+    )
+    copied = values[first + shift : stop + shift] + np.linspace(offset_before, offset_after, stop - first)
     target = values[first:stop]
-    target[np.isnan(target)] = other[np.isnan(target)]
+    target[np.isnan(target)] = copied[np.isnan(target)]
 
 
-def _line(values: Array, rows: Flags) -> None:
-    """Set the missing values of these rows to straight lines between the known ones."""
+def _fill_by_line(values: Array, rows: Flags) -> None:
+    """Fill the missing values (n,) at the flagged `rows` (n,), in place, by linear interpolation; not at the ends."""
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
     if missing.size and known.size:
@@ -200,11 +209,11 @@ def _line(values: Array, rows: Flags) -> None:
         values[missing] = np.interp(missing, known, values[known])
 
 
-def _spline(values: Array, rows: Flags) -> None:
-    """Set the missing values of these rows to a cubic spline through all others."""
+def _fill_by_spline(values: Array, rows: Flags) -> None:
+    """Fill the missing values (n,) at the flagged `rows` (n,), in place, from a cubic spline through the known ones."""
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
-    if missing.size and known.size > _END:
+    if missing.size and known.size > _N_END:
         values[missing] = CubicSpline(known, values[known])(missing)

@@ -1,8 +1,8 @@
-"""Stale samples: a slow channel, or a logger that found nothing new, repeats the sample before.
+"""Stale samples: a slow channel, or a logger that got no new value, repeats the previous sample.
 
-A repeated sample is no reading. It is replaced by the straight line between the fresh ones, so that a channel that
-repeats its samples for 0.1 s is not 0.05 s late on average. A quantised channel at rest repeats its value as well: only
-runs that begin and end with more than a quantisation step tell how long a channel repeats. The inspection calls it.
+Repeated samples are no readings. They are interpolated between fresh ones; otherwise a channel that repeats each sample
+for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value: the holding period is
+therefore estimated from runs that begin and end with more than a quantisation step. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import find_holds, quantum, runs_of, stuck
+from sealscope.recordings.motion import estimate_quantum, find_holds, find_runs, find_stuck
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.storage.toml_file import priors_of
 
-_PRIORS = priors_of("sealscope.recordings")["stale"]
-#: Largest share of a recording in which a pressure may be stuck, and is taken as missing there.
-MOST_STUCK: float = _PRIORS["stuck"]
-#: A jump of fewer quantisation steps may be a slow change.
-_JUMP = 1.5
-#: Samples at the beginning that tell how long a channel repeats its own.
-_TOLD = 2**18
+_PRIORS = RECORDINGS.stale
+#: Largest fraction of stuck samples of a pressure: up to it they are missing, beyond it the channel is not used.
+MAX_STUCK_FRACTION: float = _PRIORS.stuck
+#: Smallest jump, in quantisation steps; a smaller one may be a slow change.
+_MIN_JUMP = 1.5
+#: Samples from the beginning from which the holding period is estimated.
+_N_ESTIMATE = 2**18
 #: Longest run of repeated rows.
-_LONGEST_REPEAT = 3
+_MAX_REPEAT = 3
 
 
-def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Replace repeated samples by lines between fresh ones; return the recording and what was found.
+def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Interpolate repeated samples between fresh ones; return the recording and the findings.
 
-    A channel repeats its samples where most runs of equal values, among those that jumps begin and end, last alike. A
-    row is repeated where all channels stay the same for up to three rows and one of them jumps before and after.
+    A channel holds its samples if most runs of equal values, among those between jumps, have the same length. A row is
+    repeated if all channels stay the same for up to three rows and one of them jumps before and after.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
-    repeated = _repeated_rows([recording[name] for name in names])
+    repeated = _flag_repeated_rows([recording[name] for name in names])
     rows = np.flatnonzero(repeated)
     if rows.size:
         text = f"{rows.size} rows repeat the one before: left out"
@@ -46,8 +46,8 @@ def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding
     for name in names:
         values = recording[name]
         stale = repeated & np.isfinite(values)
-        if (period := holding_period(recording.t, values)) is not None:
-            stale = stale | _held_samples(recording.t, values, period)
+        if (period := estimate_holding_period(recording.t, values)) is not None:
+            stale = stale | _flag_held(recording.t, values, period)
             text = f"{name}: repeats each sample for {period:.2g} s: lines between the fresh ones"
             findings.append(
                 Finding("held_samples", "note", name, int(np.count_nonzero(stale)), float(recording.t[0]), text)
@@ -58,125 +58,132 @@ def without_stale_samples(recording: Recording) -> tuple[Recording, list[Finding
     return (replace(recording, channels=channels) if findings else recording), findings
 
 
-def stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
-    """Return the rows (n,) in which a pressure stays the same while something else moves; one at rest is no defect."""
-    values, rows = recording[name], np.zeros(len(recording), dtype=bool)
-    known = np.flatnonzero(np.isfinite(values))
-    references = [recording[other] for other in (*CHAMBERS, "x", "theta") if other != name and other in recording]
-    for first, length in stuck(values[known]).tolist():
-        held = known[first : first + length]
-        at_an_end = values[held[0]] in (np.nanmin(values), np.nanmax(values))  # there it is cut off
-        if not at_an_end and (not references or any(_moves_in(other, held) for other in references)):
-            rows[held] = True
-    return rows
+def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
+    """Flag the rows (n,) in which a pressure is stuck while the machine moves; at rest it is no defect.
 
-
-def frozen_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Return the rows (n,) in which a logger repeats its last row: all channels stay the same for long.
-
-    Both chamber pressures stop together and go on together, for longer than a reading may be held
-    (`motion.find_holds`), at what they were, and something leaps at the end. A machine at rest goes on from there.
+    The machine's motion is taken from the position, else from the pump's angle, else from the other pressures; these
+    come last, as they may change while valves hold the cylinder, or hardly change while a stiff load moves.
     """
-    rows = np.zeros(len(recording), dtype=bool)
+    values, flags = recording[name], np.zeros(len(recording), dtype=bool)
+    known = np.flatnonzero(np.isfinite(values))
+    motion_channels = next(((channel,) for channel in ("x", "theta") if channel in recording), CHAMBERS)
+    references = [recording[other] for other in motion_channels if other != name and other in recording]
+    for first, length in find_stuck(values[known]).tolist():
+        stuck_run = known[first : first + length]
+        is_clipped = values[stuck_run[0]] in (np.nanmin(values), np.nanmax(values))
+        if not is_clipped and (not references or any(_moves_in(other, stuck_run) for other in references)):
+            flags[stuck_run] = True
+    return flags
+
+
+def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
+    """Flag the rows (n,) in which a logger repeats its last row for long.
+
+    All channels are constant; both chamber pressures stop and continue together, after longer than a reading may be
+    held (`motion.find_holds`), without a jump at the beginning and with one at the end. A machine at rest continues
+    smoothly.
+    """
+    flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
-    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS["runs"]:
-        return rows
-    holds = [runs_of(find_holds(values, recording.rate).flags) for values in pressures]
+    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:
+        return flags
+    holds = [find_runs(find_holds(values, recording.rate).flags) for values in pressures]
     channels = list(recording.channels.values())
     for first, length in holds[0].tolist():
         stop = first + length
         begins, ends = holds[1][:, 0], holds[1].sum(axis=1)
-        together = np.any((np.abs(begins - first) <= _LONGEST_REPEAT) & (np.abs(ends - stop) <= _LONGEST_REPEAT))
-        inner = slice(first + _LONGEST_REPEAT, stop - _LONGEST_REPEAT)
+        coincide = np.any((np.abs(begins - first) <= _MAX_REPEAT) & (np.abs(ends - stop) <= _MAX_REPEAT))
+        inner = slice(first + _MAX_REPEAT, stop - _MAX_REPEAT)
         if (
-            together
+            coincide
             and first > 1
             and stop < len(recording)
-            and all(_is_constant(values[inner]) for values in channels)
-            and not any(_leaps(values, first) for values in channels)
-            and any(_leaps(values, stop) for values in channels)
+            and all(_is_constant_or_missing(values[inner]) for values in channels)
+            and not any(_jumps_at(values, first) for values in channels)
+            and any(_jumps_at(values, stop) for values in channels)
         ):
-            rows[first:stop] = True
-    return rows
+            flags[first:stop] = True
+    return flags
 
 
-def _is_constant(values: Array) -> bool:
+def _is_constant_or_missing(values: Array) -> bool:
+    """Test whether all values are equal, or all are missing."""
     return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
 
 
-def _leaps(values: Array, row: int) -> bool:
-    """Test whether a channel changes about a sample by more than it does elsewhere between samples."""
-    change = np.abs(values[min(row + _LONGEST_REPEAT, len(values) - 1)] - values[max(row - _LONGEST_REPEAT - 1, 0)])
-    usual = np.nanquantile(
-        np.abs(values[2 * _LONGEST_REPEAT + 1 :] - values[: -2 * _LONGEST_REPEAT - 1]), _PRIORS["leap"]
-    )
-    return bool(change > usual)
+def _jumps_at(values: Array, row: int) -> bool:
+    """Test whether a channel changes across a row by more than a high quantile of its changes elsewhere."""
+    change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
+    usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
+    return bool(change > usual_change)
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Test whether a channel moves in the given rows by more than a share of its range."""
-    whole, part = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
-    least: float = _PRIORS["moves"]
-    return bool(part.size and np.ptp(part) > least * np.ptp(whole))
+    """Test whether a channel moves in the given rows by more than a fraction of its range."""
+    all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
+    min_fraction: float = _PRIORS.moves
+    return bool(values_in_rows.size and np.ptp(values_in_rows) > min_fraction * np.ptp(all_values))
 
 
-def _runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the first index of each run of equal values (n,), and which runs jump at both ends."""
+def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Find runs of equal values (n,): the first index of each, and flags for those with jumps at both ends."""
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
-    jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _JUMP * quantum(values)
+    jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _MIN_JUMP * estimate_quantum(values)
     return starts, np.r_[False, jumps] & np.r_[jumps, False]
 
 
-def holding_period(t: Array, values: Array) -> float | None:
-    """Estimate how long [s] a channel (n,) repeats each sample; None where it is nothing to mend."""
-    t, values = t[:_TOLD], values[:_TOLD]
+def estimate_holding_period(t: Array, values: Array) -> float | None:
+    """Estimate how long [s] a channel (n,) repeats each sample; None if it does not, or too briefly to matter."""
+    t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
-    if np.count_nonzero(known) < _PRIORS["runs"]:
+    if np.count_nonzero(known) < _PRIORS.runs:
         return None
     t, values = t[known], values[known]
-    starts, jumps = _runs(values)
+    starts, is_bounded = _find_equal_runs(values)
     ends = np.r_[starts[1:], values.size]
-    lengths, durations = (ends - starts)[jumps], (t[np.minimum(ends, t.size - 1)] - t[starts])[jumps]
-    if lengths.size < _PRIORS["runs"] or np.median(lengths) < 2:
+    lengths, durations = (ends - starts)[is_bounded], (t[np.minimum(ends, t.size - 1)] - t[starts])[is_bounded]
+    if lengths.size < _PRIORS.runs or np.median(lengths) < 2:
         return None
-    usual = float(np.median(durations))
-    regular = np.abs(durations / usual - 1.0) <= _PRIORS["spread"]
-    period = float(durations[regular].mean())
-    return period if period >= _PRIORS["shortest"] and np.mean(regular) >= _PRIORS["share"] else None
+    median_duration = float(np.median(durations))
+    is_regular = np.abs(durations / median_duration - 1.0) <= _PRIORS.spread
+    period = float(durations[is_regular].mean())
+    return period if period >= _PRIORS.shortest and np.mean(is_regular) >= _PRIORS.share else None
 
 
-def _held_samples(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
+def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat an older one, for a channel sampled every `period` [s]."""
     known = np.flatnonzero(np.isfinite(values))
-    starts, _ = _runs(values[known])
+    starts, _ = _find_equal_runs(values[known])
     times = t[known]
-    begun = times[starts][np.searchsorted(starts, np.arange(known.size), side="right") - 1]
-    turn = np.floor((times - begun) / period + 1e-6)
-    stale = np.zeros(t.size, dtype=bool)
-    stale[known[1:]] = (turn[1:] == turn[:-1]) & (begun[1:] == begun[:-1])
-    return stale
+    run_start = times[starts][np.searchsorted(starts, np.arange(known.size), side="right") - 1]
+    period_index = np.floor((times - run_start) / period + 1e-6)  # 1e-6: rounding of the times
+    is_held = np.zeros(t.size, dtype=bool)
+    # a sample in the same run and period as the one before repeats it
+    is_held[known[1:]] = (period_index[1:] == period_index[:-1]) & (run_start[1:] == run_start[:-1])
+    return is_held
 
 
-def _repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Flag the rows (n,) that repeat the row before in all moving channels."""
+def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
+    """Flag the rows (n,) in which all moving channels repeat the previous row."""
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
-    if not moving or moving[0].size < _PRIORS["runs"]:
+    if not moving or moving[0].size < _PRIORS.runs:
         return np.zeros(channels[0].size if channels else 0, dtype=bool)
     equal = [values[1:] == values[:-1] for values in moving]
-    same = np.r_[False, np.all(equal, axis=0)]
-    chance = float(np.prod([np.mean(flags) for flags in equal]))
-    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(np.int8)))
-    first, stop = edges[::2], edges[1::2]
-    inner = (stop - first < _LONGEST_REPEAT) & (first > 1) & (stop < same.size)
-    first, stop = first[inner], stop[inner]
+    is_same = np.r_[False, np.all(equal, axis=0)]
+    p_equal = float(np.prod([np.mean(flags) for flags in equal]))  # if channels repeat independently
+    runs = find_runs(is_same)
+    first, stop = runs[:, 0], runs.sum(axis=1)
+    is_short = (stop - first < _MAX_REPEAT) & (first > 1) & (stop < is_same.size)
+    first, stop = first[is_short], stop[is_short]
     jumps = np.zeros(first.size, dtype=bool)
     for values in moving:
-        least = _JUMP * quantum(values[np.isfinite(values)])
-        jumps |= (np.abs(values[first - 1] - values[first - 2]) > least) & (
-            np.abs(values[stop] - values[stop - 1]) > least
+        min_jump = _MIN_JUMP * estimate_quantum(values[np.isfinite(values)])
+        jumps |= (np.abs(values[first - 1] - values[first - 2]) > min_jump) & (
+            np.abs(values[stop] - values[stop - 1]) > min_jump
         )
-    repeated = np.zeros(same.size, dtype=bool)
-    if np.count_nonzero(jumps) < _PRIORS["repeats"] * max(chance, _PRIORS["fewest"]) * same.size:
+    repeated = np.zeros(is_same.size, dtype=bool)
+    # no more than expected by chance
+    if np.count_nonzero(jumps) < _PRIORS.repeats * max(p_equal, _PRIORS.fewest) * is_same.size:
         return repeated
     for begin, end in zip(first[jumps].tolist(), stop[jumps].tolist(), strict=True):
         repeated[begin:end] = True

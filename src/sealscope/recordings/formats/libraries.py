@@ -1,4 +1,4 @@
-"""Libraries that read a format: loaded when they are needed, and silent, as messages are the caller's."""
+"""Import libraries that read a format when they are needed, and silence them: messages are the caller's task."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ from types import ModuleType
 from sealscope.errors import MissingExtra
 
 
-def library(module: str, reads: str, package: str) -> ModuleType:
-    """Import a library of the extra `io`, silent but for handlers that a program has set up, or raise MissingExtra."""
-    fresh = module not in sys.modules
+def import_library(module: str, purpose: str, package: str) -> ModuleType:
+    """Import a library of the extra `io` and silence its warnings and log; raise MissingExtra if it is not installed.
+
+    Handlers that a program has set up before stay.
+    """
+    is_first = module not in sys.modules
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what its own libraries will change one day
-            loaded = import_module(module)
+            warnings.simplefilter("ignore")  # deprecations in its own libraries
+            library = import_module(module)
     except ImportError as error:
-        raise MissingExtra(f"{reads} needs {package}: pip install 'sealscope[io]'") from error
-    for name in list(logging.root.manager.loggerDict) if fresh else ():
+        raise MissingExtra(f"{purpose} needs {package}: pip install 'sealscope[io]'") from error
+    for name in list(logging.root.manager.loggerDict) if is_first else ():
         if name.partition(".")[0] == module:
             logging.getLogger(name).handlers[:] = [logging.NullHandler()]
-    return loaded
+    return library

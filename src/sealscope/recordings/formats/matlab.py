@@ -1,6 +1,6 @@
 """MATLAB files of any version, with mat-io: vectors, matrices, structs, tables, timetables, timeseries, Simulink logs.
 
-A file is walked as a tree of structs and objects (`structured.tree`).
+A file is read as a tree of structs and objects (`structured.tree`).
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.columns import Wanted
+from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import entries, stated_rate
-from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.netcdf import refuse_elsewhere
-from sealscope.recordings.formats.structured.tree import entry_of, series_in
-from sealscope.recordings.formats.table import MAX_VALUES, RecordingFields, Series, table_of, uniform
+from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.libraries import import_library
+from sealscope.recordings.formats.netcdf import check_internal
+from sealscope.recordings.formats.structured.tree import format_remark, iter_series
+from sealscope.recordings.formats.table import MAX_VALUES, RecordingFields, Series, build_fields, uniform_clock
 
-#: Group of the streams, by which such a file is known; what refers to them.
+#: HDF5 groups of a file of signal streams: the streams, and the references to them.
 _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Test whether a file that begins with `head` is a MATLAB 4 file: five integers, and a name ending in zero."""
-    for machine, order in enumerate("<>" if len(head) > 20 else ""):
+    """Test whether `head` begins a MATLAB 4 file: five integers, and a name that ends in a zero byte."""
+    for machine, order in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
         if (
             kind // 1000 == machine
-            and kind // 100 % 10 == 0
+            and kind // 100 % 10 == 0  # reserved
             and kind // 10 % 10 <= 5  # precision
             and kind % 10 <= 2  # storage
             and min(rows, columns) >= 0
@@ -46,30 +46,30 @@ def is_matlab_4(head: bytes) -> bool:
     return False
 
 
-def read_matlab(path: Path, request: Wanted) -> RecordingFields:
-    """Read the wanted series of a MATLAB file; raise MissingExtra where mat-io is absent."""
+def read_matlab(path: Path, request: Request) -> RecordingFields:
+    """Read the requested series of a MATLAB file; raise MissingExtra without mat-io."""
     import h5py
 
     size = path.stat().st_size
     if h5py.is_hdf5(path):  # version 7.3
         with h5py.File(path, "r") as file:
-            _refuse_elsewhere(file)
+            _check_links(file)
             if _STREAMS in file:
-                return table_of(list(_streamed_series(file)), request, "MATLAB", size=size)
-    matio = library("matio", "a MATLAB file", "mat-io")
+                return build_fields(list(_read_streams(file)), request, "MATLAB", size=size)
+    matio = import_library("matio", "a MATLAB file", "mat-io")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on classes that have no meaning here
+        warnings.simplefilter("ignore")  # about classes without a Python equivalent
         for name, (shape, *_) in matio.whosmat(path).items():
             if np.prod([float(length) for length in shape]) > MAX_VALUES:
                 raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
-        held = matio.load_from_mat(path, add_table_attrs=True)
-    values = {name: value for name, value in held.items() if not name.startswith("__")}
-    remarks = entries((name, entry_of(value)) for name, value in values.items())
-    return table_of(list(series_in(values)), request, "MATLAB", remarks, stated_rate(remarks), size=size)
+        variables = matio.load_from_mat(path, add_table_attrs=True)
+    values = {name: value for name, value in variables.items() if not name.startswith("__")}
+    remarks = collect_remarks((name, format_remark(value)) for name, value in values.items())
+    return build_fields(list(iter_series(values)), request, "MATLAB", remarks, stated_rate(remarks), size=size)
 
 
-def _refuse_elsewhere(file: Any) -> None:
-    """Raise InputError where an HDF5 file refers to other files."""
+def _check_links(file: Any) -> None:
+    """Raise InputError if an HDF5 file refers to other files."""
     import h5py
 
     folders = [file]
@@ -83,11 +83,14 @@ def _refuse_elsewhere(file: Any) -> None:
             if isinstance(item, h5py.Group):
                 folders.append(item)
             elif isinstance(item, h5py.Dataset):
-                refuse_elsewhere(name, item)
+                check_internal(name, item)
 
 
-def _streamed_series(file: Any) -> Iterator[Series]:
-    """Yield the signals of doubles; `CompressedTime` holds first time, step and count, `DataR2` the stream's number."""
+def _read_streams(file: Any) -> Iterator[Series]:
+    """Yield the streamed signals of doubles.
+
+    `CompressedTime` contains first time, step and count, `DataR2` the number of the stream.
+    """
     import h5py
 
     for item in file.get(_REFERENCES, {}).values():
@@ -99,17 +102,18 @@ def _streamed_series(file: Any) -> Iterator[Series]:
         if stream is None or times.size != 3 or stream["#sampleSize#"][0] != np.dtype(np.float64).itemsize:
             continue
         data, count = stream["#data#"], int(stream["#length#"][0])
-        name, unit = (_utf16(item.get(path)) for path in ("Name", "Values/DataUnits/Value"))
-        clock = uniform("stream", count, float(times[1]), float(times[0]))
-        yield Series("", Label.parse(name.strip("<>"), unit or None), count, partial(_doubles, data, count), clock)
+        name, unit = (_decode_utf16(item.get(path)) for path in ("Name", "Values/DataUnits/Value"))
+        clock = uniform_clock("stream", count, float(times[1]), float(times[0]))
+        yield Series("", Label.parse(name.strip("<>"), unit or None), count, partial(_read_doubles, data, count), clock)
 
 
-def _utf16(characters: Any) -> str:
-    """Return a MATLAB text, which is an array of UTF-16; empty where there is none."""
+def _decode_utf16(characters: Any) -> str:
+    """Decode a MATLAB text, an array of UTF-16; empty if there is none."""
     if characters is None or characters.dtype != np.uint16:
         return ""
     return np.ravel(characters[()]).tobytes().decode("utf-16-le", errors="replace")
 
 
-def _doubles(data: Any, count: int) -> Array:
+def _read_doubles(data: Any, count: int) -> Array:
+    """Read the first `count` doubles of a data set of bytes."""
     return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)

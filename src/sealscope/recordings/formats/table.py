@@ -1,11 +1,10 @@
-"""One way from a file to a recording: series with units, of which a map chooses, on one clock, in SI units.
+"""Build a recording from the series in a file: choose channels, bring them to one clock, convert to SI units.
 
-A reader of a format lists the series of a file; `table_of` makes the fields of a recording of them. A file may hold
-groups of series that are sampled at different rates. A name that occurs in several groups stands for the series in the
-group that holds most channels. Channels of different clocks are brought to the clock of the chamber pressures: a slower
-one is interpolated linearly, a faster one is averaged over the base's intervals, and nothing is put into a gap of a
-series or before its first and after its last sample. In a long table, where a row is a sample of one channel, each name
-is a series.
+A reader of a format lists the series of a file; `build_fields` turns them into the fields of a recording. Groups of
+series may have different sampling rates. A name that occurs in several groups means the series in the group with most
+channels. Channels are brought to the clock of the chamber pressures: slower ones by linear interpolation, faster ones
+by averages over its intervals. Gaps of a series, and the time before its first and after its last sample, stay empty.
+In a long table, where a row is a sample of one channel, each name is a series.
 """
 
 from __future__ import annotations
@@ -22,53 +21,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
+from sealscope.paragraphs import format_count, join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
-from sealscope.recordings.formats.cells import MOST_WORDS, numbers
-from sealscope.recordings.formats.columns import ColumnMap, Wanted, choose_columns, counted, listed
+from sealscope.recordings.formats.cells import MAX_WORD_FRACTION, parse_numbers
+from sealscope.recordings.formats.columns import ColumnMap, Request, choose_columns
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import exported_from
+from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
-from sealscope.recordings.formats.headings.split_time import joined_time
+from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import LogTime, falling, iso_moment, nominal_rate, stamps, time_base
+from sealscope.recordings.formats.timebase import (
+    TimeState,
+    is_falling,
+    iso_moment,
+    nominal_rate,
+    parse_stamps,
+    time_base,
+)
 from sealscope.units import to_si
 
-#: Most values that one file may hold in the columns used: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
+#: Most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
 MAX_VALUES = 2**28
-#: A table up to this many bytes may be a fill value alone; a larger one at most this many times its file.
-_SMALL, _EXPANSION = 2**26, 4096
-_MOST_TEXTS, _WIDEST_TEXT, _MOST_TEXT = 2**22, 400, 2**29
+#: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
+_MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
+#: Most texts in a column, most bytes of one, and most bytes of all.
+_MAX_TEXTS, _MAX_TEXT_WIDTH, _MAX_TEXT_BYTES = 2**22, 400, 2**29
 FORMAT_VERSION = 1
-#: The clock of a file among the columns: what stands for it where no column is mapped to `t`.
+#: Label of a file's own clock, added to the columns if none of them is the time.
 _CLOCK_LABEL = Label("t [s]", "t", "s")
-#: Channels whose clock is the base, most telling first.
-_BASE = ("p_A", "p_B", "p_1", "p_2")
-#: A slower series is not interpolated between samples that are this many of its usual intervals apart.
-_GAP = 3.0
-#: Clocks that differ by less than this share of an interval are one.
-_SAME = 1e-2
-#: The rate that a recording had when it was written is kept where the time stamps agree with it to this share.
+#: Channels whose clock all others are brought to, in order of preference.
+_BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
+#: Longest interval of a slower series that is interpolated, in median intervals.
+_MAX_INTERVAL = 3.0
+#: Largest difference of equal clocks, as a fraction of an interval.
+_SAME_CLOCK = 1e-2
+#: Relative difference up to which the written rate of a recording takes precedence over that of its time stamps.
 _SAME_RATE = 0.01
-_MOST_NAMES = 4096
-#: Reads columns, each as "numbers", "any" numbers with words among them, which are infinite, a "time" or "texts",
-#: before their values are asked for, with the column of the date beside the time; returns lines for the history.
+#: Most names in a long table.
+_MAX_NAMES = 4096
+#: Reads columns before their values are used, and returns lines for the history. Arguments: column -> kind ("numbers";
+#: "any": numbers, words as inf; "time"; "texts"), and the column of the date that belongs to the time, or None.
 Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 
 @dataclass(frozen=True)
 class Clock:
-    """When samples were taken: `key` is equal for series sampled together; `read` gives times (n,) [s] and moment 0."""
+    """The times of samples.
+
+    `key` is equal for series sampled together; `read` returns times (n,) [s] and the time stamp of 0 s, or None.
+    """
 
     key: Hashable
     read: Callable[[], tuple[Array, np.datetime64 | None]]
+
+    @classmethod
+    def of_times(cls, key: Hashable, t: Array, start: np.datetime64 | None = None) -> Clock:
+        """Make a clock with the times `t` (n,) [s] after `start`."""
+        return cls(key, lambda: (t, start))
 
 
 @dataclass(frozen=True)
 class Series:
     """A named series of a file.
 
-    `group`: what the file calls its group, or an empty text; `count`: samples; `values`: reads the samples (n,):
-    doubles, text or datetime64; `clock`: None where the file does not say when they were taken.
+    `group`: name of its group, or empty; `count`: number of samples; `values`: reads the samples (n,): doubles, texts
+    or datetime64; `clock`: None if the file does not state when they were taken.
     """
 
     group: str
@@ -79,17 +96,22 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Name with the group before it, as a map may call it."""
+        """Name with the group before it, as a map may contain it."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 
-def uniform(key: Hashable, count: int, step: float, first: float = 0.0, start: np.datetime64 | None = None) -> Clock:
-    """Return the clock of `count` samples every `step` [s], the first at `first` [s] after `start`."""
+def uniform_clock(
+    key: Hashable, count: int, step: float, first: float = 0.0, start: np.datetime64 | None = None
+) -> Clock:
+    """Make the clock of `count` samples every `step` [s], the first at `first` [s] after `start`.
+
+    `key`: with the other arguments, the identity by which series share the clock.
+    """
     return Clock((key, count, step, first, start), lambda: (first + step * np.arange(count, dtype=np.float64), start))
 
 
 class RecordingFields(NamedTuple):
-    """The arguments of a recording, in their order, and the `kind` of the table, in words."""
+    """The arguments of a recording in order, and the `kind` of its file, in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -100,13 +122,13 @@ class RecordingFields(NamedTuple):
     kind: str
 
     def with_note(self, line: str) -> RecordingFields:
-        """Return the fields with a line at the beginning of the history."""
+        """Add a line at the beginning of the history."""
         return self._replace(history=(line, *self.history))
 
 
-def table_of(
+def build_fields(
     series: Sequence[Series],
-    request: Wanted,
+    request: Request,
     kind: str,
     remarks: Mapping[str, str] | None = None,
     rate: float | None = None,
@@ -115,54 +137,58 @@ def table_of(
     prepare: Prepare | None = None,
     size: int | None = None,
 ) -> RecordingFields:
-    """Build the fields of a recording from the requested series; raise InputError where they do not fit together.
+    """Build the fields of a recording from the requested series; raise InputError if they do not fit together.
 
-    `kind`: the format, in words; `remarks`: the file's entries about the recording; `rate` [Hz]: the rate it states,
-    for series without a clock; `description`: what Sealscope wrote beside the samples; `prepare`: reads all columns
-    that are used together; `size`: bytes of a file that may be compressed.
+    `kind`: the format, in words; `remarks`: the file's remarks on the recording; `rate` [Hz]: stated by the file, for
+    series without a clock; `description`: rate, provenance and history written by Sealscope; `prepare`: reads all used
+    columns together; `size`: bytes of a file that may be compressed.
     """
-    members, notes = _distinct(_timed(series))
-    labels = [member.label for member in members]
-    clocked = any(member.clock is not None for member in members) and not any(label.name == "t" for label in labels)
+    candidates, notes = _make_names_unique(_assign_clocks(series))
+    labels = [member.label for member in candidates]
+    uses_clock = any(member.clock is not None for member in candidates) and not any(
+        label.name == "t" for label in labels
+    )
     try:
-        choice = choose_columns([*labels, _CLOCK_LABEL] if clocked else labels, request, rate)
+        choice = choose_columns([*labels, _CLOCK_LABEL] if uses_clock else labels, request, rate)
     except InputError:
-        if (long := _long_columns([member.label for member in series])) is None:
+        if (long_columns := _find_long_columns([member.label for member in series])) is None:
             raise
-        pivoted, more = _pivoted(series, long, prepare)
-        table = table_of(pivoted, request, kind, remarks)
-        return table._replace(history=(*more, *table.history))
-    kinds = {column: how for column, how in choice.columns.items() if column < len(members)}
-    chosen = {column: members[column] for column in kinds}
+        channel_series, more_notes = _pivot_long_table(series, long_columns, prepare)
+        table = build_fields(channel_series, request, kind, remarks)
+        return table._replace(history=(*more_notes, *table.history))
+    kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}
+    members = {column: candidates[column] for column in kinds}
     if prepare is not None:
         notes += prepare(kinds, choice.date)
-    check_size(max(member.count for member in chosen.values()), len(choice.columns), size)
-    if choice.time == len(members):
-        columns, more = _on_one_clock(choice, chosen)
-        return converted(choice, columns, kind, request, [*notes, *more], remarks, description)
-    last = chosen[[*kinds][-1]]
-    for member in chosen.values():
-        if member.count != last.count:
-            raise InputError(
-                f"{member.path} must have as many samples as {last.path} ({last.count}), got {member.count}"
-            )
-    columns = {column: _samples(chosen[column], how == "time") for column, how in kinds.items()}
-    return converted(choice, columns, kind, request, notes, remarks, description)
+    check_size(max(member.count for member in members.values()), len(choice.columns), size)
+    if choice.time == len(candidates):  # the file's own clock, not a column
+        columns, more_notes = _align_clocks(choice, members)
+        notes = [*notes, *more_notes]
+        return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
+    time_series = members[[*kinds][-1]]  # the last column, whether it is a time or not
+    for member in members.values():
+        if member.count != time_series.count:
+            required = f"{time_series.path} ({time_series.count})"
+            raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
+    columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
+    return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
 
 
-def converted(
+def convert_columns(
     choice: ColumnMap,
     columns: Mapping[int, NDArray[Any]],
     kind: str,
-    request: Wanted,
+    request: Request,
     notes: Sequence[str] = (),
+    *,
     remarks: Mapping[str, str] | None = None,
     description: Mapping[str, Any] | None = None,
-    log: LogTime | None = None,
+    state: TimeState | None = None,
 ) -> RecordingFields:
     """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording.
 
-    `log`: what the parts before this one tell of the time, where it is one of a log.
+    `kind`, `remarks`, `description`: as for `build_fields`; `state`: for a part of a text log, that after the last
+    part, which is updated.
     """
     label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
     count = len(next(iter(columns.values())))
@@ -174,49 +200,58 @@ def converted(
         time = columns[choice.time]
         if choice.parts:
             time = _join_time(choice, columns, label, notes)
-        if choice.time == choice.date and not _has_clock(time):
+        if choice.time == choice.date and not _has_time_of_day(time):
             raise InputError(
                 "a recording must have a time column such as t [s] or be given a rate, "
                 f"got dates alone in column {label.whole}"
             )
-        if description is None and falling(time):
+        if description is None and is_falling(time):
             time, columns = time[::-1], {column: cells[::-1] for column, cells in columns.items()}
             notes.append("rows begin with the last sample: taken in the order of time")
-    channels, units, in_log = {}, {}, {}
-    for name, formula in choice.channels.items():
-        unit = formula.unit or COUNTS
-        in_log[name] = "" if unit in (COUNTS, CHANNEL_UNITS[name]) else unit
-        units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
-        channels[name] = to_si(formula.values(columns), unit, units[name], name=name)
-        if not any(channels[name] is cells for cells in columns.values()):
-            channels[name].setflags(write=False)  # made here: a recording takes it as it is
+    channels, units, log_units = _convert_channels(choice, columns)
     if label is None:
         assert choice.rate is not None
         t, rate = np.arange(count) / choice.rate, choice.rate
     elif description is not None and not request.infers_rate:
         t, rate = time, description["rate"]
     else:
-        t, rate, start, more = time_base(time, label.unit, label.whole, choice.rate, log)
-        notes += more
-        if not start and (begin := exported_from(remarks)) is not None:
-            start = {"start": iso_moment(begin)}
+        t, rate, start, time_notes = time_base(time, label.unit, label.whole, choice.rate, state)
+        notes += time_notes
+        if not start and (scope_begin := scope_start(remarks)) is not None:
+            start = {"start": iso_moment(scope_begin)}
         if description is not None and abs(rate / description["rate"] - 1.0) <= _SAME_RATE:
             rate = description["rate"]
-    if description is not None:
+    if description is not None:  # a recording that Sealscope has written states its provenance itself
         return RecordingFields(
             t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
         )
     details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
-    details |= {"unused": list(choice.unused), "log_units": {name: unit for name, unit in in_log.items() if unit}}
+    details |= {"unused": list(choice.unused), "log_units": log_units}
     provenance = {key: value for key, value in details.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 
 
+def _convert_channels(
+    choice: ColumnMap, columns: Mapping[int, NDArray[Any]]
+) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
+    """Convert the channels to SI units or counts; return values, units and, where they differ, units in the log."""
+    channels, units, log_units = {}, {}, {}
+    for name, formula in choice.channels.items():
+        unit = formula.unit or COUNTS
+        units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
+        if unit != units[name]:
+            log_units[name] = unit
+        channels[name] = to_si(formula.values(columns), unit, units[name], name=name)
+        if not any(channels[name] is cells for cells in columns.values()):
+            channels[name].setflags(write=False)  # so that the recording does not copy it
+    return channels, units, log_units
+
+
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
-    """Return the time that several columns hold, and add a line to the notes."""
+    """Combine the columns that form the time, or return the time column if they do not; add a line to the notes."""
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
-    time = joined_time(columns[choice.time], parts, label.unit)
+    time = combine_time_parts(columns[choice.time], parts, label.unit)
     if time is not None:
         notes.append(f"time joined from {label.whole} and its parts: {', '.join(parts)}")
         return time
@@ -229,121 +264,133 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
     return columns[choice.time]
 
 
-def _has_clock(time: NDArray[Any]) -> bool:
-    """Test whether a column of dates, taken for the time, holds any with a time of the day."""
+def _has_time_of_day(time: NDArray[Any]) -> bool:
+    """Test whether any value of a column of dates, used as the time, has a time of day."""
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
 
-def _timed(series: Sequence[Series]) -> list[Series]:
-    """Give series without a clock that of their group's times, and one called `data` or `value` the group's name."""
-    times: dict[str, Series] = {}
+def _assign_clocks(series: Sequence[Series]) -> list[Series]:
+    """Give series without a clock that of their group's time series, and remove the time series if there are several.
+
+    A series called `data` or `value` that is alone in its group gets the group's name.
+    """
+    time_series: dict[str, Series] = {}
     for member in series:
         if member.clock is None and is_time(member.label):
-            times.setdefault(member.group, member)
-    times = times if len(times) > 1 else {}
-    members = [member for member in series if member is not times.get(member.group)]
-    held = Counter(member.group for member in members)
+            time_series.setdefault(member.group, member)
+    time_series = time_series if len(time_series) > 1 else {}  # a single one is the time column of all
+    members = [member for member in series if member is not time_series.get(member.group)]
+    group_sizes = Counter(member.group for member in members)
     result = []
     for member in members:
-        group, label, time = member.group, member.label, times.get(member.group)
-        if label.name.casefold() in WORDS["generic"] and group and held[group] == 1:
-            named = Label.parse(group.rpartition("/")[2], label.unit)
-            member = replace(member, label=replace(named, whole=label.whole))  # noqa: PLW2901
+        group, label, time = member.group, member.label, time_series.get(member.group)
+        if label.name.casefold() in WORDS["generic"] and group and group_sizes[group] == 1:
+            group_label = Label.parse(group.rpartition("/")[2], label.unit)
+            member = replace(member, label=replace(group_label, whole=label.whole))  # noqa: PLW2901
         if time is not None and member.clock is None and time.count == member.count:
-            clock = Clock(("times of", group), partial(seconds_of_series, time))
+            clock = Clock(("times of", group), partial(read_times, time))
             member = replace(member, clock=clock)  # noqa: PLW2901
         result.append(member)
     return result
 
 
-def seconds_of_series(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
-    """Return the times (n,) [s] of a series of times and their moment 0: that of stamps, else `start`."""
+def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
+    """Read the times (n,) [s] of a time series and the time stamp of 0 s: its first stamp, else `start`."""
     values = time.values()
     if values.dtype.kind == "m":
-        return _in_seconds(values), start
+        return timedelta_seconds(values), start
     known = values[~np.isnat(values) if values.dtype.kind == "M" else np.isfinite(values)]
     if not known.size:
-        what = "a stamp" if values.dtype.kind == "M" else "a number"
-        raise InputError(f"time must have {what} in some row, got none in column {time.label.whole}")
+        expected = "a stamp" if values.dtype.kind == "M" else "a number"
+        raise InputError(f"time must have {expected} in some row, got none in column {time.label.whole}")
     if values.dtype.kind == "M":
-        return _in_seconds(values - known[0]), known[0] if time.group == "" else None
+        return timedelta_seconds(values - known[0]), known[0] if time.group == "" else None
     unit = time.label.unit or unit_of_time(time.label) or "s"
     return to_si(np.asarray(values, dtype=np.float64), unit, "s", name="time"), start
 
 
-def _in_seconds(times: NDArray[Any]) -> Array:
+def timedelta_seconds(times: Any) -> Array:
+    """Convert timedelta64 of any shape to seconds."""
     return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
 
 
-def _distinct(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
-    """Name each series: by its own name where this is clear, by its path where another group's has the name."""
+def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
+    """Give each series a unique name: its label's, or its path if another group has a preferred series of that name.
+
+    Returns the series and lines for the history.
+    """
     if all(member.group == "" for member in series):
         return list(series), []
-    known = {name.casefold() for name in CHANNEL_UNITS}
-    held = Counter(member.group for member in series if member.label.name.casefold() in known)
-    size = Counter[str]()
+    channel_names = {name.casefold() for name in CHANNEL_UNITS}
+    n_channels = Counter(member.group for member in series if member.label.name.casefold() in channel_names)
+    n_samples = Counter[str]()
     for member in series:
-        size[member.group] += member.count
+        n_samples[member.group] += member.count
     names = [member.label.name.casefold() for member in series]
-    first: dict[str, Series] = {}
-    for member in sorted(series, key=lambda member: (-held[member.group], -size[member.group])):
-        first.setdefault(member.label.name.casefold(), member)
-    repeated, notes = {name for name, times in Counter(names).items() if times > 1} & known, []
-    if repeated:
-        group = first[min(repeated)].group
-        other_groups = listed(dict.fromkeys(member.group for member in series if member.group != group), 4)
+    preferred: dict[str, Series] = {}
+    # a name goes to the series in the group with most channels, then with most samples
+    for member in sorted(series, key=lambda member: (-n_channels[member.group], -n_samples[member.group])):
+        preferred.setdefault(member.label.name.casefold(), member)
+    ambiguous, notes = {name for name, count in Counter(names).items() if count > 1} & channel_names, []
+    if ambiguous:
+        group = preferred[min(ambiguous)].group
+        other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
     named = []
     for name, member in zip(names, series, strict=True):
-        shown = member.label.name if first[name] is member else member.path
-        named.append(replace(member, group="", label=Label(member.path, shown, member.label.unit)))
+        unique_name = member.label.name if preferred[name] is member else member.path
+        named.append(replace(member, group="", label=Label(member.path, unique_name, member.label.unit)))
     return named, notes
 
 
-def _samples(series: Series, time: bool = False) -> NDArray[Any]:
-    """Return a series' samples (n,) as doubles, or its `time` as datetime64; in texts, a few words are missing."""
+def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
+    """Read a series' samples (n,) as doubles, or as datetime64 if `as_time`.
+
+    A few words in a column of texts are missing samples; raises InputError for more.
+    """
     values = series.values()
     if values.dtype.kind in "OSU":
         cells = [str(cell) for cell in values.tolist()]
         with suppress(ValueError):
-            if time:
-                return stamps(cells)
-        values, words = numbers(cells, ".", lambda index: f"(row {index + 1}, {series.path})")
-        if len(words) > MOST_WORDS * len(cells):
+            if as_time:
+                return parse_stamps(cells)
+        values, words = parse_numbers(cells, ".", lambda index: f"(row {index + 1}, {series.path})")
+        if len(words) > MAX_WORD_FRACTION * len(cells):
             raise InputError(f"{series.path} must hold numbers, got text")
         return values
-    if values.dtype.kind == "M" and time:
+    if values.dtype.kind == "M" and as_time:
         return values.astype("datetime64[ns]")
     if values.dtype.kind == "m":
-        return _in_seconds(values)
+        return timedelta_seconds(values)
     if values.dtype.kind not in "fiub":
         raise InputError(f"{series.path} must hold numbers, got the type {values.dtype}")
     return np.asarray(values, dtype=np.float64)
 
 
-def _on_one_clock(choice: ColumnMap, chosen: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Return the chosen columns and the time, all on the clock of the chamber pressures, and lines for the history."""
+def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+    """Resample the used columns to the clock of the chamber pressures; return them, with the time, and notes."""
     channel_of = choice.channel_of
-    rank = {channel: number for number, channel in enumerate(_BASE)}
-    ranked = sorted(chosen, key=lambda column: (rank.get(channel_of[column], len(rank)), -chosen[column].count))
-    base = next((chosen[column] for column in ranked if chosen[column].clock is not None), None)
+    rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
+    # the chamber pressures first, then the longest series
+    ranked = sorted(used, key=lambda column: (rank.get(channel_of[column], len(rank)), -used[column].count))
+    base = next((used[column] for column in ranked if used[column].clock is not None), None)
     if base is None or base.clock is None:
-        names = ", ".join(chosen[column].path for column in ranked)
+        names = ", ".join(used[column].path for column in ranked)
         raise InputError(f"a channel must have a clock or be given a rate, got none for {names}")
     t, start = base.clock.read()
     known = np.isfinite(t)
     columns: dict[int, NDArray[Any]] = {}
     notes: list[str] = []
-    for column, member in chosen.items():
-        values = _samples(member)
+    for column, member in used.items():
+        values = _read_samples(member)
         if member.clock is None and member.count != base.count:
             raise InputError(
                 f"{member.path} must have a clock or as many samples as {base.path} ({base.count}), got {member.count}"
             )
         if member.clock is not None and member.clock.key != base.clock.key:
-            values, how = _brought(values, member, t[known], start)
-            notes += [f"{channel_of[column]} {how}"] if how else []
+            values, note = _resample(values, member, t[known], start)
+            notes += [f"{channel_of[column]} {note}"] if note else []
         columns[column] = values if len(values) == np.count_nonzero(known) else values[known]
     t = t[known]
     assert choice.time is not None
@@ -353,16 +400,16 @@ def _on_one_clock(choice: ColumnMap, chosen: dict[int, Series]) -> tuple[dict[in
     return columns, notes
 
 
-def _brought(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
-    """Return the samples of `member` at the times `t` (n,) after `start`, and what was done to them, if anything."""
+def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
+    """Resample `member` to the times `t` (n,) after `start`; return the samples and a note, empty if unchanged."""
     assert member.clock is not None
-    times, begin = member.clock.read()
-    if begin is not None and start is not None:
-        times = times + float((begin - start) / np.timedelta64(1, "ns")) / 1e9
+    times, member_start = member.clock.read()
+    if member_start is not None and start is not None:
+        times = times + timedelta_seconds(member_start - start)
     timed = np.isfinite(times)
     times, values = times[timed], values[timed]
-    steps = np.diff(t)
-    if times.shape == t.shape and np.all(np.abs(times - t) <= _SAME * (np.median(steps) if steps.size else 0.0)):
+    tolerance = _SAME_CLOCK * (np.median(np.diff(t)) if t.size > 1 else 0.0)
+    if times.shape == t.shape and np.all(np.abs(times - t) <= tolerance):
         return values, ""
     present = np.isfinite(values)
     times, values = times[present], values[present]
@@ -370,132 +417,166 @@ def _brought(values: Array, member: Series, t: Array, start: np.datetime64 | Non
         raise InputError(f"the times of {member.path} must increase, got times that do not")
     rate, base_rate = nominal_rate(times), nominal_rate(t)
     if rate > base_rate:
-        how = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
-        return _averaged(values, times, t, 1.0 / base_rate), how
+        note = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
+        return _average(values, times, t, 1.0 / base_rate), note
     result = np.interp(t, times, values, left=np.nan, right=np.nan)
-    after = np.clip(np.searchsorted(times, t), 1, times.size - 1)
-    result[(times[after] - times[after - 1] > _GAP * float(np.median(np.diff(times)))) & (times[after] != t)] = np.nan
+    # no values within long intervals
+    next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
+    interval = times[next_sample] - times[next_sample - 1]
+    result[(interval > _MAX_INTERVAL * float(np.median(np.diff(times)))) & (times[next_sample] != t)] = np.nan
     return result, f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
 
 
-def _averaged(values: Array, times: Array, t: Array, step: float) -> Array:
-    """Average `values` (m,), taken at `times` (m,), over the interval of length `step` around each time of `t` (n,)."""
+def _average(values: Array, times: Array, t: Array, step: float) -> Array:
+    """Average `values` (m,) at `times` (m,) over intervals of length `step` centred at `t` (n,)."""
     begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
     total = np.concatenate(([0.0], np.cumsum(values)))
     with np.errstate(invalid="ignore"):
         return np.asarray((total[end] - total[begin]) / np.where(end > begin, end - begin, np.nan))
 
 
-def _long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
-    """Return the columns of names, values, units and validity of a long table; None for any other table."""
+def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
+    """Find the columns of names, values, units and validity of a long table; None for other tables."""
     names = [label.name.strip().casefold() for label in labels]
-    known = {
+    columns_of_kind = {
         kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()
     }
-    long = {kind: columns[0] for kind, columns in known.items() if columns}
-    if "_field" in names:  # of InfluxDB, beside columns that may be called name
-        long["name"] = names.index("_field")
-    return long if {"name", "value"} <= set(long) else None
+    first_columns = {kind: columns[0] for kind, columns in columns_of_kind.items() if columns}
+    if "_field" in names:  # of InfluxDB, which may also have a column called name
+        first_columns["name"] = names.index("_field")
+    return first_columns if {"name", "value"} <= set(first_columns) else None
 
 
-def _pivoted(
-    series: Sequence[Series], long: Mapping[str, int], prepare: Prepare | None
+@dataclass(frozen=True)
+class _LongTable:
+    """The rows of a long table, from which those of a name are read as a table with one channel, `u` in counts.
+
+    `columns`: cells (n,) of the columns of values, `value`, and of times, `time`.
+    """
+
+    choice: ColumnMap
+    request: Request
+    columns: Mapping[int, NDArray[Any]]
+    value: int
+    time: int
+
+    def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
+        """Make the series of one channel of a long table from its rows (k,), which are read when they are needed.
+
+        `number`: of the channel, whose clock the series has.
+        """
+        read_rows = cache(partial(self._read_rows, label, rows))
+        clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
+        return Series("", label, rows.size, lambda: read_rows().channels["u"], clock)
+
+    def _read_rows(self, label: Label, rows: NDArray[np.intp]) -> RecordingFields:
+        """Convert the rows (k,) that have a time to a recording; raise InputError if too many values are words."""
+        times = self.columns[self.time][rows]
+        timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
+        columns = {column: cells[timed_rows] for column, cells in self.columns.items()}
+        is_word = np.isinf(columns[self.value])  # `Prepare` reads words as inf
+        if np.count_nonzero(is_word) > MAX_WORD_FRACTION * is_word.size:
+            raise InputError(f"{label.whole[:40]} must hold numbers, got text")
+        columns[self.value][is_word] = np.nan
+        return convert_columns(self.choice, columns, "", self.request)
+
+    def _read_clock(self, fields: RecordingFields, rows: NDArray[np.intp]) -> tuple[Array, np.datetime64 | None]:
+        """Return the times (n,) [s] of the rows' recording and the time stamp of 0 s."""
+        start, times = fields.provenance, self.columns[self.time][rows]
+        if "start_epoch_s" in start:
+            return fields.t, np.datetime64(round(start["start_epoch_s"] * 1e9), "ns")
+        if "start" in start:
+            return fields.t, np.datetime64(start["start"]).astype("datetime64[ns]")
+        is_time_of_day = times.dtype.kind == "M" and times.size > 0
+        return fields.t, np.nanmin(times) if is_time_of_day else None
+
+
+def _pivot_long_table(
+    series: Sequence[Series], column_by_kind: Mapping[str, int], prepare: Prepare | None
 ) -> tuple[list[Series], list[str]]:
-    """Return a series for each name, its rows read as a table of one channel, and lines for the history."""
-    value, texts = long["value"], [long[kind] for kind in ("name", "unit") if kind in long]
-    labels = [Label("", "") if column in texts else member.label for column, member in enumerate(series)]
-    if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's moments have their fraction beside them
+    """Make a series of each name in a long table; also return lines for the history.
+
+    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
+    """
+    value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
+    text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
+    labels = [Label("", "") if column in text_columns else member.label for column, member in enumerate(series)]
+    if "timestring" in {label.name.casefold() for label in labels}:  # WinCC has exact times in a second column
         days = Label("Time_ms", "t", "microday since 1899-12-30")
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
-    request = Wanted({"u": f"#{value + 1} count"})
+    # values in counts, as such are not converted
+    request = Request({"u": f"#{value_column + 1} count"})
     choice = choose_columns(labels, request)
+    assert choice.time is not None  # `choose_columns` raises InputError without a time
     choice.notes.clear()
-    kinds = dict.fromkeys(texts, "texts") | ({long["valid"]: "any"} if "valid" in long else {})
-    kinds |= choice.columns | {value: "any"}
-    if choice.time is not None:
-        kinds[choice.time] = kinds.pop(choice.time)  # the last
+    kinds = dict.fromkeys(text_columns, "texts") | ({} if validity_column is None else {validity_column: "any"})
+    kinds |= choice.columns | {value_column: "any"}
+    kinds[choice.time] = kinds.pop(choice.time)  # the time comes last
     notes = [*prepare(kinds, choice.date)] if prepare else []
-    columns = {column: _samples(series[column], kind == "time") for column, kind in choice.columns.items()}
-    if "valid" in long:
-        invalid = _samples(series[long["valid"]]) == 0.0
-        columns[value] = np.where(invalid, np.nan, columns[value])
-        note = f"{counted(int(np.count_nonzero(invalid)), 'value')} that the file calls invalid read as missing"
+    columns = {column: _read_samples(series[column], as_time=kind == "time") for column, kind in choice.columns.items()}
+    if validity_column is not None:
+        invalid = _read_samples(series[validity_column]) == 0.0
+        columns[value_column] = np.where(invalid, np.nan, columns[value_column])
+        note = f"{format_count(int(np.count_nonzero(invalid)), 'value')} that the file calls invalid read as missing"
         notes += [note] if invalid.any() else []
-    times = columns[[*choice.columns][-1]]
-    cells = [np.array([str(cell).strip() for cell in series[column].values().tolist()]) for column in texts]
-    keys = np.char.add(np.char.add(cells[0], "\n"), cells[1]) if len(cells) > 1 else cells[0]
-    names, first, rows = np.unique(keys, return_index=True, return_inverse=True)
-    if len(names) > _MOST_NAMES:
-        raise InputError(f"a long table must have at most {_MOST_NAMES} names, got more")
-    order = np.argsort(rows, kind="stable")
-    ends = np.cumsum(np.bincount(rows, minlength=len(names)))
-
-    def member(number: int) -> Series:
-        selected = order[ends[number - 1] if number else 0 : ends[number]]
-
-        @cache
-        def fields() -> RecordingFields:
-            timed = selected[~np.isnat(times[selected]) if times.dtype.kind == "M" else np.isfinite(times[selected])]
-            held = {column: cells[timed] for column, cells in columns.items()}
-            words = np.isinf(held[value])
-            if np.count_nonzero(words) > MOST_WORDS * words.size:
-                raise InputError(f"{label.whole[:40]} must hold numbers, got text")
-            held[value][words] = np.nan
-            return converted(choice, held, "", request)
-
-        def clock() -> tuple[Array, np.datetime64 | None]:
-            begin = fields().provenance
-            if "start_epoch_s" in begin:
-                return fields().t, np.datetime64(round(begin["start_epoch_s"] * 1e9), "ns")
-            if "start" in begin:
-                return fields().t, np.datetime64(begin["start"]).astype("datetime64[ns]")
-            known = times[selected] if times.dtype.kind == "M" else times[:0]  # times of the day
-            return fields().t, np.nanmin(known) if known.size else None
-
-        own_name, _, own_unit = str(names[number]).partition("\n")
-        label = Label.parse(own_name[:200], own_unit[:40] or None)
-        return Series("", label, selected.size, lambda: fields().channels["u"], Clock(number, clock))
-
-    ordered = [member(int(number)) for number in np.argsort(first) if str(names[number]).strip()]
-    return ordered, [*notes, f"long table: {counted(len(rows), 'row')} of {counted(len(ordered), 'name')}"]
+    texts = [np.array([str(cell).strip() for cell in series[column].values().tolist()]) for column in text_columns]
+    keys = np.char.add(np.char.add(texts[0], "\n"), texts[1]) if len(texts) > 1 else texts[0]  # name, unit
+    names, first_rows, name_of_row = np.unique(keys, return_index=True, return_inverse=True)
+    if len(names) > _MAX_NAMES:
+        raise InputError(f"a long table must have at most {_MAX_NAMES} names, got more")
+    # the rows of the first name, then of the second, ...
+    rows_by_name = np.split(np.argsort(name_of_row, kind="stable"), np.cumsum(np.bincount(name_of_row))[:-1])
+    table = _LongTable(choice, request, columns, value_column, choice.time)
+    result = []
+    for number in np.argsort(first_rows).tolist():
+        name, _, unit = str(names[number]).partition("\n")
+        if name or unit:
+            label = Label.parse(name[:200], unit[:40] or None)
+            result.append(table.make_series(number, label, rows_by_name[number]))
+    n_rows, n_names = format_count(len(name_of_row), "row"), format_count(len(result), "name")
+    return result, [*notes, f"long table: {n_rows} of {n_names}"]
 
 
-def check_size(rows: int, columns: int, size: int | None = None) -> None:
-    """Refuse more than `MAX_VALUES`, and than `_EXPANSION` times the file's `size` [bytes]: fill values expand so."""
-    if rows * columns > MAX_VALUES:
+def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
+    """Raise InputError for more than `MAX_VALUES` values, or more than a file of `file_size` [bytes] can hold."""
+    if n_rows * n_columns > MAX_VALUES:
         raise InputError(
-            f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), got {rows} rows of "
-            f"{columns}: cut it into parts"
+            f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), got {n_rows} rows of "
+            f"{n_columns}: cut it into parts"
         )
-    if size is not None and 8 * rows * columns > max(_SMALL, _EXPANSION * size):
-        raise InputError(f"a recording must hold its samples, got {rows} rows of {columns} in a file of {size} bytes")
-
-
-def check_texts(cells: int, width: int, name: str) -> None:
-    """Raise InputError for too many texts, or texts wider than a number, in a column."""
-    if cells > _MOST_TEXTS or width > _WIDEST_TEXT or cells * width > _MOST_TEXT:
+    if file_size is not None and 8 * n_rows * n_columns > max(_MIN_LIMIT, _MAX_EXPANSION * file_size):
         raise InputError(
-            f"{name} must hold numbers, or at most {_MOST_TEXTS} texts of {_WIDEST_TEXT} bytes, got {cells} of {width}"
+            f"a recording must hold its samples, got {n_rows} rows of {n_columns} in a file of {file_size} bytes"
         )
 
 
-def description_of(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
-    """Return rate, provenance and history as JSON values; raise InputError where a value is none of JSON's."""
+def check_texts(count: int, width: int, name: str) -> None:
+    """Raise InputError for too many or too wide texts in a column."""
+    if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
+        raise InputError(
+            f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "
+            f"got {count} of {width}"
+        )
+
+
+def make_description(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
+    """Return rate, provenance and history as JSON values; raise InputError for values that JSON does not have."""
     description = {"format": FORMAT_VERSION, "rate": rate, "provenance": dict(provenance), "history": list(history)}
     try:
-        return json.loads(json.dumps(description, default=_plain))  # type: ignore[no-any-return]
+        return json.loads(json.dumps(description, default=_convert_numpy))  # type: ignore[no-any-return]
     except (TypeError, ValueError) as error:
         raise InputError(f"provenance must hold JSON values only: {error}") from None
 
 
-def _plain(value: Any) -> Any:
+def _convert_numpy(value: Any) -> Any:
+    """Convert numpy values to JSON values; raise TypeError for others."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"got a {type(value).__name__}")
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Parse the description made by `description_of`, a JSON text or its values; raise InputError if it is damaged."""
+    """Parse a description made by `make_description`, JSON or its values; raise InputError if it is damaged."""
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])

@@ -1,4 +1,4 @@
-"""TDMS files of LabVIEW and its relatives, with npTDMS: groups of channels, each with the rate of its waveform."""
+"""TDMS files of LabVIEW and other tools, with npTDMS: groups of channels, each with its own sampling interval."""
 
 from __future__ import annotations
 
@@ -10,38 +10,40 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.recordings.formats.columns import Wanted
+from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import entries, stated_rate
-from sealscope.recordings.formats.libraries import library
-from sealscope.recordings.formats.table import Clock, RecordingFields, Series, table_of, uniform
+from sealscope.recordings.formats.headings.preamble import collect_remarks, stated_rate
+from sealscope.recordings.formats.libraries import import_library
+from sealscope.recordings.formats.table import Clock, RecordingFields, Series, build_fields, uniform_clock
 
 _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
-def read_tdms(path: Path, request: Wanted) -> RecordingFields:
-    """Read the wanted channels; one with the waveform's interval (``wf_increment``) has a clock."""
-    nptdms = library("nptdms", "TDMS", "npTDMS")
-    library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)  # a last segment cut short is read
+def read_tdms(path: Path, request: Request) -> RecordingFields:
+    """Read the requested channels; a channel with a waveform interval (``wf_increment``) has a clock."""
+    nptdms = import_library("nptdms", "TDMS", "npTDMS")
+    # no warnings on a truncated last segment
+    import_library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)
     with nptdms.TdmsFile.open(path) as file:
         series = []
         for group in file.groups():
             for channel in group.channels():
-                properties = channel.properties
-                label = Label.parse(
-                    channel.name, next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
-                )
-                values = partial(channel.__getitem__, slice(None))
-                series.append(Series(group.name, label, len(channel), values, _clock(properties, len(channel))))
+                properties, count = channel.properties, len(channel)
+                unit = next((str(properties[key]) for key in _UNITS if properties.get(key)), None)
+                values, clock = partial(channel.__getitem__, slice(None)), _waveform_clock(properties, count)
+                series.append(Series(group.name, Label.parse(channel.name, unit), count, values, clock))
         remarks, *group_remarks = (
-            entries((name, value) for name, value in member.properties.items() if isinstance(value, str | int | float))
+            collect_remarks(
+                (name, value) for name, value in member.properties.items() if isinstance(value, str | int | float)
+            )
             for member in (file, *file.groups())
         )
         stated = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
-        return table_of(series, request, "TDMS", remarks, stated, size=path.stat().st_size)
+        return build_fields(series, request, "TDMS", remarks, stated, size=path.stat().st_size)
 
 
-def _clock(properties: Mapping[str, Any], count: int) -> Clock | None:
+def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
+    """Make the clock of a channel from its waveform properties; None if they have no interval."""
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:
         return None
@@ -49,4 +51,4 @@ def _clock(properties: Mapping[str, Any], count: int) -> Clock | None:
     moment = None if start is None else np.datetime64(start).astype("datetime64[ns]")
     if moment is not None and (np.isnat(moment) or moment < np.datetime64("1971-01-01")):
         moment = None  # a logger without a clock writes 1904
-    return uniform("waveform", count, float(step), float(properties.get("wf_start_offset", 0.0)), moment)
+    return uniform_clock("waveform", count, float(step), float(properties.get("wf_start_offset", 0.0)), moment)

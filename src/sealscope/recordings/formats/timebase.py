@@ -1,4 +1,4 @@
-"""From a time column to seconds and a sampling rate: numbers of any unit, epoch seconds, date stamps."""
+"""Convert a time column to seconds and a sampling rate: numbers in any unit, seconds since an epoch, date stamps."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
 _EITHER = r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})"
-#: How dates are written; what `first` and `second` are follows from all dates of a column (`day_before_month`).
+#: Forms of dates; whether `first` is the day or the month is decided from a whole column (`is_day_first`).
 _DATES = (
     r"(?P<year>\d{4})[-/.](?P<month>\d{1,2})[-/.](?P<day>\d{1,2})",
     r"(?P<plain>(?P<year>(?:19|20)\d{2})(?P<month>\d{2})(?P<day>\d{2}))(?=[T\s]|\Z)",
-    r"(?P<days>\d{1,5}) days?,?(?=\s)",  # a length of time, as pandas writes it
+    r"(?P<days>\d{1,5}) days?,?(?=\s)",  # a duration, as pandas writes it
     r"(?P<year>\d{4})年(?P<month>\d{1,2})月(?P<day>\d{1,2})日",
     r"(?P<day>\d{1,2})\.(?P<month>\d{1,2})\.(?P<year>\d{4}|\d{2})",
     r"(?P<day>\d{1,2})[-. /]{1,2}(?P<month>[^\W\d_]{3,9})[-. /]{1,2}(?P<year>\d{4}|\d{2})",
@@ -31,8 +31,8 @@ _DATES = (
 )
 _EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
 _LAST_MONTH = 12
-#: A number, which is no stamp but a date of eight digits.
-_PLAIN = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
+#: A number, which is no stamp unless it has eight digits.
+_BARE_NUMBER = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
 _STAMPS = [
     re.compile(
@@ -43,54 +43,58 @@ _STAMPS = [
 ]
 #: Beginning of a month's name -> its number.
 _MONTHS = {beginning: number for number, names in WORDS["month"].items() for beginning in names}
-_LONGEST_STAMP = 64
+_MAX_STAMP = 64
 _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})", re.IGNORECASE)
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
-#: Numbers from here on, without a unit, are read as the time since 1970 in this unit.
+#: Smallest number without a unit that is read as the time since 1970, and its unit.
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
-#: Fewer samples do not tell how many share a stamp.
-_FEWEST_SHARED = 20
-#: The date of a time of the day alone.
+#: Fewest samples from which the number of samples per stamp is estimated.
+_MIN_SHARED = 20
+#: Largest deviation of times from a uniform clock that is rounding, in intervals; limits of a rate's relative error.
+_MAX_ROUNDING, _MIN_SLACK, _MAX_SLACK = 0.6, 1e-9, 1e-3
+#: The date used for a time of day without a date.
 _NO_DATE = "1970-01-01"
-#: A step of one hour to so many usual intervals, between midnight and four, is a change of daylight saving time.
-_HOUR, _DAY, _NEAR, _LATEST_CHANGE = 3600.0, 86400.0, 3.0, 4
-#: Days since 1899-12-30 from 1982 to 2078, and the largest intervals [day] that are none of seconds.
-_EXCEL = (30_000, 65_000)
-_LARGEST_STEP, _LARGEST_STEP_OF_DAYS = 2e-6, 1.2e-5
-_OFFSET_OF_DATENUM = 693_960
-#: Seconds since 1904 begin here, in 2008: those since 1970 would be in 2074.
+#: A jump of one hour, to within _TOLERANCE median intervals, before 4 o'clock is a change of daylight saving time.
+_HOUR, _DAY, _TOLERANCE, _LATEST_CHANGE = 3600.0, 86400.0, 3.0, 4
+#: Range of days since 1899-12-30 in the years 1982 to 2078; largest intervals of fractions of a day and of days, as no
+#: logger samples every 2 or 12 us; MATLAB's datenum of 1899-12-30.
+_EXCEL_RANGE = (30_000, 65_000)
+_MAX_FRACTION_STEP, _MAX_DAY_STEP = 2e-6, 1.2e-5
+_DATENUM_OFFSET = 693_960
+#: From here on (2008 since 1904, 2074 since 1970) seconds are counted from 1904.
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
-_EARLIEST_EPOCH, _LATEST_EPOCH = 1e8, 1e11  # [s]: March 1973, and no recording lasts three years; the year 5138
-#: Times (n,) [s], what is known of the moment 0, and lines for the history.
+#: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.
+_MIN_EPOCH, _MAX_EPOCH = 1e8, 1e11
+#: Times (n,) [s], provenance of the start (`start` or `start_epoch_s`), and lines for the history.
 _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 
 @dataclass
-class LogTime:
-    """The time of a log, known from the parts read before.
+class TimeState:
+    """State of the time column of a log after the parts read before.
 
-    `head`: their first times, without a unit; `rate`: of the samples [Hz]; `resolution`: of times that these share [s];
-    `last`: the last time, as the file has it, and where it is, `end` [s].
+    `head`: first times of a column without unit; `rate`: sampling rate [Hz]; `resolution`: of times that samples share
+    [s]; `last_time`: the last time as in the file, and `last_seconds`: the same [s].
     """
 
     head: Array | None = None
     rate: float | None = None
     resolution: float | None = None
-    last: Any = None
-    end: float = 0.0
+    last_time: Any = None
+    last_seconds: float = 0.0
 
 
-def _parsed_stamp(text: str) -> dict[str, str | None] | None:
-    """Return the parts of a stamp by the names of their groups; None for any other text."""
+def _parse_stamp(text: str) -> dict[str, str | None] | None:
+    """Parse a stamp to its parts by name (`year`, `clock`, ...), unused ones None; None for any other text."""
     text = text.strip()
-    if len(text) > _LONGEST_STAMP or (_PLAIN.fullmatch(text) and len(text) != len("20240531")):
+    if len(text) > _MAX_STAMP or (_BARE_NUMBER.fullmatch(text) and len(text) != len("20240531")):
         return None
     match = next(filter(None, (stamp.fullmatch(text) for stamp in _STAMPS)), None)
-    if match is None or not (match["clock"] or len(match.groupdict()) > len(("clock", "half"))):
-        return None
+    if match is None or not (match["clock"] or match.groupdict().keys() - {"clock", "half"}):
+        return None  # neither a time of day nor a date
     parts, month = match.groupdict(), match.groupdict().get("month")
     if match["clock"] and ":" not in match["clock"] and "plain" not in parts:
-        return None  # six digits are a clock behind a date of eight alone
+        return None  # six digits are a time of day only after a date of eight digits
     if month and not month.isdecimal():
         name = month.casefold()
         parts["month"] = _MONTHS.get(name[:4], _MONTHS.get(name[:3]))
@@ -98,83 +102,83 @@ def _parsed_stamp(text: str) -> dict[str, str | None] | None:
 
 
 def is_stamp(text: str) -> bool:
-    """Test whether `text` is a date stamp or the time of a day that `stamps` can read."""
-    return _parsed_stamp(text) is not None
+    """Test whether `text` is a date stamp or time of day that `parse_stamps` can read."""
+    return _parse_stamp(text) is not None
 
 
-def stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
-    """Read stamps (ISO, day.month.year, month/day/year) and times of a day as datetime64[ns]; an empty cell is NaT.
+def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
+    """Parse stamps (ISO, day.month.year, month/day/year) and times of day to datetime64[ns], NaT for empty cells.
 
-    `day_first`: the order of dates such as 05/06/2024 and 05-06-2024, by default what these cells tell
-    (`day_before_month`). Raises ValueError with the index of the first cell that is no stamp.
+    `day_first`: order of dates such as 05/06/2024 and 05-06-2024, by default decided from these cells
+    (`is_day_first`). Raises ValueError with the index of the first cell that is no stamp.
     """
     if day_first is None:
-        day_first = day_before_month([either_dates(cells)])
-    plain: list[str] = []
+        day_first = is_day_first([ambiguous_dates(cells)])
+    iso_stamps: list[str] = []
     for index, cell in enumerate(cells):
-        parts = _parsed_stamp(cell)
+        parts = _parse_stamp(cell)
         if parts is None:
             if cell.strip():
                 raise ValueError(index)
-            plain.append("NaT")
+            iso_stamps.append("NaT")
             continue
-        hour, colon, rest = _clock(parts["clock"] or "00:00").partition(":")
-        if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon
+        hour, colon, rest = _format_clock(parts["clock"] or "00:00").partition(":")
+        if half := parts["half"]:  # 12 AM is midnight, 12 PM is noon; 99 is refused below, as 13 PM is no time
             hour = str(int(hour) % 12 + (12 if half[0] in "pP" else 0)) if 1 <= int(hour) <= 12 else "99"
-        plain.append(f"{_date_of(parts, day_first)}T{hour:0>2}{colon}{rest}")
+        iso_stamps.append(f"{_iso_date(parts, day_first)}T{hour:0>2}{colon}{rest}")
     try:
-        return np.array(plain, dtype="datetime64[ns]")
+        return np.array(iso_stamps, dtype="datetime64[ns]")
     except ValueError:  # the 30th of February
-        raise ValueError(next(index for index, text in enumerate(plain) if not _is_moment(text))) from None
+        raise ValueError(next(index for index, text in enumerate(iso_stamps) if not _is_datetime(text))) from None
 
 
-def either_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Return the dates of stamps that begin with the day or the month, each once, as they follow each other."""
+def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
+    """Collect the dates in which the day may precede the month or follow it, each once, in order."""
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
-def stated_order(dates: Iterable[str]) -> bool | None:
-    """Test whether the day is before the month in the first unambiguous one of the `either_dates`; None without.
+def explicit_order(dates: Iterable[str]) -> bool | None:
+    """Test whether the first date with one number over 12 has the day before the month; None without such a date."""
+    over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
+    return next((first for first, second in over_12 if first != second), None)
 
-    It has one number over 12.
+
+def is_day_first(columns: Collection[Iterable[str]]) -> bool:
+    """Decide whether the day is before the month in the `ambiguous_dates` of columns in the same format.
+
+    Criteria in order: a number over 12 (`explicit_order`), the order in which no column goes back, the order with the
+    shorter time span; else the day is first with hyphens, and the month with slashes.
     """
-    over = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_numbers, dates))
-    return next((first for first, second in over if first != second), None)
-
-
-def day_before_month(columns: Collection[Iterable[str]]) -> bool:
-    """Decide whether the day stands before the month in the `either_dates` of columns that follow one rule.
-
-    By their `stated_order`; else in the order in which no column goes back; else in which they span less time; else
-    before a hyphen and not before a stroke.
-    """
-    stated = next((order for order in map(stated_order, columns) if order is not None), None)
+    stated = next((order for order in map(explicit_order, columns) if order is not None), None)
     if stated is not None:
         return stated
-    hyphen = any("-" in text for column in columns for text in column)
+    has_hyphens = any("-" in text for column in columns for text in column)
     ranks = {}
-    for day_first in (hyphen, not hyphen):
-        days = [[_day(text, day_first) for text in column] for column in columns]
-        ends = [day for dates in days for day in dates if day]
-        ranks[day_first] = any(dates != sorted(dates) for dates in days), max(ends, default=0) - min(ends, default=0)
-    return min(ranks, key=ranks.__getitem__)
+    for day_first in (has_hyphens, not has_hyphens):
+        days = [[_ordinal_day(text, day_first) for text in column] for column in columns]
+        known_days = [day for dates in days for day in dates if day]
+        goes_back = any(dates != sorted(dates) for dates in days)
+        ranks[day_first] = goes_back, max(known_days, default=0) - min(known_days, default=0)
+    return min(ranks, key=ranks.__getitem__)  # of equals, the first
 
 
-def _day(either: str, day_first: bool) -> int:
-    """Return the number of a day, 0 for one that no calendar has."""
-    first, second, year = _numbers(either)
+def _ordinal_day(text: str, day_first: bool) -> int:
+    """Return the ordinal number of a day; 0 for a date that does not exist."""
+    first, second, year = _date_numbers(text)
     try:
         return date(year, *((second, first) if day_first else (first, second))).toordinal()
     except ValueError:
         return 0
 
 
-def _numbers(either: str) -> tuple[int, int, int]:
-    first, second, year = re.split("[/-]", either)
+def _date_numbers(text: str) -> tuple[int, int, int]:
+    """Split an ambiguous date into its first and second number and the year."""
+    first, second, year = re.split("[/-]", text)
     return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
 
 
-def _is_moment(text: str) -> bool:
+def _is_datetime(text: str) -> bool:
+    """Test whether numpy can convert an ISO stamp."""
     try:
         np.datetime64(text, "ns")
     except ValueError:
@@ -183,25 +187,25 @@ def _is_moment(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock [s] counts from 1970, and not from the start of a machine."""
-    return _EARLIEST_EPOCH < clock < _LATEST_EPOCH
+    """Test whether a clock [s] counts from 1970, not from the start of a machine."""
+    return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
 def iso_moment(moment: np.datetime64) -> str:
-    """Format a moment as an ISO stamp, without trailing zeros: `2024-05-31T12:00:00.25`."""
+    """Format a time stamp in ISO form without trailing zeros: `2024-05-31T12:00:00.25`."""
     text = str(moment)
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def clock_text(clock: float) -> str:
-    """Format a clock [s]: the date and time of the day in UTC if it counts from 1970, else seconds."""
+    """Format a clock [s]: date and time in UTC if it counts from 1970, else seconds."""
     if not counts_from_1970(clock):
         return f"{clock:.0f} s"
     return str(np.datetime64(round(clock), "s")).replace("T", " ") + " UTC"
 
 
-def seconds_of(stamp: str) -> float | None:
-    """Return an ISO stamp as seconds since 1970, to a millisecond; None where it is none."""
+def parse_epoch(stamp: str) -> float | None:
+    """Parse an ISO stamp to seconds since 1970, to a millisecond; None if it is none."""
     try:
         moment = np.datetime64(stamp, "ms")
     except ValueError:
@@ -209,8 +213,8 @@ def seconds_of(stamp: str) -> float | None:
     return None if np.isnat(moment) else float(moment.astype(np.int64)) / 1e3
 
 
-def _clock(text: str) -> str:
-    """Return a time of the day as `hour:minute:second.fraction`; `59:59.9` has no hour, `12:00:00:250` four parts."""
+def _format_clock(text: str) -> str:
+    """Rewrite a time of day as `hour:minute:second.fraction`; `59:59.9` has no hour, `12:00:00:250` four parts."""
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -219,126 +223,135 @@ def _clock(text: str) -> str:
     return f"00:{text:0>2}" if text.count(":") == 1 and "." in text else text
 
 
-def _date_of(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Return the date of a stamp as ISO writes it; 1970-01-01 for the time of a day alone."""
-    if days := parts.get("days"):
+def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
+    """Format the date of a stamp in ISO form; 1970-01-01 for a time of day without one."""
+    if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
     if "first" in parts:
-        month, day = (parts["first"], parts["second"])[:: -1 if day_first else 1]
+        first, second = parts["first"], parts["second"]
+        month, day = (second, first) if day_first else (first, second)
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
 
 
 def nominal_rate(t: Array) -> float:
-    """Return the sampling rate [Hz] of time stamps `t` (n,): the shortest decimal that agrees with them.
+    """Estimate the sampling rate [Hz] of times `t` (n,): the shortest decimal that agrees with them.
 
-    From the mean interval where they are uniform, else from the median interval. Raises InputError where no interval is
+    Uses the mean interval if the times are uniform, else the median interval. Raises InputError if no interval is
     positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])
     if steps.size and np.isfinite(span) and steps.min() > 0:
         mean = span / steps.size
-        off_line = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
-        if off_line < 0.6 * mean:
-            return _shortest(1.0 / mean, max(1e-9, min(2 * off_line / span, 1e-3)))
+        max_deviation = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
+        if max_deviation < _MAX_ROUNDING * mean:  # the rounding of stamps limits the error of the mean interval
+            return _shortest_decimal(1.0 / mean, max(_MIN_SLACK, min(2 * max_deviation / span, _MAX_SLACK)))
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not steps.size:
         raise InputError("time must increase between some samples")
-    return _shortest(1.0 / float(np.median(steps)), 1e-9)
+    return _shortest_decimal(1.0 / float(np.median(steps)), _MIN_SLACK)
 
 
-def _shortest(value: float, slack: float) -> float:
-    """Return the shortest decimal that agrees with a value to a share of it."""
+def _shortest_decimal(value: float, slack: float) -> float:
+    """Return the decimal with the fewest digits that differs from a value by at most the fraction `slack`."""
     decimals = (float(f"{value:.{digits}g}") for digits in range(1, 16))
     return next((decimal for decimal in decimals if abs(decimal / value - 1.0) <= slack), value)
 
 
-def falling(times: NDArray[Any]) -> bool:
-    """Test whether every time (n,) is before the one above it, as in logs that begin with the last sample."""
+def is_falling(times: NDArray[Any]) -> bool:
+    """Test whether all times (n,) decrease, as in logs that begin with the last sample."""
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 
-def _from_stamps(values: NDArray[np.datetime64], name: str, log: LogTime) -> _Seconds:
+def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
+    """Convert stamps (n,) to seconds from the first; times of day without a date continue from part to part.
+
+    Jumps back at midnight or at the full hour, and those of daylight saving time, are removed.
+    """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
         raise InputError("time must have a stamp in some row, got none")
-    undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
-    goes_on = undated and log.last is not None
-    if goes_on:
-        nanoseconds, known = np.append(log.last, nanoseconds), np.append(True, known)
+    is_undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    continues = is_undated and state.last_time is not None
+    if continues:  # prefix the last stamp of the previous part
+        nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
     start = nanoseconds[known][0]
     t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
     t[~known] = np.nan
-    hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
-    steps = {
+    first_hour = int((nanoseconds[known] - nanoseconds[known].astype("datetime64[D]")).min() / np.timedelta64(1, "h"))
+    note_of_jump = {
         -_DAY: "has no date: begins again with the next day",
         -_HOUR: "has no date: begins again with the next hour",
     }
-    if not undated:
-        changed = "steps by an hour: taken for daylight saving time, the hour left out"
-        steps = dict.fromkeys((-_HOUR, _HOUR), changed) if hour < _LATEST_CHANGE else {}
+    if not is_undated:
+        note = "steps by an hour: taken for daylight saving time, the hour left out"
+        note_of_jump = dict.fromkeys((-_HOUR, _HOUR), note) if first_hour < _LATEST_CHANGE else {}
     notes = []
-    for step, what in steps.items():
-        if (wrapped := _unwrapped(t, step, once=not undated)) is not None:
-            t = wrapped
-            notes.append(f"column {name} {what}")
-    return t[1:] + log.end if goes_on else t, {} if undated else {"start": iso_moment(start)}, notes
+    for step, note in note_of_jump.items():
+        if (continuous := _remove_jumps(t, step, single=not is_undated)) is not None:
+            t = continuous
+            notes.append(f"column {name} {note}")
+    return t[1:] + state.last_seconds if continues else t, {} if is_undated else {"start": iso_moment(start)}, notes
 
 
-def _unwrapped(t: Array, step: float, once: bool) -> Array | None:
-    """Return times (n,) without jumps by `step` [s], to a few usual intervals; None without, or if not just `once`."""
+def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
+    """Remove jumps by `step` [s], to within some median intervals; None if there is none, or several and `single`."""
     steps = np.diff(t)
-    forward = steps[np.isfinite(steps) & (steps > 0)]
-    if not forward.size:
+    positive_steps = steps[np.isfinite(steps) & (steps > 0)]
+    if not positive_steps.size:
         return None
-    usual = float(np.median(forward))
-    jumps = np.flatnonzero(np.abs(steps - step - usual) <= _NEAR * usual)
-    if not jumps.size or (once and jumps.size > 1) or usual * _NEAR >= 0.1 * abs(step):
+    median_step = float(np.median(positive_steps))
+    jumps = np.flatnonzero(np.abs(steps - step - median_step) <= _TOLERANCE * median_step)
+    is_coarse = median_step * _TOLERANCE >= 0.1 * abs(step)  # ordinary intervals could look like jumps
+    if not jumps.size or (single and jumps.size > 1) or is_coarse:
         return None
     return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")
 
 
-def _from_numbers(values: Array, unit: str | None, name: str, log: LogTime) -> _Seconds:
-    """Read numbers in a unit, or without: seconds, a time since 1970 in the unit that their size tells, or days."""
+def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
+    """Convert numbers (n,) to seconds, by their unit or, without one, by their magnitude."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
     if unit is None:
-        return _without_unit(values, finite, name, log)
+        return _convert_without_unit(values, finite, name, state)
     if since := _SINCE.fullmatch(unit.strip()):
-        word = _LONG_UNITS.get(since["unit"].lower(), since["unit"].lower())
-        seconds = to_si(values - first, word, "s", name="time")
+        unit_of_time = _LONG_UNITS.get(since["unit"].lower(), since["unit"].lower())
+        seconds = to_si(values - first, unit_of_time, "s", name="time")
         try:
-            elapsed = np.timedelta64(round(to_si(first, word, "s") * 1e9), "ns")
-            return seconds, {"start": iso_moment(stamps([since["start"]])[0] + elapsed)}, []
+            elapsed = np.timedelta64(round(to_si(first, unit_of_time, "s") * 1e9), "ns")
+            return seconds, {"start": iso_moment(parse_stamps([since["start"]])[0] + elapsed)}, []
         except (ValueError, OverflowError):
             return seconds, {"start": f"{first:g} {unit}"}, []
     seconds = to_si(values, unit, "s", name="time")
-    begin = float(seconds[np.isfinite(values)][0])
-    if begin >= _EARLIEST_EPOCH:
-        return to_si(values - first, unit, "s"), {"start_epoch_s": begin}, []
+    epoch = float(seconds[np.isfinite(values)][0])
+    if epoch >= _MIN_EPOCH:
+        return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, []
     return seconds, {}, []
 
 
-def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Seconds:
-    first, begins = float(finite[0]), log.head is None
-    log.head = head = finite if log.head is None else log.head
-    if (days := _days_since(head)) is not None:
-        origin, note = days[0], f"column {name} read as {days[1]}"
-        if origin is None:  # it has no start, and goes on
-            return (values - (first if log.last is None else log.last)) * _DAY + log.end, {}, [note]
-        begin = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
-        return (values - first) * _DAY, begin, [note]
-    counted = begins and finite.size == values.size and np.all(np.diff(finite) == 1)
-    if counted and abs(first) < _EARLIEST_EPOCH:
+def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
+    """Convert numbers (n,) without a unit to seconds; the `finite` ones tell days, epochs and seconds."""
+    first, is_first_part = float(finite[0]), state.head is None
+    state.head = head = finite if state.head is None else state.head
+    if (days := _detect_days(head)) is not None:
+        origin, meaning = days
+        note = f"column {name} read as {meaning}"
+        if origin is None:  # fractions of a day have no start, and continue from part to part
+            previous = first if state.last_time is None else state.last_time
+            return (values - previous) * _DAY + state.last_seconds, {}, [note]
+        start = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
+        return (values - first) * _DAY, start, [note]
+    is_row_count = is_first_part and finite.size == values.size and np.all(np.diff(finite) == 1)
+    if is_row_count and abs(first) < _MIN_EPOCH:
         raise InputError(
             f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
             f"give the rate, or the unit of its column (t={name} ms)"
         )
-    unit = next((unit for least, unit in _EPOCH if abs(head[0]) >= least), None)
+    unit = next((unit for min_value, unit in _EPOCH if abs(head[0]) >= min_value), None)
     if unit is None:
         return values, {}, [f"column {name} has no unit: taken as s"]
     epoch, year = to_si(first, unit, "s"), 1970
@@ -347,75 +360,79 @@ def _without_unit(values: Array, finite: Array, name: str, log: LogTime) -> _Sec
     return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [f"column {name} read as {unit} since {year}"]
 
 
-def _days_since(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Return the origin of numbers that are days, as seconds sampled faster than any logger does; None for seconds."""
+def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
+    """Detect numbers that are days by their steps: return (origin, meaning in words); None for seconds.
+
+    Numbers are days if, taken as seconds, they were sampled faster than any logger does; the origin of fractions of a
+    day is None.
+    """
     steps = np.diff(values)
     steps = steps[steps > 0]
     if not steps.size:
         return None
     step, first, origin = float(np.median(steps)), float(values[0]), np.datetime64("1899-12-30", "us")
-    if step <= _LARGEST_STEP_OF_DAYS:
-        if _EXCEL[0] <= first <= _EXCEL[1]:
+    if step <= _MAX_DAY_STEP:
+        if _EXCEL_RANGE[0] <= first <= _EXCEL_RANGE[1]:
             return origin, "days since 1899-12-30, as spreadsheets count"
-        if _EXCEL[0] <= first - _OFFSET_OF_DATENUM <= _EXCEL[1]:
-            return origin - np.timedelta64(_OFFSET_OF_DATENUM, "D"), "days, as MATLAB counts"
-    if step <= _LARGEST_STEP and values.min() >= 0.0 and values.max() <= 1.0:
+        if _EXCEL_RANGE[0] <= first - _DATENUM_OFFSET <= _EXCEL_RANGE[1]:
+            return origin - np.timedelta64(_DATENUM_OFFSET, "D"), "days, as MATLAB counts"
+    if step <= _MAX_FRACTION_STEP and values.min() >= 0.0 and values.max() <= 1.0:
         return None, "a share of the day"
     return None
 
 
 def time_base(
-    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, log: LogTime | None = None
+    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, state: TimeState | None = None
 ) -> tuple[Array, float, dict[str, Any], list[str]]:
     """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
 
-    Returns the times (n,) [s], the rate [Hz], what is known of the moment 0, and lines for the history. Stamps and
-    epoch times are based at their first sample; other times are left where they are. The `stated_rate` of a file [Hz]
-    places samples that share their stamps. The values may go on from those of `log`, which then has theirs, too. Raises
+    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps and epoch
+    times are relative to their first sample; other times stay as they are. The file's `stated_rate` [Hz] spaces samples
+    that share stamps. `state`: that after the previous part, which the values may continue; it is updated. Raises
     InputError.
     """
-    log = LogTime() if log is None else log
+    state = TimeState() if state is None else state
     if values.dtype.kind == "M":
-        t, start, notes = _from_stamps(values, name, log)
+        t, start, notes = _convert_stamps(values, name, state)
     else:
-        t, start, notes = _from_numbers(np.asarray(values, dtype=np.float64), unit, name, log)
+        t, start, notes = _convert_numbers(np.asarray(values, dtype=np.float64), unit, name, state)
     known = np.flatnonzero(np.isfinite(t))
     if known.size:
-        log.last, log.end = values[known[-1]], float(t[known[-1]])
+        state.last_time, state.last_seconds = values[known[-1]], float(t[known[-1]])
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
-        if stated_rate is not None and t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1:
+        shares_stamps = t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1
+        if stated_rate is not None and shares_stamps:
             notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
             return t[0] + np.arange(t.size) / stated_rate, stated_rate, start, notes
-        resolved = _finer(t, log)
-        if resolved is not None:
-            log.resolution, t = resolved
-            notes.append(f"column {name} in steps of {log.resolution:g} s: samples in between taken as uniform")
-        log.rate = nominal_rate(t) if log.rate is None else log.rate
-        return t, log.rate, start, notes
+        if (spaced := _space_shared_times(t, state)) is not None:
+            state.resolution, t = spaced
+            notes.append(f"column {name} in steps of {state.resolution:g} s: samples in between taken as uniform")
+        state.rate = nominal_rate(t) if state.rate is None else state.rate
+        return t, state.rate, start, notes
 
 
-def _finer(t: Array, log: LogTime) -> tuple[float, Array] | None:
-    """Return the resolution [s] of times (n,) that samples share as their distances ask for, and uniform times.
+def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
+    """Space samples that share coarse times (n,) uniformly; return (resolution [s], new times), or None if none do.
 
-    A part too short to tell, and without a gap, is taken as those before it.
+    A part too short to estimate the resolution, and without a gap, uses the resolution and rate of `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)
     if not np.isfinite(t).all() or (steps < 0).any():
         return None
-    if t.size >= _FEWEST_SHARED and changes.size >= 3:
+    if t.size >= _MIN_SHARED and changes.size >= 3:
         if 2 * changes.size > steps.size:
             return None
         resolution = float(steps[changes].min())
-        many = np.round(steps[changes][1:] / resolution)
-        counts, usual = np.diff(changes) / many, float(np.diff(changes).sum() / many.sum())
-        if usual < 2.0 or np.abs(counts - usual).max() > 1.0:
+        n_resolutions, n_samples = np.round(steps[changes][1:] / resolution), np.diff(changes)
+        samples_per_step = float(n_samples.sum() / n_resolutions.sum())
+        if samples_per_step < 2.0 or np.abs(n_samples / n_resolutions - samples_per_step).max() > 1.0:
             return None
-        rate = _shortest(usual / resolution, 1.0 / float(np.diff(changes).sum()))
-    elif log.resolution is not None and log.rate is not None and steps.max(initial=0.0) < 1.5 * log.resolution:
-        resolution, rate = log.resolution, log.rate
+        rate = _shortest_decimal(samples_per_step / resolution, 1.0 / float(n_samples.sum()))
+    elif state.resolution is not None and state.rate is not None and steps.max(initial=0.0) < 1.5 * state.resolution:
+        resolution, rate = state.resolution, state.rate
     else:
         return None
-    # a stamp says when its first sample was taken, to a sample
-    begin = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
-    return resolution, begin + np.arange(t.size) / rate
+    # a stamp is the time of its first sample, to within one interval
+    first_time = float(np.median(t[changes + 1] - (changes + 1) / rate)) if changes.size else float(t[0])
+    return resolution, first_time + np.arange(t.size) / rate

@@ -1,1 +1,1 @@
-"""A campaign's result as page and tables."""
+"""The page and the tables of a campaign's result."""

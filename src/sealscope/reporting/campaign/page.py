@@ -1,4 +1,4 @@
-"""A campaign's result for people: the terminal's table, and one HTML page with the curves that works offline."""
+"""Write a campaign's result as a table for the terminal, and as one HTML page with curves that works offline."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sealscope.campaigns.execution.store import RUN_BY_RUN
-from sealscope.campaigns.judging.alarms import AlarmShares
+from sealscope.campaigns.judging.alarms import AlarmFractions
 from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import PriorKnowledge
-from sealscope.campaigns.plans.detectors import DIAGNOSE, plan_detector
+from sealscope.campaigns.plans.detectors import DIAGNOSE, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.detectors.registry import detectors
@@ -28,55 +28,57 @@ from sealscope.reporting.messages import say
 from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 
 PAGE = "report.html"
-#: More sizes than this are shown together: a column for each could not be read.
-_MOST_SIZES = 8
-#: Size of a picture; points of a fitted curve, of any curve at most, and of fractions at most.
+#: If there are more sizes of leaks, they are shown pooled in one column.
+_MAX_SIZES = 8
+#: Size of a picture; points of a fitted curve; limits of points of any curve, and of measured fractions.
 WIDTH, HEIGHT = 460.0, 300.0
-_CURVE_POINTS, _MOST_DRAWN, _MOST_POINTS = 120, 400, 60
-#: Detectors that the result names in words, the best of them.
-_MOST_SAID = 3
+_CURVE_POINTS, _MAX_CURVE_POINTS, _MAX_FRACTIONS = 120, 400, 60
+#: Number of the best detectors that the summary describes.
+_MAX_NAMED = 3
 
 
-def _area(area: Area) -> str:
+def _format_area(area: Area) -> str:
+    """Format an area under the ROC with its interval."""
     return f"{area.value:.3f} ({area.low:.3f}–{area.high:.3f})"
 
 
-def sizes_of(judgement: Judgement) -> list[float]:
-    """Return the leak sizes with a column each; nan stands for all sizes together if they are many or none."""
+def column_sizes(judgement: Judgement) -> list[float]:
+    """List the leak sizes of the table's columns; [nan], all sizes pooled, if there are too many sizes or none."""
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
-    return sizes if 0 < len(sizes) <= _MOST_SIZES else [math.nan]
+    return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
 
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
-    """Return heads and rows: detectors in the plan's order, then the one that always and the one that never fires."""
+    """Build heads and rows of the main table: the plan's detectors, then those that always and never fire."""
     judgement = result.judgement
-    sizes = sizes_of(judgement)
+    sizes = column_sizes(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
-    by_detector: dict[str, dict[str, AlarmShares]] = defaultdict(dict)
-    for row in rows:
+    by_detector: dict[str, dict[str, AlarmFractions]] = defaultdict(dict)
+    for row in rows:  # sizes as text, since nan (all sizes) does not equal itself
         by_detector[row.detector][f"{row.leak_lpm}"] = row
     pods = {pod.detector: pod for pod in judgement.pods}
-    areas = {roc.detector: _area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
+    areas = {roc.detector: _format_area(roc.area) for roc in judgement.rocs if math.isnan(roc.leak_lpm)}
     table = []
-    for name, results in by_detector.items():
-        cells = [percent(results[f"{size}"].alarms) if f"{size}" in results else "–" for size in sizes]
-        knowledge = [_name_knowledge(result.known.get(name))] if result.known else []
-        alarms = percent(next(iter(results.values())).false_alarm)
-        table.append([name, *knowledge, alarms, *cells, areas.get(name, "–"), *_smallest(pods.get(name))])
-    of_sizes = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
-    knowledge = ["given"] if result.known else []
-    return ["detector", *knowledge, "false alarms", *of_sizes, "AUC, any leak", "a90", "a90/95"], table
+    for name, by_size in by_detector.items():
+        detections = [percent(by_size[f"{size}"].alarms) if f"{size}" in by_size else "–" for size in sizes]
+        knowledge = [_format_knowledge(result.known.get(name))] if result.known else []
+        false_alarms = percent(next(iter(by_size.values())).false_alarm)  # the same for all sizes
+        a90_texts = _format_a90(pods.get(name))
+        table.append([name, *knowledge, false_alarms, *detections, areas.get(name, "–"), *a90_texts])
+    size_heads = ["any leak" if math.isnan(size) else f"{size:g} {result.plan.unit}" for size in sizes]
+    knowledge_head = ["given"] if result.known else []
+    return ["detector", *knowledge_head, "false alarms", *size_heads, "AUC, any leak", "a90", "a90/95"], table
 
 
-def _name_knowledge(known: PriorKnowledge | None) -> str:
-    """Name the prior knowledge of a detector in a word or two."""
+def _format_knowledge(known: PriorKnowledge | None) -> str:
+    """Format the information that a detector was given: `true onset`, `rig`, or a dash."""
     if known is None:
         return "–"
     return ", ".join(word for word, is_known in (("true onset", known.onset), ("rig", known.rig)) if is_known) or "–"
 
 
-def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format a90 and a90/95, or only that they lie beyond the tested sizes."""
+def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
+    """Format a90 and a90/95, as `> SIZE` if they are beyond the tested sizes."""
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)
@@ -88,7 +90,7 @@ def _smallest(pod: DetectorPod | None) -> tuple[str, str]:
 
 
 def result_text(result: CampaignResult) -> str:
-    """Summarize in a few sentences the leaks found by the best detectors and their rates of false alarms."""
+    """Summarise in a few sentences the leaks that the best detectors find, and their false alarms."""
     judgement, unit = result.judgement, result.plan.unit
     ranked: list[tuple[float, float, str]] = []
     for pod in judgement.pods:
@@ -104,15 +106,15 @@ def result_text(result: CampaignResult) -> str:
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
         ranked.append((a90, -largest.alarms.value, text))
     ranked.sort(key=lambda item: item[:2])
-    shown = [text for _, _, text in ranked[:_MOST_SAID]]
-    more = len(ranked) - len(shown)
-    rest = f" {more} more detectors are in the table." if more > 1 else " Another detector is in the table."
+    sentences = [text for _, _, text in ranked[:_MAX_NAMED]]
+    n_more = len(ranked) - len(sentences)
+    rest = f" {n_more} more detectors are in the table." if n_more > 1 else " Another detector is in the table."
     records = f"{judgement.judged} records were judged."
-    return " ".join([*shown, records]) + (rest if more else "")
+    return " ".join([*sentences, records]) + (rest if n_more else "")
 
 
 def campaign_text(result: CampaignResult) -> str:
-    """Return the main table as plain text."""
+    """Format the main table and its notes as text."""
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
@@ -123,19 +125,18 @@ def campaign_text(result: CampaignResult) -> str:
 
 
 def _notes(result: CampaignResult) -> list[str]:
-    """Write the notes under the table, in whole sentences."""
+    """List the notes under the table, as sentences."""
     judgement, plan = result.judgement, result.plan
-    simulated = isinstance(plan, SimulatedPlan)
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
-    share = 100 * plan.false_alarm
+    percentage = 100 * plan.false_alarm
     if judgement.thresholds:
-        key = "thresholds_of_records" if simulated else "thresholds_of_recordings"
-        notes.append(_say(key, share=share, leak_free=judgement.leak_free, judged=judgement.judged))
-    stating = [name for name in plan.detectors if plan_detector(name).scorer is None]
-    notes += [_say("own_verdict", share=share, detectors=", ".join(stating))] if stating else []
+        key = "thresholds_of_records" if isinstance(plan, SimulatedPlan) else "thresholds_of_recordings"
+        notes.append(_say(key, share=percentage, leak_free=judgement.leak_free, judged=judgement.judged))
+    stating = [name for name in plan.detectors if parse_detector_name(name).scorer is None]
+    notes += [_say("own_verdict", share=percentage, detectors=", ".join(stating))] if stating else []
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
-    notes += _known_notes(result)
+    notes += _prior_knowledge_notes(result)
     notes += [_say("batched", mode=result.mode)] if _is_batched(result) else []
     notes += [plan.note] if plan.note else []
     notes += [_say("missing", count=result.missing)] if result.missing else []
@@ -144,11 +145,12 @@ def _notes(result: CampaignResult) -> list[str]:
 
 
 def _say(name: str, **values: Any) -> str:
+    """Return a text of the section `campaign` of `messages.toml` with `values` in its placeholders."""
     return say(f"campaign.{name}", **values)
 
 
-def _known_notes(result: CampaignResult) -> list[str]:
-    """Write the notes on the channels and the assumed rig of the detectors."""
+def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
+    """Format a note for each group of detectors that know the same channels, and for each that know the same rig."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -160,19 +162,20 @@ def _known_notes(result: CampaignResult) -> list[str]:
 
 
 def _is_batched(result: CampaignResult) -> bool:
+    """Return True if the records were simulated in batches."""
     return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
-    """Write the page of a result; `files`: names of the tables beside it.
+    """Write the page of a result; `files`: names of the tables in its folder.
 
-    Raises InputError where it cannot be written.
+    Raises InputError if it cannot be written.
     """
     return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
-    """Return the page as text, with nothing outside it but links to the tables beside it."""
+    """Render the page as HTML, which links only to the tables in its folder."""
     judgement, plan = result.judgement, result.plan
     heads, rows = main_table(result)
     failed = [
@@ -190,7 +193,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
         result=result_text(result),
         notes=_notes(result),
         facts=_facts(result),
-        sections=[_section(pod, judgement, plan.unit) for pod in judgement.pods],
+        sections=[_detector_section(pod, judgement, plan.unit) for pod in judgement.pods],
         tables=page_tables(judgement, plan.unit, getattr(plan, "part", "")),
         causes=cause_tables(judgement),
         failed=failed,
@@ -211,50 +214,47 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
         *([("simulated", result.mode)] if _is_batched(result) else []),
-        *((f"seen by @ {name}" if name else "seen", ", ".join(channels)) for name, channels in plan.views.items()),
+        *((f"channels of view @ {view}" if view else "channels", ", ".join(plan.views[view])) for view in plan.views),
     ]
-    if any(plan_detector(name).scorer is None for name in plan.detectors):
+    if any(parse_detector_name(name).scorer is None for name in plan.detectors):
         facts.append(("assumed by detectors", _describe_assumed_machine(plan)))
-    for size, (mean, spread) in judgement.realised.items():
-        deviation = "" if math.isnan(spread) else f" ± {spread:.2g}"
-        facts.append(
-            (
-                f"leak of {size:g} L/min",
-                f"really {mean:.3g}{deviation} L/min (mean and standard deviation over the records)",
-            )
-        )
+    for size, (mean, deviation) in judgement.achieved_flows.items():
+        margin = "" if math.isnan(deviation) else f" ± {deviation:.2g}"
+        text = f"achieved {mean:.3g}{margin} L/min (mean and standard deviation over the records)"
+        facts.append((f"leak of {size:g} L/min", text))
     return facts
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the machine assumed by the detectors."""
+    """Describe the rig that the detectors assume, and up to six parameters that differ from the simulated rig."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
-    true = {row.name: row.value for row in plan.rig.table()}
-    other = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
-             for row in plan.assumed.table() if true.get(row.name) != row.value]  # fmt: skip
-    more = f" and {len(other) - 6} more" if len(other) > 6 else ""
-    return f"{plan.assumed.name}, which differs from the rig: {', '.join(other[:6])}{more}"
+    simulated = {row.name: row.value for row in plan.rig.table()}
+    different = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
+                 for row in plan.assumed.table() if simulated.get(row.name) != row.value]  # fmt: skip
+    more = f" and {len(different) - 6} more" if len(different) > 6 else ""
+    return f"{plan.assumed.name}, which differs from the rig: {', '.join(different[:6])}{more}"
 
 
-def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
-    """Return one detector's curves, areas and the table of its cells."""
+def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
+    """Build the template's values for one detector: plots, areas under the ROC, and detections by cell."""
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
-    shown = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
-    shown = shown if 0 < len(shown) <= _MOST_SIZES else [roc for roc in rocs if math.isnan(roc.leak_lpm)]
+    drawn_rocs = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
+    if not 0 < len(drawn_rocs) <= _MAX_SIZES:  # the curve without a size pools all sizes
+        drawn_rocs = [roc for roc in rocs if math.isnan(roc.leak_lpm)]
     cells = [cell for cell in judgement.cells if cell.detector == name]
     factors = list(cells[0].levels) if cells else []
     sizes = sorted({cell.leak_lpm for cell in cells})
     by_levels: dict[tuple[str, ...], dict[float, str]] = defaultdict(dict)
-    if factors and len(sizes) <= _MOST_SIZES + 1:
+    if factors and len(sizes) <= _MAX_SIZES + 1:
         for cell in cells:
             by_levels[tuple(map(str, cell.levels.values()))][cell.leak_lpm] = percent(cell.alarms)
     return {
         "name": name,
         "about": _describe_score(name),
-        "plots": [plot for plot in (_pod_plot(pod, unit), _roc_plot(shown, unit)) if plot is not None],
-        "areas": [(_size_text(roc, unit), _area(roc.area)) for roc in shown],
+        "plots": [plot for plot in (_pod_plot(pod, unit), _roc_plot(drawn_rocs, unit)) if plot is not None],
+        "areas": [(_size_text(roc, unit), _format_area(roc.area)) for roc in drawn_rocs],
         "cell_columns": [*factors, *("no leak" if size == 0 else f"{size:g} {unit}" for size in sizes)],
         "cells": [
             (*levels, *(cells_by_size.get(size, "–") for size in sizes)) for levels, cells_by_size in by_levels.items()
@@ -263,12 +263,13 @@ def _section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
+    """Format the leak size of an ROC."""
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score of a detector; "" if only its name is known."""
-    detector = plan_detector(name)
+    """Describe the score of a detector; "" for a detector that is not installed."""
+    detector = parse_detector_name(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
         return detector.scorer.description + through
@@ -277,8 +278,17 @@ def _describe_score(name: str) -> str:
     return f"the score of the detector {detector.base!r}{through}" if detector.base in detectors() else ""
 
 
+class _PlotCurve(NamedTuple):
+    """A curve y(x), and the lower and upper end of its band, if any."""
+
+    label: str
+    x: Array
+    y: Array
+    band: tuple[Array, Array] | None
+
+
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw detection over the size: the fractions with their intervals, the curve with its band, a90 and a90/95."""
+    """Draw detection over leak size: fractions with intervals, fitted curve with band, a90 and a90/95."""
     if len(pod.sizes) < 2:
         return None
     first, last = pod.sizes[0].size, pod.sizes[-1].size
@@ -286,13 +296,14 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     if pod.curve is not None:
         ends = first / 1.5, last * 1.5
         grid = np.geomspace(*ends, _CURVE_POINTS)
-        curves = [("hits and misses", grid, pod.curve.detection(grid), pod.curve.detection_band(grid))]
-        known = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
-        marks = [(size, label) for size, label in known if math.isfinite(size) and size <= grid[-1]]
+        band = pod.curve.detection_band(grid)
+        curves = [_PlotCurve("hits and misses", grid, pod.curve.detection(grid), band)]
+        sizes = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
+        marks = [(size, label) for size, label in sizes if math.isfinite(size) and size <= grid[-1]]
     x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)
     picture = Picture(WIDTH, HEIGHT, x_ends, (0.0, 1.0), log=True)
-    _draw_curves(picture, f"leak [{unit}]", curves)
-    for point in pod.sizes if len(pod.sizes) <= _MOST_POINTS else ():
+    _draw_detection_curves(picture, f"leak [{unit}]", curves)
+    for point in pod.sizes if len(pod.sizes) <= _MAX_FRACTIONS else ():
         detection = point.proportion
         picture.point("point", point.size, detection.value, (detection.high, detection.low))
     for k, (size, label) in enumerate(marks, 1):
@@ -302,29 +313,26 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw detection over false alarms, a line for each size; the band where there is one line alone."""
+    """Draw detection over false alarms, a line for each size; a single line is drawn with its band."""
     if not rocs:
         return None
-    curves = [
-        (_size_text(roc, unit), curve.false_alarm, curve.detection, (curve.low, curve.high) if len(rocs) == 1 else None)
-        for roc in rocs
-        for curve in [roc.curve]
-    ]
+    curves = []
+    for roc in rocs:
+        band = (roc.curve.low, roc.curve.high) if len(rocs) == 1 else None
+        curves.append(_PlotCurve(_size_text(roc, unit), roc.curve.false_alarm, roc.curve.detection, band))
     picture = Picture(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
-    _draw_curves(picture, "false alarms", curves)
+    _draw_detection_curves(picture, "false alarms", curves)
     return {"title": f"Detection over false alarms, {rocs[0].detector}", "picture": picture}
 
 
-def _draw_curves(
-    picture: Picture, x_label: str, curves: Sequence[tuple[str, Array, Array, tuple[Array, Array] | None]]
-) -> None:
-    """Draw curves (label, x, y, ends of the band), of long ones some points, with the frame and its axes."""
+def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
+    """Draw curves of the detected fraction, thinned to `_MAX_CURVE_POINTS`, with frame and axes."""
     thinned = []
-    for label, x, y, ends in curves:
-        kept = np.unique(np.linspace(0, x.size - 1, min(x.size, _MOST_DRAWN)).round().astype(np.int64))
-        thinned.append((label, x[kept], y[kept]))
-        if ends is not None:
-            picture.area("band", x[kept], ends[0][kept], ends[1][kept])
+    for label, x, y, band in curves:
+        indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))
+        thinned.append((label, x[indices], y[indices]))
+        if band is not None:
+            picture.area("band", x[indices], band[0][indices], band[1][indices])
     for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
         picture.mark("grid", value)
         picture.below(value, f"{value:g}")

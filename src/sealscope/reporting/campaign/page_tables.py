@@ -1,4 +1,4 @@
-"""The tables of a campaign's page beside the main one: onsets, flows, causes, as text."""
+"""Build the further tables of a campaign's page as text: onsets, flows, faults, families and causes."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sealscope.campaigns.judging.judge import Judgement
-from sealscope.campaigns.judging.tables import attribute_of
+from sealscope.campaigns.judging.tables import resolve_attribute
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 
 
 def percent(proportion: Proportion | None) -> str:
-    """Return a proportion with its interval in per cent, a dash where nothing is known."""
+    """Format a proportion with its interval in percent; a dash if there are no records."""
     if proportion is None or proportion.n == 0:
         return "–"
-    return f"{_p(proportion.value)} % ({_p(proportion.low)}–{_p(proportion.high)})"
+    value, low, high = map(_format_percent, (proportion.value, proportion.low, proportion.high))
+    return f"{value} % ({low}–{high})"
 
 
-def _p(share: float) -> str:
-    value = 100.0 * share
+def _format_percent(fraction: float) -> str:
+    """Format a fraction in percent, with more digits if it is small."""
+    value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
     return f"{value:.{digits}f}"
 
 
 class PageTable(NamedTuple):
-    """A table of the page: `words`, how many columns of text stand first; `about`: what it shows, in a sentence."""
+    """A table of the page; `about`: description of its content; `words`: number of leading columns with text."""
 
     id: str
     title: str
@@ -38,11 +40,11 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Return the tables of statements, faults and families by name, without the empty ones."""
+    """Build the tables of `page_tables.toml` by name, without empty ones."""
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
-        rows = [tuple(_cell(row, content) for content in columns.values()) for row in getattr(judgement, name)]
+        rows = [tuple(_format_cell(row, content) for content in columns.values()) for row in getattr(judgement, name)]
         if rows:
             title = layout["title"].format(part=f" ({part})" if part else "")
             heads = [head.format(unit=unit) for head in columns]
@@ -50,17 +52,18 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
     return tables
 
 
-def _cell(row: Any, content: str) -> str:
-    """Format one cell of a row by the layout of its column."""
-    how, _, path = content.rpartition(" ")
-    value = attribute_of(row, path)
-    return _FORMATS[how](value) if how in _FORMATS else format(value, how)
+def _format_cell(row: Any, content: str) -> str:
+    """Format one cell of a row by its column's `content`: an entry of `_FORMATS` or a format, and an attribute."""
+    format_name, _, path = content.rpartition(" ")
+    value = resolve_attribute(row, path)
+    return _FORMATS[format_name](value) if format_name in _FORMATS else format(value, format_name)
 
 
 class CauseTable(NamedTuple):
-    """The causes named by one detector (`columns`) for each true cause: its name, its records, the share of each.
+    """The causes that one detector names.
 
-    `right`: records whose cause is named alone; `covered`: alone or with the one that no channel tells from it.
+    A row: true cause, number of its records, and fraction with each named cause (`columns`). `right`: fraction of all
+    records with exactly the true cause; `covered`: also with an ambiguous cause that includes it.
     """
 
     detector: str
@@ -71,22 +74,28 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Tabulate the causes named by each detector, for each true cause."""
+    """Build the table of named causes by true cause for each detector."""
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion
-        every = zip(confusion.rows, confusion.counts, confusion.shares, strict=True)
-        rows = [(name, int(counts.sum()), [*map(_share, shares)]) for name, counts, shares in every if counts.any()]
+        confusion_rows = zip(confusion.rows, confusion.counts, confusion.shares, strict=True)
+        rows = [
+            (name, int(counts.sum()), [*map(_format_fraction, shares)])
+            for name, counts, shares in confusion_rows
+            if counts.any()
+        ]
         right, covered = percent(confusion.accuracy), percent(causes.covered)
         tables.append(CauseTable(causes.detector, confusion.columns, rows, right, covered))
     return tables
 
 
-def _share(proportion: Proportion) -> str:
+def _format_fraction(proportion: Proportion) -> str:
+    """Format a proportion in percent, a dot for none."""
     return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 
-def _quantile(quantile: IntervalEstimate) -> str:
+def _format_quantile(quantile: IntervalEstimate) -> str:
+    """Format a quantile with its interval; a dash for an infinite value or end."""
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):
@@ -98,5 +107,5 @@ def _quantile(quantile: IntervalEstimate) -> str:
 _FORMATS: Mapping[str, Callable[[Any], str]] = {
     "size": lambda size: f"{size:g}" if size else "no leak",
     "percent": percent,
-    "quantile": _quantile,
+    "quantile": _format_quantile,
 }

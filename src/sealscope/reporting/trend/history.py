@@ -1,4 +1,4 @@
-"""The page of a commissioned machine: its newest verdict, and all its recordings on one axis of time."""
+"""Write the page of a commissioned machine: its newest verdict, and all its recordings over time."""
 
 from __future__ import annotations
 
@@ -22,41 +22,41 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A diagnosis, the start of its recording [s since 1970] or None, and a function to read it again."""
+    """A diagnosis, the start of its recording [s since 1970] or None, and a function that reads the recording."""
 
     diagnosis: Diagnosis
     start_s: float | None
     read: Callable[[], Recording]
 
 
-#: What a recording states of the leak [L/min]: figure, ends of its interval; a bound where the lower one is None.
+#: Leak of a recording [L/min]: (estimate, lower, upper end of its interval), or (bound, None, bound).
 _Level = tuple[float, float | None, float]
 
 
 def write_history_page(
     path: str | os.PathLike[str], judged: Sequence[Judged], *, title: str, left_out: int = 0
 ) -> Path:
-    """Write the page of a machine, whole or not at all; arguments and errors as for `render_history_page`."""
-    return template.write(template.check_page(path, card=False), render_history_page(judged, title, left_out))
+    """Write the page of a machine atomically; arguments and errors as for `render_history_page`."""
+    return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
 
 def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0) -> str:
-    """Return the page of a machine as HTML: its recordings and their diagnoses, in any order.
+    """Render the page of a machine as HTML from its recordings and their diagnoses, in any order.
 
-    `title`: name of the machine; `left_out`: files that could not be read. Raises InputError without a recording.
+    `title`: name of the machine; `left_out`: number of files that could not be read. Raises InputError if `judged` is
+    empty.
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
+    first = -math.inf  # recordings without a date come first
     ordered = sorted(
-        judged, key=lambda entry: (-math.inf if entry.start_s is None else entry.start_s, entry.diagnosis.file)
+        judged, key=lambda entry: (first if entry.start_s is None else entry.start_s, entry.diagnosis.file)
     )
     newest = ordered[-1].diagnosis
     dates = _dates(ordered)
-    shown, drawn, files = _overlay(ordered)
-    rows = [
-        {"file": Path(entry.diagnosis.file).name, "date": date, "d": entry.diagnosis}
-        for entry, date in zip(ordered, dates, strict=True)
-    ]
+    page_charts, drawn, files = _draw_comparison(ordered)
+    entries = zip(ordered, dates, strict=True)
+    rows = [{"file": Path(entry.diagnosis.file).name, "date": date, "d": entry.diagnosis} for entry, date in entries]
     return template.render(
         "history.html.j2",
         d=newest,
@@ -66,7 +66,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
         undated=sum(entry.start_s is None for entry in ordered),
         left_out=left_out,
         levels=history_pictures(ordered),
-        charts=shown,
+        charts=page_charts,
         drawn=drawn,
         files=files,
         chart_data=None if drawn is None else drawn.data,
@@ -74,32 +74,38 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Return the pictures of recordings in their order.
+    """Draw the leak of each recording over time, by picture size; None if no recording states an estimate or bound.
 
-    Days of their dates, numbers from 1 where a date is not known. None where no recording states a figure or a bound.
+    Recordings are drawn by number, from 1, if a date is missing.
     """
-    levels = [_level(entry.diagnosis) for entry in ordered]
-    known = [level for level in levels if level is not None]
-    if not known:
+    levels = [_leak_level(entry.diagnosis) for entry in ordered]
+    known_levels = [level for level in levels if level is not None]
+    if not known_levels:
         return None
-    dated = all(entry.start_s is not None for entry in ordered)
-    days = [(entry.start_s or 0.0) / DAY if dated else float(k + 1) for k, entry in enumerate(ordered)]
+    has_dates = all(entry.start_s is not None for entry in ordered)
+    days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    far = 8.0 * float(np.median([lpm for lpm, *_ in known])) or math.inf  # beyond it others would be pressed flat
-    near = [value for lpm, _, high in known for value in (lpm, high) if value <= far and value < math.inf]
-    near += [] if limit is None or limit > far else [limit]
-    top = 1.08 * max(near, default=0.0) or 1.0
+    # larger values are drawn as a symbol at the top, as they would flatten the others
+    max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf
+    shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
+    shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
+    shown_values += [] if limit is None or limit > max_shown else [limit]
+    top = 1.08 * max(shown_values, default=0.0) or 1.0
 
-    def moment(day: float) -> str:
-        return stamp(day * DAY, days[-1] - days[0]) if dated else f"{day:g}" if day.is_integer() else ""
+    def format_day(day: float) -> str:
+        """Format a tick: its date, or the number of a recording, "" between two numbers."""
+        if has_dates:
+            return stamp(day * DAY, days[-1] - days[0])
+        return f"{day:g}" if day.is_integer() else ""
 
-    def draw(picture: Picture) -> None:
+    def draw_levels(picture: Picture) -> None:
+        """Draw each recording as a point with its interval, or as the symbol of a bound, a large or a missing value."""
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, picture.height - 4.0)
                 continue
             lpm, low, high = level
-            title = f"{Path(entry.diagnosis.file).name}: {messages.flow(entry.diagnosis)}"
+            title = f"{Path(entry.diagnosis.file).name}: {messages.format_leak_flow(entry.diagnosis)}"
             if lpm > top:
                 picture.symbol("beyond", day, 6.0, title)
             elif low is None:
@@ -107,10 +113,11 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
             else:
                 picture.point("point", day, lpm, (low, min(high, top)), title)
 
-    return level_pictures((days[0], days[-1]), (0.0, top), limit, moment, draw)
+    return level_pictures((days[0], days[-1]), (0.0, top), limit, format_day, draw_levels)
 
 
-def _level(diagnosis: Diagnosis) -> _Level | None:
+def _leak_level(diagnosis: Diagnosis) -> _Level | None:
+    """Return the leak of a diagnosis with its interval, or its bound; None if it states neither."""
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
         return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
@@ -121,34 +128,39 @@ def _level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    known = [entry.start_s for entry in ordered if entry.start_s is not None]
-    span = (max(known) - min(known)) / DAY if known else 0.0
-    return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span) for entry in ordered]
+    """Format the start of each recording as a date, a dash if not known."""
+    starts = [entry.start_s for entry in ordered if entry.start_s is not None]
+    span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
+    return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]
 
 
-def _overlay(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the newest recording's channels, with those of the last earlier one judged `no leak` over them.
+def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
+    """Draw the newest recording's channels together with those of the last earlier one, if possible judged `no leak`.
 
-    Both begin together. With them the two files; nothing where there is no other recording, or no channel of both.
+    Both are drawn from a common start. Returns (charts, drawn charts, names of the two files), empty if there is no
+    earlier recording, no common channel or a clock that does not increase.
     """
-    *before, newest = ordered
-    healthy = [latest for latest in before if latest.diagnosis.verdict == "no leak"]
-    if not before:
+    *earlier, newest = ordered
+    healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]
+    if not earlier:
         return [], None, []
-    reference = (healthy or before)[-1]
+    reference = (healthy or earlier)[-1]
     latest, other = newest.read(), reference.read()
     if not all(recording.t.size and np.all(np.diff(recording.t) > 0.0) for recording in (latest, other)):
         return [], None, []
     files = [Path(judged.diagnosis.file).name for judged in (newest, reference)]
-    t = other.t - other.t[0] + latest.t[0]
-    shown = []
+    other_t = other.t - other.t[0] + latest.t[0]
+    comparison = []
     for name in latest.channels:
         if name not in other or latest.units[name] != other.units[name]:
             continue
         pressure_unit = latest.pressure_unit
-        unit, values = charts.shown_values(latest, name, pressure_unit)
-        over = replace(latest, channels={name: np.interp(latest.t, t, other[name], left=np.nan, right=np.nan)})
-        values_over = charts.shown_values(over, name, pressure_unit)[1]
-        lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", values_over))
-        shown.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
-    return (shown, charts.draw(latest, [], shown, newest.diagnosis, []), files) if shown else ([], None, [])
+        unit, values = charts.display_values(latest, name, pressure_unit)
+        samples = np.interp(latest.t, other_t, other[name], left=np.nan, right=np.nan)
+        resampled = replace(latest, channels={name: samples})
+        other_values = charts.display_values(resampled, name, pressure_unit)[1]
+        lines = (charts.ChartLine(files[0], "a", values), charts.ChartLine(files[1], "b", other_values))
+        comparison.append(charts.Chart(f"over-{name}", "channels", name, unit, lines))
+    if not comparison:
+        return [], None, []
+    return comparison, charts.draw(latest, [], comparison, newest.diagnosis, []), files

@@ -1,4 +1,4 @@
-"""The page of a trend: one HTML file that works offline; recordings, healthy band, course and limit as SVG."""
+"""Write the page of a trend: one HTML file that works offline, with recordings, healthy band and limit as SVG."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ from sealscope.reporting.picture import Picture
 from sealscope.reporting.trend import text
 from sealscope.units import DAYS_PER_MONTH
 
-#: Sizes of the picture: for a screen, and for a telephone; the margins left of its frame, above, right and below.
+#: Sizes of the picture for a screen and for a telephone, and its margins left of the frame, above, right and below.
 SIZES = {"wide": (900.0, 320.0), "narrow": (420.0, 300.0)}
 _MARGINS = (58.0, 14.0, 12.0, 26.0)
-#: Distances between two ticks: minutes, hours, days; in days.
+#: Width of a tick's label with its margin, and half of the label's width, in pixels.
+_TICK_WIDTH, _HALF_LABEL = 110.0, 22.0
+#: Distances between two ticks [d], from a minute to five years.
 _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91, 182, 365, 730, 1826)
 
 
 def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
-    """Write the page of a trend, whole or not at all."""
-    return template.write(template.check_page(path, card=False), render_trend_page(trend, title=title))
+    """Write the page of a trend atomically."""
+    return template.write(template.parse_page_path(path, card=False), render_trend_page(trend, title=title))
 
 
 def render_trend_page(trend: Trend, *, title: str = "") -> str:
-    """Return the page of a trend as HTML."""
+    """Render the page of a trend as HTML."""
     return template.render(
         "trend.html.j2",
         trend=trend,
@@ -46,13 +48,13 @@ def level_pictures(
     days: tuple[float, float],
     levels: tuple[float, float],
     limit: float | None,
-    moment: Callable[[float], str],
+    format_day: Callable[[float], str],
     draw: Callable[[Picture], None],
 ) -> dict[str, Picture]:
-    """Return levels over days as pictures by the names of their `SIZES`.
+    """Draw leak levels over time, in each of the `SIZES`.
 
-    `days`: of the first and the last recording, with a tick at the first; `levels`: ends of the axis; `limit`: drawn
-    where it is on the axis; `moment`: a day in words; `draw` draws the rest into each picture.
+    `days`: first and last recording, with a tick at the first; `levels`: ends of the axis; `limit`: repair limit, drawn
+    if it is on the axis; `format_day`: text of a tick; `draw`: draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5
     first, last = days[0] - margin, days[1] + margin
@@ -60,10 +62,11 @@ def level_pictures(
     pictures = {}
     for size, (width, height) in SIZES.items():
         picture = Picture(width - left - right, height - top - bottom, (first, last), levels, margins=_MARGINS)
-        step = next((step for step in _STEPS if (last - first) / step <= width / 110.0), _STEPS[-1])
+        step = next((step for step in _STEPS if (last - first) / step <= width / _TICK_WIDTH), _STEPS[-1])
         picture.frame(4)
         for day in np.arange(days[0], last, step).tolist():
-            picture.below(day, moment(day), "middle" if picture.x(day) + 22.0 <= picture.width else "end")
+            has_room = picture.x(day) + _HALF_LABEL <= picture.width
+            picture.below(day, format_day(day), "middle" if has_room else "end")
         if limit is not None and limit <= levels[1]:
             picture.level("limit", limit)
         draw(picture)
@@ -72,15 +75,15 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Return the pictures of a trend; None where no recording states a level."""
+    """Draw a trend in each of the `SIZES`; None if no recording states a level."""
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
-    ends, moment = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
-    return level_pictures(ends, _levels(trend), trend.limit, moment, partial(_draw, trend))
+    ends, format_day = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
+    return level_pictures(ends, _y_limits(trend), trend.limit, format_day, partial(_draw_trend, trend))
 
 
-def _draw(trend: Trend, picture: Picture) -> None:
-    """Draw the healthy band, the recordings, the course, alarms and repairs."""
+def _draw_trend(trend: Trend, picture: Picture) -> None:
+    """Draw healthy band, recordings, fitted line, alarms and repairs into a picture."""
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
         healthy = episode.wear.healthy
@@ -98,11 +101,11 @@ def _draw(trend: Trend, picture: Picture) -> None:
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
         picture.point(style, point.day, point.value, (point.low or 0.0, point.high or 0.0), title)
     for episode in trend.episodes:
-        picture.line("course", *np.transpose(_course(days, episode)))
+        picture.line("course", *np.transpose(_fitted_line(days, episode)))
 
 
-def _levels(trend: Trend) -> tuple[float, float]:
-    """Return the ends of the axis of levels, which includes a nearby limit."""
+def _y_limits(trend: Trend) -> tuple[float, float]:
+    """Compute the limits of the axis of levels, which include a nearby repair limit."""
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)
@@ -114,12 +117,13 @@ def _levels(trend: Trend) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _course(days: list[float], episode: Episode) -> list[tuple[float, float]]:
-    """Return corners (day, level) of the course that a stretch is described by."""
+def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
+    """Return the vertices (day, level) of the line fitted to an episode: straight, or constant up to an onset."""
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:
-        rise = wear.growth.value if math.isfinite(wear.growth.value) else 0.0
-        return [(first, wear.now.value - rise * (last - first) / DAYS_PER_MONTH), (last, wear.now.value)]
+        growth_per_month = wear.growth.value if math.isfinite(wear.growth.value) else 0.0
+        start_level = wear.total.value - growth_per_month * (last - first) / DAYS_PER_MONTH
+        return [(first, start_level), (last, wear.total.value)]
     onset = min(max(wear.onset.value, first), last)
-    stepped = [(onset, wear.now.value)] if wear.step else []
-    return [(first, wear.healthy.value), (onset, wear.healthy.value), *stepped, (last, wear.now.value)]
+    step_end = [(onset, wear.total.value)] if wear.step else []
+    return [(first, wear.healthy.value), (onset, wear.healthy.value), *step_end, (last, wear.total.value)]

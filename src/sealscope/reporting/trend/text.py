@@ -1,4 +1,4 @@
-"""The trend in words: what a person reads first, on the terminal and on the page."""
+"""Format a trend as text for the terminal and the page."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ import math
 import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.wear import Wear
-from sealscope.paragraphs import paragraph, paragraphs
-from sealscope.recordings.formats.columns import counted
+from sealscope.paragraphs import format_count, paragraph, paragraphs
 from sealscope.reporting.messages import machine_text, number, say, state_text
 from sealscope.storage.csv_file import guard_cell
 from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the name of a level: the total of pump and piston, or the ringing of now."""
+    """Return the label of the present level: `total` of pump and piston, or `now` for ringing."""
     return "now" if trend.basis == "ringing" else "total"
 
 
 def moment(trend: Trend, day: float) -> str:
-    """Return a time of a trend: a date, with the time of day where the recordings lie close, or a number of days."""
+    """Format a day of a trend as a date, or as a number of days if the recordings have no dates."""
     if not trend.dated or not trend.points:
         return f"day {day:.3g}"
     first, last = trend.points[0], trend.points[-1]
@@ -33,29 +32,31 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Return a time [s since 1970] as a date, with the time of day where all times lie within three days."""
+    """Format a time [s since 1970] as a date, with the time of day if `span_days` is below three."""
     text = str(np.datetime64(round(seconds * 1e3), "ms"))
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
 
-def recordings(trend: Trend) -> str:
-    """Count the recordings, and give the first and the last day."""
+def recordings_text(trend: Trend) -> str:
+    """Format the number of recordings, and the first and the last day."""
     count, ends = len(trend.points), [moment(trend, trend.points[k].day) for k in (0, -1) if trend.points]
-    return ", ".join([counted(count, "recording"), *([" to ".join(ends)] if ends else [])])
+    return ", ".join([format_count(count, "recording"), *([" to ".join(ends)] if ends else [])])
 
 
 def headline(trend: Trend) -> str:
-    """Format the verdict and its basis in one line."""
-    wear, line, since = trend.wear, "trend", ""
-    if trend.verdict == "no leak" and trend.repairs:  # what was before is over
-        line, since = "trend_fell", moment(trend, trend.repairs[-1].day)
+    """Format the verdict, the leak's onset or the last repair, and the recordings in one line."""
+    wear, key, since = trend.wear, "trend", ""
+    if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
+        key, since = "trend_fell", moment(trend, trend.repairs[-1].day)
     elif wear is not None and wear.onset is not None:
-        line, since = "trend_since", moment(trend, wear.onset.value)
-    return say(f"terminal.{line}", verdict=trend.verdict, since=since, recordings=recordings(trend))
+        key, since = "trend_since", moment(trend, wear.onset.value)
+    return say(f"terminal.{key}", verdict=trend.decision.summary, since=since, recordings=recordings_text(trend))
 
 
-def sentence(trend: Trend) -> str:
+def verdict_sentence(trend: Trend) -> str:
     """Return the verdict as a sentence."""
+    if trend.decision.summary != trend.verdict:
+        return trend.decision.summary.capitalize()
     key = "ringing"
     if trend.verdict == "no leak":
         key = "fell" if trend.repairs else "no leak"
@@ -67,91 +68,94 @@ def sentence(trend: Trend) -> str:
 
 
 def figures(trend: Trend) -> dict[str, str]:
-    """Return the present total, the leak, the healthy total, since when it is another, growth and limit, in words.
+    """Format present level, leak, healthy range, onset, growth and time to the limit; "" for those not known.
 
-    The total is what pump and piston pass together, the leak its rise over the healthy one. What is not known is an
-    empty text.
+    The level is the leakage of pump and piston together, the leak its rise over the healthy level.
     """
     wear = trend.wear
     if wear is None:
-        return dict.fromkeys(("now", "leak", "healthy", "since", "growth", "limit"), "")
+        return dict.fromkeys(("total", "leak", "healthy", "since", "growth", "limit"), "")
     at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
-    of_first = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
-    healthy = f"{number(wear.healthy.low, 2)} to {number(healthy_end(wear), 2)} {trend.unit}{of_first}"
+    reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
+    high = healthy_end(wear)
+    is_whole = high == wear.healthy.high
+    remark = "95 of 100 recordings" if is_whole else "cut off at the limit: healthy recordings lie above, too"
+    healthy = f"{number(wear.healthy.low, 2)} to {number(high, 2)} {trend.unit}{reference}, {remark}"
     since, growth = "", "not stated: the recordings are too few, or span less than a day"
     if wear.onset is not None:
-        value, low, high = (moment(trend, day) for day in wear.onset)
-        since = f"{value} ({low} to {high})"
+        onset, earliest, latest = (moment(trend, day) for day in wear.onset)
+        since = f"{onset} ({earliest} to {latest})"
     if wear.step is not None:
-        growth = f"a step of {_figure(wear.step, trend.unit)}"
+        growth = f"a step of {_format_estimate(wear.step, trend.unit)}"
     elif math.isfinite(wear.growth.value):
-        growth = f"{_figure(wear.growth, trend.unit)} a month"
-    rise = wear.step or Interval(*(level - wear.healthy.value for level in wear.now))
+        growth = f"{_format_estimate(wear.growth, trend.unit)} a month"
     return {
-        "now": f"{_figure(wear.now, trend.unit)}{at_pressure}",
-        "leak": _figure(rise, trend.unit) if trend.verdict == "leak" else "",
-        "healthy": f"{healthy}, 95 of 100 recordings",
+        "total": f"{_format_estimate(trend.total or wear.total, trend.unit)}{at_pressure}",
+        "leak": _format_estimate(trend.leak, trend.unit) if trend.verdict == "leak" and trend.leak else "",
+        "healthy": healthy,
         "since": since,
         "growth": growth,
-        "limit": "" if wear.reach is None or wear.limit is None else _reach(trend, wear.limit, wear.reach),
+        "limit": "" if wear.reach is None or wear.limit is None else _format_reach(trend, wear.limit, wear.reach),
     }
 
 
 def healthy_end(wear: Wear) -> float:
-    """Return the upper end of the healthy range, cut off at the limit despite any wider scatter."""
+    """Return the upper end of the healthy range, limited to the repair limit."""
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
-def _figure(interval: Interval, unit: str) -> str:
-    """Return an estimate with its interval; an end that is not known is left open."""
+def _format_estimate(interval: Interval, unit: str) -> str:
+    """Format an estimate with its interval; an infinite end is `open`."""
     if not math.isfinite(interval.value):
         return "not known"
     ends = (number(end, 2) if math.isfinite(end) else "open" for end in (interval.low, interval.high))
     return f"{number(interval.value, 2)} {unit} ({' to '.join(ends)})"
 
 
-def _reach(trend: Trend, limit: float, reach: Interval) -> str:
-    """Return when the level reaches its limit, `reach` days after the last recording."""
-    named, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
-    furthest = priors("trend")["course"]["furthest"]
-    value, low, high = (moment(trend, last + days) if days <= furthest else "later" for days in reach)
+def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
+    """Format the limit and the date at which the level reaches it, by `reach` [d] from the last recording on."""
+    limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
+    max_days = TREND.history.furthest
+    expected, earliest, latest = (moment(trend, last + days) if days <= max_days else "later" for days in reach)
     if reach.value == 0.0:
-        return f"{named} is reached"
-    if trend.alarm is not None and reach.value <= furthest:
-        return f"{named}, reached {value} ({low} to {high}) if it goes on so"
-    if reach.low > furthest:
-        return f"{named}, not within {furthest / DAYS_PER_YEAR:.0f} years"
+        return f"{limit_text} is reached"
+    if trend.alarm is not None and reach.value <= max_days:
+        return f"{limit_text}, reached {expected} ({earliest} to {latest}) if it goes on so"
+    if reach.low > max_days:
+        return f"{limit_text}, not within {max_days / DAYS_PER_YEAR:.0f} years"
+    # a prediction is not stated if it is nearer than one interval between recordings
     if reach.low * max(len(trend.rows) - 1, 1) < last - first or math.isnan(reach.value):
-        return f"{named}; the recordings are too few to say when"
-    return f"{named}, not before {low} (95 %)"
+        return f"{limit_text}; the recordings are too few to say when"
+    return f"{limit_text}, not before {earliest} (95 %)"
 
 
-def assumed(trend: Trend) -> str:
-    """Describe the basis of the levels: machine, estimate and oil temperature."""
+def assumptions_text(trend: Trend) -> str:
+    """Format the assumptions behind the levels: method, machine data, oil temperature and healthy recordings."""
     machine = ""
     if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
         if trend.unit == "L/min":
             machine = f"L/min rest on {machine_text(trend.machine)}. "
     basis = "" if trend.basis is None else say(f"trend_basis.{trend.basis}")
-    known = [point.temperature is not None for point in trend.points if point.value is not None]
-    oil = "taken out" if all(known) and trend.basis != "ringing" else "not taken out"
-    oil = oil if any(known) else "not known"
+    is_known = [point.temperature is not None for point in trend.points if point.value is not None]
+    oil = "taken out" if all(is_known) and trend.basis != "ringing" else "not taken out"
+    oil = oil if any(is_known) else "not known"
     first = "The first recording is" if trend.healthy == 1 else f"The first {trend.healthy} recordings are"
     return f"{basis}{machine}The oil's temperature is {oil}. {first} taken to be of a healthy machine."
 
 
 def limit_note(trend: Trend) -> str:
-    """Describe the limit."""
-    maker = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
-    within = trend.wear is not None and trend.wear.limit is not None and trend.wear.limit < trend.wear.healthy.high
-    scatter = "; healthy recordings of this machine scatter as far" if within else ""
-    return f"{trend.repair} beyond the healthy level{maker}{scatter}"
+    """Format the repair limit, its origin, and whether healthy recordings scatter as far."""
+    origin = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
+    wear = trend.wear
+    is_in_scatter = wear is not None and wear.limit is not None and wear.limit < wear.healthy.high
+    scatter = "; healthy recordings of this machine scatter as far" if is_in_scatter else ""
+    return f"{trend.repair} beyond the healthy level{origin}{scatter}"
 
 
 def events(trend: Trend) -> list[str]:
-    """Return alarms and repairs, in the order of their times."""
+    """List alarms and repairs in the order of their times, as text."""
     lines = []
     for episode in trend.episodes:
         if episode.fell:
@@ -164,14 +168,14 @@ def events(trend: Trend) -> list[str]:
 
 
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
-    """Return the trend as lines of at most 80 columns; `whole`: with the reason, what was assumed and all findings."""
+    """Format the trend as lines of at most 80 columns; `whole`: with reason, assumptions and all findings."""
     known, findings = figures(trend), [finding.text for finding in trend.findings]
     rows = [("state", state_text(trend.state))]
-    rows += [(level_name(trend), known["now"])]
+    rows += [(level_name(trend), known["total"])]
     rows += [(name, known[name]) for name in ("leak", "healthy", "since", "growth", "limit")]
     rows += [("event", line) for line in events(trend)]
     if whole:
-        rows += [("reason", trend.reason), ("assumed", assumed(trend))]
+        rows += [("reason", trend.reason), ("assumed", assumptions_text(trend))]
         rows += [("limit", limit_note(trend)), *(("data", text) for text in findings)]
     else:
         more = f" (and {len(findings) - 1} more: -v)" if len(findings) > 1 else ""
@@ -182,7 +186,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 
 
 def trend_csv(trend: Trend) -> str:
-    """Return the recordings of a trend as a table, one row each."""
+    """Format the recordings of a trend as CSV, one row each."""
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
     with io.StringIO(newline="") as text:

@@ -1,1 +1,1 @@
-"""Many experiments side by side, reduced to statistics as they run."""
+"""Many experiments at once, reduced to statistics as they run."""

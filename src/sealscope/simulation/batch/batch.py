@@ -1,7 +1,7 @@
 """Many experiments at once: eight to a vector register, over all cores, reduced to statistics as they run.
 
-Memory does not grow with the number or the length of the runs but for what describes and what is reported of each:
-pressures, readings and details exist for a few seconds of each run only.
+Pressures, readings and details are kept for a few seconds of each run only, so that memory grows with the number of the
+runs only by the description and the result of each, and not with their length.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
-from sealscope.simulation.batch.run import LaneSet, SetRun, sets_of, with_sizes
+from sealscope.simulation.batch.run import ExperimentSet, SetRun, group_experiments, with_leak_coefficient
 from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment
-from sealscope.simulation.integrate import FINEST, FIRST_WINDOW, trajectory
+from sealscope.simulation.integrate import FIRST_WINDOW, MAX_STEP_REFINEMENT, integrate_run
 from sealscope.simulation.sizing import size_leaks
 from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Told how far the batch is, 0..1.
+#: Called with the completed fraction of the batch.
 Progress = Callable[[float], None]
-#: Members of a set on which its step is chosen, and for how long [s] each of them runs for that.
-_SCOUTS, _SCOUTED = 4, 2.0 * FIRST_WINDOW
+#: Members of a set on which its step is chosen, and how long [s] each of them is run for that.
+_N_SAMPLE_RUNS, _SAMPLE_DURATION = 4, 2.0 * FIRST_WINDOW
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,8 +38,8 @@ class Batch:
     """Result of `simulate_batch`: RMS of the details in segments, and the leaks of the runs.
 
     `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
-    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while open [L/min];
-    `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) [s].
+    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) limits of the segments [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while
+    open [L/min]; `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) solver's [s].
     """
 
     rms: Array
@@ -58,11 +58,12 @@ class Batch:
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
         """Return the RMS of one detail of one channel in each segment, (runs, segments)."""
-        return np.asarray(self.rms[:, _place(channel, CHAMBERS, "channel"), :, _place(detail, QUANTITIES, "detail")])
+        i, k = _index_of(channel, CHAMBERS, "channel"), _index_of(detail, QUANTITIES, "detail")
+        return np.asarray(self.rms[:, i, :, k])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
-        """Compute the change of an RMS from segment `before` to segment `after`, (runs,) [%]: the thesis's statistic.
+        """Compute the relative change of an RMS from segment `before` to `after`, (runs,) [%]: the thesis's statistic.
 
         Examples
         --------
@@ -100,7 +101,8 @@ class Batch:
         return pd.DataFrame(columns)
 
 
-def _place(name: str, names: tuple[str, ...], what: str) -> int:
+def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
+    """Return the index of a name in `names`; raise InputError, which calls it `what`, if it is unknown."""
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -115,26 +117,26 @@ def simulate_batch(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Batch:
-    """Simulate experiments side by side and keep the RMS of the db8 details of p_A and p_B as recorded.
+    """Simulate many experiments at once, and compute the RMS of the db8 details of p_A and p_B as recorded.
 
-    The runs have one duration and one sampling rate; rigs, leaks (one each, opening abruptly or evenly), drifts,
-    faults of the machine and loads may all differ. A run's step is its own `step`, or one that is chosen by its own or
-    this `error` for all runs of its kind, command and load. Results do not depend on the order of the runs, their
-    number or `threads`. The noise is another stream than that of `simulate`.
+    All runs must have one duration and one sampling rate; rigs, leaks (at most one each, opening abruptly or linearly),
+    drifts, faults of the machine and loads may differ. The step of a run is its own `step` if stated; otherwise one
+    step is chosen for all runs with the same laws, command, load and error (their own, or `error`). Results do not
+    depend on the runs' order or number, nor on `threads`. The noise differs from that of `simulate`.
 
     Parameters
     ----------
     experiments : iterable of Experiment
-        What is simulated.
+        The runs.
     bounds : sequence of float, optional
-        Times [s] between which the segments lie, both halves by default; samples at the record's ends that the
-        transform cannot see whole are left out.
+        Limits of the segments [s], by default both halves of the record; samples near the record's ends, where the
+        wavelet's filters reach beyond it, are left out.
     error : float or str, optional
-        Error that a pressure may have [Pa rms] in the runs that state neither a step nor an error.
+        Largest rms error of a pressure [Pa] in the runs that state neither a step nor an error.
     threads : int, optional
-        Threads of the processor, by default one a core.
+        Number of threads, by default one a core.
     progress : callable, optional
-        Called with how far the batch is (0 to 1).
+        Called with the completed fraction of the batch (0 to 1).
 
     Returns
     -------
@@ -144,9 +146,9 @@ def simulate_batch(
     Raises
     ------
     InputError
-        The runs cannot be side by side.
+        The runs cannot be in one batch.
     SimulationFailed
-        A run, which the message names, diverged or fell below vacuum.
+        A run diverged or fell below vacuum; the message names it.
 
     Examples
     --------
@@ -160,82 +162,88 @@ def simulate_batch(
     for experiment in experiments:
         if not isinstance(experiment, Experiment):
             raise InputError(f"a batch must have experiments (Experiment.of(...) makes one), got {experiment!r}")
-    sets = sets_of(experiments)
+    sets = group_experiments(experiments)
     first = experiments[0]
     edges = np.array([0.0, 0.5, 1.0]) * first.duration if bounds is None else np.asarray(bounds, dtype=np.float64)
-    inside = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
-    if not (inside and edges[0] >= 0 and edges[-1] <= first.duration):
+    is_rising = edges.ndim == 1 and edges.size >= 2 and np.all(np.isfinite(edges)) and np.all(np.diff(edges) > 0)
+    if not (is_rising and edges[0] >= 0 and edges[-1] <= first.duration):
         raise InputError(f"bounds must rise within 0 .. {first.duration:g} s, got {edges.tolist()}")
     n, segments = len(experiments), edges.size - 1
-    batch = Batch(np.empty((n, 2, segments, 5)), edges, np.empty(n), np.empty(n), np.empty(n))
-    done = 0.0
-    for part in sets:
+    batch = Batch(np.empty((n, len(CHAMBERS), segments, len(QUANTITIES))), edges, *(np.empty(n) for _ in range(3)))
+    completed = 0.0
+    for experiment_set in sets:
+        set_fraction = len(experiment_set.members) / n
 
-        def report(share: float, start_share: float = done, size: int = len(part.members)) -> None:
+        def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
+            """Report the completed fraction of the batch from that of this set; `before`: that of the sets before."""
             if progress is not None:
-                progress(min(1.0, start_share + share * size / n))
+                progress(min(1.0, before + fraction * set_fraction))
 
-        stated_error = part.experiment.error
-        _run(part, batch, error if stated_error is None else stated_error, threads or os.cpu_count() or 1, report)
-        done += len(part.members) / n
+        set_error = error if experiment_set.experiment.error is None else experiment_set.experiment.error
+        _run_set(experiment_set, batch, set_error, threads or os.cpu_count() or 1, report)
+        completed += set_fraction
     return batch
 
 
-def _run(part: LaneSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]) -> None:
-    places = [member.place for member in part.members]
-    sizes = np.array([member.leak.coefficient or 0.0 for member in part.members])
-    step = part.experiment.step or chosen_step(part, sizes, error)
-    if any(member.leak.mean for member in part.members):
-        sizes = _sized(part, step, sizes, threads)
-        step = part.experiment.step or min(step, chosen_step(part, sizes, error))
-    run = SetRun(part, step, sizes, sizes, batch.bounds)
+def _run_set(
+    experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
+) -> None:
+    """Run a set of experiments, and write its results into the rows of `batch`."""
+    members, stated_step = experiment_set.members, experiment_set.experiment.step
+    rows = [member.row for member in members]
+    coefficients = np.array([member.leak.coefficient or 0.0 for member in members])
+    step = stated_step or choose_step(experiment_set, coefficients, error)
+    if any(member.leak.mean for member in members):
+        coefficients = _size_leaks(experiment_set, step, coefficients, threads)
+        step = stated_step or min(step, choose_step(experiment_set, coefficients, error))  # large leaks need short ones
+    run = SetRun(experiment_set, step, coefficients, flow_coefficients=coefficients, bounds=batch.bounds)
     run.run_all(threads, progress)
-    batch.rms[places] = run.rms()
-    batch.mean_leak_lpm[places] = run.mean_flow() / LITRE_PER_MINUTE
-    batch.coefficients[places] = sizes
-    batch.steps[places] = run.h
+    batch.rms[rows] = run.rms()
+    batch.mean_leak_lpm[rows] = run.mean_flow() / LITRE_PER_MINUTE
+    batch.coefficients[rows] = coefficients
+    batch.steps[rows] = run.step
 
 
-def chosen_step(part: LaneSet, sizes: Array, error: float) -> float:
-    """Choose the finest of the steps [s] that `trajectory` takes for some members over their first seconds.
+def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
+    """Choose the step [s] of a set: the shortest that error control chooses for a few sample members.
 
-    It is no longer than all members' numbers and leaks allow.
+    Those run for their first seconds. The step is at most the longest that the parameters and leaks of all members
+    allow.
     """
-    steps = [allowed_step(part, sizes)]
-    picked = np.unique(np.linspace(0, len(part.members) - 1, _SCOUTS).round().astype(int))
-    for k in picked:
-        experiment = with_sizes(part.members[k].experiment, float(sizes[k]))
-        scouted = min(experiment.duration, _SCOUTED)
-        run = trajectory(experiment, experiment.leaks, error=error, duration=scouted)
-        steps.append(run.step)
+    members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
+    for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
+        experiment = with_leak_coefficient(members[k].experiment, float(coefficients[k]))
+        duration = min(experiment.duration, _SAMPLE_DURATION)
+        steps.append(integrate_run(experiment, experiment.leaks, error=error, duration=duration).step)
     return float(min(steps))
 
 
-def allowed_step(part: LaneSet, sizes: Array) -> float:
-    """Compute the longest step [s] that all members' numbers and leaks allow, down to the finest of `integrate`."""
+def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
+    """Compute the longest step [s] that parameters and leaks of all members allow, at least the shortest chosen."""
     from sealscope.physics.solvers.limits import longest_step
 
     limits = []
-    for member, size in zip(part.members, sizes, strict=True):
-        laminar = member.leak.law == "laminar"
-        leak = (size if laminar else 0.0, 0.0 if laminar else size)
-        limits += [longest_step(numbers, *leak) for numbers in member.extremes]
-    return max(min(limits), LONGEST_STEP / FINEST)
+    for member, coefficient in zip(experiment_set.members, coefficients, strict=True):
+        G, C = (coefficient, 0.0) if member.leak.law == "laminar" else (0.0, coefficient)
+        limits += [longest_step(numbers, G, C) for numbers in member.step_limiting_parameters]
+    return max(min(limits), LONGEST_STEP / MAX_STEP_REFINEMENT)
 
 
-def _sized(part: LaneSet, step: float, sizes: Array, threads: int) -> Array:
-    """Find coefficients that give the leaks' means, for all members together."""
-    means = np.array([member.leak.mean or 0.0 for member in part.members])
+def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
+    """Find the coefficients of all members' leaks that give their stated mean flows, starting from `coefficients`."""
+    members, stated_step = experiment_set.members, experiment_set.experiment.step
+    mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
-    def measure(sizes: Array) -> tuple[Array, None]:
-        measured = np.where(sizes > 0, sizes, 1.0)
-        run = SetRun(part, part.experiment.step or min(step, allowed_step(part, sizes)), sizes, measured, None)
+    def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
+        """Run the set; return the mean flows (runs,) [m^3/s] per unit of the coefficients, and no further result."""
+        flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
+        run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
+        run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)
         run.run_all(threads, None)
-        units = run.mean_flow() / measured
-        shut = np.flatnonzero((means > 0) & (units <= 0))
-        if shut.size:
-            place = part.members[shut[0]].place
-            raise InputError(f"a leak with a mean flow must be open within the run (run {place})")
-        return units, None
+        unit_flows = run.mean_flow() / flow_coefficients
+        never_open = np.flatnonzero((mean_flows > 0) & (unit_flows <= 0))
+        if never_open.size:
+            raise InputError(f"a leak with a mean flow must be open within the run (run {members[never_open[0]].row})")
+        return unit_flows, None
 
-    return size_leaks([member.leak for member in part.members], sizes, measure)[0]
+    return size_leaks([member.leak for member in members], coefficients, measure_unit_flows)[0]

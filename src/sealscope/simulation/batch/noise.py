@@ -1,8 +1,8 @@
-"""White noise for runs side by side: normal numbers from a counter and a key for each lane.
+"""White noise for runs on lanes: normal random numbers from a counter and a key for each lane.
 
-The generator is SplitMix64 at a stated place of its sequence (Steele, Lea, Flood, Fast splittable pseudorandom number
-generators, OOPSLA 2014): the number of a sample depends on the run's key and the sample's place alone, never on the
-lane, the group or the block. It is another stream than that of a run by itself (`instruments.record`).
+The generator is SplitMix64, evaluated directly at any position of its sequence (Steele, Lea, Flood, Fast splittable
+pseudorandom number generators, OOPSLA 2014): a sample's number depends only on the run's key and the sample's position,
+never on lane, group or block. The stream differs from that of a single run (`instruments.record`).
 """
 
 from __future__ import annotations
@@ -15,84 +15,99 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 
 from sealscope.compiled import contracted
-from sealscope.physics.lanes import LANES, WIDTH, lowered, select
+from sealscope.physics.lanes import LANES, WIDTH, register_lowering, select
 from sealscope.recordings.recording import Array
-from sealscope.simulation.commands import GOLDEN, MIX
+from sealscope.simulation.commands import GOLDEN, LAST_SHIFT, MIX
 
-_WORDS, _DOUBLES = ir.VectorType(ir.IntType(64), WIDTH), ir.VectorType(ir.DoubleType(), WIDTH)
-_ONE_BITS, _MANTISSA = 0x3FF0000000000000, 0x000FFFFFFFFFFFFF
-
-
-def _constant(value: int) -> Any:
-    return ir.Constant(_WORDS, [value] * WIDTH)
+_INTEGERS, _DOUBLES = ir.VectorType(ir.IntType(64), WIDTH), ir.VectorType(ir.DoubleType(), WIDTH)
+#: Double precision: bits of 1.0, mask of the 52 mantissa bits, bias of the exponent.
+_ONE_BITS, _MANTISSA_MASK, _MANTISSA_BITS, _EXPONENT_BIAS = 0x3FF0000000000000, 0x000FFFFFFFFFFFFF, 52, 1023
+_SQRT_2, _LN_2 = math.sqrt(2.0), math.log(2.0)
 
 
-def keys(seeds: list[int]) -> Array:
-    """Compute a key for each run's noise, as the bits of doubles: (runs,)."""
+def _integer_constant(value: int) -> Any:
+    """Make an LLVM constant with a 64-bit integer in every lane."""
+    return ir.Constant(_INTEGERS, [value] * WIDTH)
+
+
+def noise_keys(seeds: list[int]) -> Array:
+    """Compute the 64-bit noise key of each run from its seed, (runs,), stored as the bits of doubles."""
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
 
-def uniform(key: Any, place: int) -> Any:
-    """Compute numbers evenly spread over (0, 1], one a lane: those at `place` >= 0 of the keys' sequences."""
+def uniform(key: Any, position: int) -> Any:
+    """Draw uniform numbers in (0, 1], one a lane, at `position` >= 0 of the keys' sequences (`_lower_uniform`)."""
 
 
-def _uniform(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
+def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Emit `uniform` in LLVM: SplitMix64 (`commands.PseudoRandom`).
+
+    The state at position k is key + (k + 1) GOLDEN; its mixed bits become the mantissa of a number in (0, 1].
+    """
+    key, position = values
     word = ir.IntType(64)
-    step = context.cast(builder, values[1], kinds[1], types.int64)
-    step = builder.mul(builder.add(step, ir.Constant(word, 1)), ir.Constant(word, GOLDEN))
-    lane = builder.insert_element(ir.Constant(_WORDS, ir.Undefined), step, ir.Constant(ir.IntType(32), 0))
-    step = builder.shuffle_vector(lane, lane, ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH))
-    z = builder.add(builder.bitcast(values[0], _WORDS), step)
+    k = context.cast(builder, position, arg_types[1], types.int64)
+    increment = builder.mul(builder.add(k, ir.Constant(word, 1)), ir.Constant(word, GOLDEN))
+    first_lane = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), increment, ir.Constant(ir.IntType(32), 0))
+    to_all_lanes = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    z = builder.add(builder.bitcast(key, _INTEGERS), builder.shuffle_vector(first_lane, first_lane, to_all_lanes))
     for shift, factor in MIX:
-        z = builder.mul(builder.xor(z, builder.lshr(z, _constant(shift))), _constant(factor))
-    z = builder.xor(z, builder.lshr(z, _constant(31)))
-    bits = builder.or_(builder.lshr(z, _constant(12)), _constant(_ONE_BITS))
+        z = builder.mul(builder.xor(z, builder.lshr(z, _integer_constant(shift))), _integer_constant(factor))
+    z = builder.xor(z, builder.lshr(z, _integer_constant(LAST_SHIFT)))
+    # a random mantissa under the exponent of 1: a number in [1, 2)
+    bits = builder.or_(builder.lshr(z, _integer_constant(64 - _MANTISSA_BITS)), _integer_constant(_ONE_BITS))
     return builder.fsub(ir.Constant(_DOUBLES, [2.0] * WIDTH), builder.bitcast(bits, _DOUBLES))
 
 
 def _exponent(x: Any) -> Any:
-    """Compute the exponent of positive normal doubles, as doubles."""
+    """Extract the binary exponent of positive normal doubles, as doubles (`_lower_exponent`)."""
 
 
-def _raised(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    raised = builder.lshr(builder.bitcast(values[0], _WORDS), _constant(52))
-    return builder.sitofp(builder.sub(raised, _constant(1023)), _DOUBLES)
+def _lower_exponent(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Emit `_exponent` in LLVM: the bits above the mantissa less the bias."""
+    biased_exponent = builder.lshr(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_BITS))
+    return builder.sitofp(builder.sub(biased_exponent, _integer_constant(_EXPONENT_BIAS)), _DOUBLES)
 
 
 def _fraction(x: Any) -> Any:
-    """Compute the fraction of positive normal doubles, 1 <= m < 2."""
+    """Extract the significand 1 <= m < 2 of positive normal doubles (`_lower_fraction`)."""
 
 
-def _mantissa(context: Any, builder: Any, kinds: Any, values: Any) -> Any:
-    bits = builder.and_(builder.bitcast(values[0], _WORDS), _constant(_MANTISSA))
-    return builder.bitcast(builder.or_(bits, _constant(_ONE_BITS)), _DOUBLES)
+def _lower_fraction(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Emit `_fraction` in LLVM: the mantissa with the exponent of 1."""
+    bits = builder.and_(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_MASK))
+    return builder.bitcast(builder.or_(bits, _integer_constant(_ONE_BITS)), _DOUBLES)
 
 
-for _function, _arity, _build in ((uniform, 2, _uniform), (_exponent, 1, _raised), (_fraction, 1, _mantissa)):
-    lowered(_function, _arity, lambda kinds: kinds[0] if kinds[0] == LANES else None, _build)
+for _function, _arity, _build in (
+    (uniform, 2, _lower_uniform),
+    (_exponent, 1, _lower_exponent),
+    (_fraction, 1, _lower_fraction),
+):
+    register_lowering(_function, _arity, lambda arg_types: arg_types[0] if arg_types[0] == LANES else None, _build)
 
 
 @contracted
 def logarithm(x: Any) -> Any:
-    """Compute ln x for lanes of normal numbers x > 0, within 2e-15 (absolute near 1, relative elsewhere).
+    """Compute ln x for lanes of normal numbers x > 0, to 2e-15 (absolute near 1, relative elsewhere).
 
-    ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)), m in sqrt(1/2)..sqrt(2), by the artanh's series.
+    ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)) with x = 2^e m and m in sqrt(1/2)..sqrt(2), by the series of artanh.
     """
     e, m = _exponent(x), _fraction(x)
-    high = m > 1.4142135623730951
-    e, m = select(high, e + 1.0, e), select(high, 0.5 * m, m)
+    above_sqrt_2 = m > _SQRT_2
+    e, m = select(above_sqrt_2, e + 1.0, e), select(above_sqrt_2, 0.5 * m, m)
     f = (m - 1.0) / (m + 1.0)
     s = f * f
     q = s * s
     series = (1.0 + s * (1.0 / 3.0)) + q * ((1.0 / 5.0 + s * (1.0 / 7.0)) + q * (1.0 / 9.0 + s * (1.0 / 11.0)))
     series = series + q * q * q * ((1.0 / 13.0 + s * (1.0 / 15.0)) + q * (1.0 / 17.0))
-    return e * 0.6931471805599453 + 2.0 * f * series
+    return e * _LN_2 + 2.0 * f * series
 
 
 @contracted
 def half_turn_sine(v: Any) -> Any:
-    """Compute sin(pi v) for -1/2 <= v <= 1/2, within 5e-14: Taylor's polynomial to the 17th power."""
+    """Compute sin(pi v) for -1/2 <= v <= 1/2 to 5e-14, by Taylor's polynomial (1/(2k + 1)!) of degree 17."""
     x = v * math.pi
     s = x * x
     q = s * s
@@ -102,12 +117,12 @@ def half_turn_sine(v: Any) -> Any:
 
 
 @contracted
-def normals(key: Any, place: int) -> tuple[Any, Any]:
-    """Compute two independent standard normal numbers a lane, from places 2 k and 2 k + 1 of the keys' sequences.
+def normals(key: Any, pair: int) -> tuple[Any, Any]:
+    """Draw two independent standard normal numbers a lane, from positions 2 `pair` and 2 `pair` + 1 of the sequences.
 
-    Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611.
+    Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611; cos 2a = 1 - 2 sin^2 a.
     """
-    radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * place)))
-    s = half_turn_sine(uniform(key, 2 * place + 1) - 0.5)
+    radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * pair)))
+    s = half_turn_sine(uniform(key, 2 * pair + 1) - 0.5)
     c = math.sqrt(max(1.0 - s * s, 0.0))
     return radius * (2.0 * s * c), radius * (1.0 - 2.0 * s * s)

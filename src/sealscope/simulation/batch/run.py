@@ -1,33 +1,28 @@
-"""Sets of experiments that can run side by side, and the run of a set from standstill, a few seconds at a time."""
+"""Sets of experiments that can run on the lanes of one vector register, and the run of a set, chunk by chunk."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect, Readings, blocks_of, extremes, values_of
+from sealscope.simulation.changes import Effect, Readings, block_bounds, changing_values, step_limiting_parameters
 from sealscope.simulation.commands import Command, Sine
-from sealscope.simulation.courses import numbers_under, state_under
-from sealscope.simulation.experiment import Experiment, choose_method, exact
-from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps
-from sealscope.simulation.integrate import (
-    VACUUM,
-    oversampling_of,
-    refuse_long,
-    refuse_unresolved,
-    steps_per_output,
-)
+from sealscope.simulation.experiment import Experiment, choose_method, identity_values
+from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps, volts_per_pascal
+from sealscope.simulation.integrate import VACUUM, oversampling_of, refuse_long, refuse_unresolved, steps_per_output
 from sealscope.simulation.leaks import Leak
+from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -39,12 +34,12 @@ ABRUPT = 1e15
 
 @dataclass(frozen=True)
 class Member:
-    """One experiment of a set.
+    """One experiment of a set: its `row` in the batch, the model's parameters (`numbers`), their changes, its command.
 
-    Its place among all, its numbers and what changes them, the command's gain and offset [V].
+    The command is gain times the set's shape plus offset [V].
     """
 
-    place: int
+    row: int
     experiment: Experiment
     numbers: RigNumbers
     effects: tuple[Effect, ...]
@@ -53,132 +48,149 @@ class Member:
 
     @property
     def leak(self) -> Leak:
-        """The one leak of the run, or one of no size."""
+        """The leak of the run, of size 0 if it has none."""
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", 0.0)
 
     @cached_property
-    def extremes(self) -> tuple[RigNumbers, ...]:
-        """The run's numbers, and those between which valves move (`changes.extremes`)."""
-        return extremes(self.effects, self.numbers)
+    def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
+        """The parameter sets of the run that limit the solver's step (`changes.step_limiting_parameters`)."""
+        return step_limiting_parameters(self.effects, self.numbers)
 
 
 @dataclass(frozen=True)
-class LaneSet:
-    """Experiments of one kind that share the shape of a command, the load, and the step or error."""
+class ExperimentSet:
+    """Experiments with the same laws, shape of the command, load, and step or error."""
 
     members: tuple[Member, ...]
     shape: Command
 
     @property
     def experiment(self) -> Experiment:
-        """One of them, for what they have in common."""
+        """The first experiment, for what all have in common."""
         return self.members[0].experiment
 
 
-def refuse(experiment: Experiment, place: int) -> None:
-    """Raise InputError for an experiment that cannot run side by side with others."""
+def refuse_unbatchable(experiment: Experiment, row: int) -> None:
+    """Raise InputError for an experiment that cannot be part of a batch; `row`: its index there."""
     rig, leaks = experiment.rig, experiment.leaks
-    missing = []
-    if experiment.controlled is not None:
-        missing.append(f"a command, got a target for a controller ({experiment.command})")
+    violated_rules = []
+    if experiment.active_controller is not None:
+        violated_rules.append(f"a command, got a target for a controller ({experiment.command})")
     if len(leaks) > 1:
-        missing.append(f"at most one leak, got {len(leaks)}")
+        violated_rules.append(f"at most one leak, got {len(leaks)}")
     if leaks and leaks[0].opening.rise is None:
-        missing.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
+        violated_rules.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
     if rig.motor.integrator == "euler":
-        missing.append("motor.integrator = state, got euler")
-    if any(fault.row.of_sensor for fault in experiment.faults):
-        missing.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
-    if leaks and experiment.thins:
-        missing.append("no leak while the oil's temperature changes")
-    absent = ["daq.jitter"]
-    absent += [
+        violated_rules.append("motor.integrator = state, got euler")
+    if any(fault.row.is_sensor_fault for fault in experiment.faults):
+        violated_rules.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
+    if leaks and experiment.changes_viscosity:
+        violated_rules.append("no leak while the oil's temperature changes")
+    not_modelled = ["daq.jitter"]  # by the instruments on lanes
+    not_modelled += [
         f"sensors.{name}.{symbol}"
         for name in CHAMBERS
         for symbol in ("stuck_rate", "drop_rate", "lag", "hum_harmonics")
     ]
-    missing += [f"{name} = 0, got {rig[name]}" for name in absent if rig[name] != 0]
-    if missing:
-        raise InputError(f"a run of a batch must have {missing[0]} (run {place}); simulate it by itself")
+    violated_rules += [f"{name} = 0, got {rig[name]}" for name in not_modelled if rig[name] != 0]
+    if violated_rules:
+        raise InputError(f"a run of a batch must have {violated_rules[0]} (run {row}); simulate it by itself")
 
 
-def _shape(command: Command) -> tuple[str, Command, float, float]:
-    """Split a command into a name of its shape, the shape, and the gain and offset on it."""
+class _ScaledCommand(NamedTuple):
+    """A command as gain times shape plus offset [V]; `key`: text that is equal for equal shapes."""
+
+    key: str
+    shape: Command
+    gain: float
+    offset: float
+
+
+def _split_command(command: Command) -> _ScaledCommand:
+    """Split a sine into gain, shape and offset; any other command is its own shape."""
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
-        return str(exact(shape)), shape, command.amplitude, command.offset
-    return str(exact(command)), command, 1.0, 0.0
+        return _ScaledCommand(str(identity_values(shape)), shape, command.amplitude, command.offset)
+    return _ScaledCommand(str(identity_values(command)), command, 1.0, 0.0)
 
 
-def sets_of(experiments: Sequence[Experiment]) -> list[LaneSet]:
-    """Group the experiments into sets that can run side by side.
+def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
+    """Group the experiments into sets with the same laws, command shape, load and solver settings.
 
-    Raises InputError where one cannot be in a batch, or their records differ in length or rate.
+    Raises InputError if one of them cannot be in a batch, or if they differ in duration or sampling rate.
     """
     from sealscope.physics.rig import CHOICES
 
     if not experiments:
         raise InputError("a batch must have experiments, got none")
     first = experiments[0]
-    by_kind: dict[Any, list[Member]] = {}
+    members_by_kind: dict[Any, list[Member]] = {}
     shapes: dict[Any, Command] = {}
-    numbers_by_rig: dict[Any, RigNumbers] = {}  # by rig and load: most batches have few of them
-    for place, experiment in enumerate(experiments):
+    numbers_by_rig: dict[Any, RigNumbers] = {}  # by rig and load; most batches have few different rigs
+    for row, experiment in enumerate(experiments):
         for name in ("duration", "rate"):
             value, common = getattr(experiment, name), getattr(first, name)
             if value != common:
-                raise InputError(f"runs of a batch must have one {name}, got {common:g} and {value:g} (run {place})")
-        refuse(experiment, place)
-        load = None if experiment.load is None else str(exact(experiment.load))
+                raise InputError(f"runs of a batch must have one {name}, got {common:g} and {value:g} (run {row})")
+        refuse_unbatchable(experiment, row)
+        load = None if experiment.load is None else str(identity_values(experiment.load))
         if (id(experiment.rig), load) not in numbers_by_rig:
-            numbers_by_rig[id(experiment.rig), load] = numbers_under(experiment.rig, experiment.load)
+            numbers_by_rig[id(experiment.rig), load] = loaded_rig_numbers(experiment.rig, experiment.load)
         numbers = numbers_by_rig[id(experiment.rig), load]
         effects = experiment.effects()
+        # laws that these effects need are compiled in
         if any(effect.field.startswith("G_ext") for effect in effects):
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
-        key, shape, gain, offset = _shape(experiment.commanded)
-        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
+        scaled = _split_command(experiment.voltage_command)
+        choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")  # that follows from the load
         method = choose_method(experiment.rig, experiment.method)
-        kind = (key, load, choices, method, experiment.step, experiment.error)
-        shapes[kind] = shape
-        by_kind.setdefault(kind, []).append(Member(place, experiment, numbers, effects, gain, offset))
-    return [LaneSet(tuple(members), shapes[kind]) for kind, members in by_kind.items()]
+        kind = (scaled.key, load, choices, method, experiment.step, experiment.error)
+        shapes[kind] = scaled.shape
+        member = Member(row, experiment, numbers, effects, scaled.gain, scaled.offset)
+        members_by_kind.setdefault(kind, []).append(member)
+    return [ExperimentSet(tuple(members), shapes[kind]) for kind, members in members_by_kind.items()]
 
 
-def in_lanes(values: Array, width: int) -> Array:
-    """Arrange values of runs (runs, ...) as (groups, ..., width); the last run fills the spare lanes."""
-    groups = -(-len(values) // width)
-    filled = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
-    return np.ascontiguousarray(np.moveaxis(filled.reshape(groups, width, *values.shape[1:]), 1, -1))
+def pack_lanes(values: Array, width: int) -> Array:
+    """Rearrange values of runs (runs, ...) as (groups, ..., width); copies of the last run fill the spare lanes."""
+    groups = math.ceil(len(values) / width)
+    padded = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
+    return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, width, *values.shape[1:]), 1, -1))
 
 
-def out_of_lanes(lanes: Array, runs: int) -> Array:
-    """Arrange (groups, ..., width) as (runs, ...), the inverse of `in_lanes`."""
+def unpack_lanes(lanes: Array, runs: int) -> Array:
+    """Rearrange lanes (groups, ..., width) as values of runs (runs, ...), the inverse of `pack_lanes`."""
     lanes_second = np.moveaxis(lanes, -1, 1)
     return lanes_second.reshape(-1, *lanes_second.shape[2:])[:runs]
 
 
-def leak_rows(members: Sequence[Member], sizes: Array, measured: Array) -> Array:
-    """Build (runs, LEAK_ROWS): leaks of the stated sizes, and the sizes whose flow is accounted."""
+def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
+    """Build the leaks' parameters (runs, LEAK_ROWS): acting G, C; start [s] and slope [1/s] of the opening; flow G, C.
+
+    The acting `coefficients` and the `flow_coefficients`, whose mean flow is computed, differ while a leak is sized:
+    the flow of a unit leak is found in a run without a leak.
+    """
     rows = []
-    for member, size, accounted in zip(members, sizes, measured, strict=True):
+    for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
         leak = member.leak
-        laminar = leak.law == "laminar"
         start, stop = leak.opening.rise or (0.0, 0.0)
-        when = start, (1.0 / (stop - start) if stop > start else ABRUPT)
-        laws = (size, 0.0, accounted, 0.0) if laminar else (0.0, size, 0.0, accounted)
-        rows.append([laws[0], laws[1], *when, laws[2], laws[3]])
+        slope = 1.0 / (stop - start) if stop > start else ABRUPT
+        if leak.law == "laminar":
+            rows.append([coefficient, 0.0, start, slope, flow_coefficient, 0.0])
+        else:
+            rows.append([0.0, coefficient, start, slope, 0.0, flow_coefficient])
     return np.array(rows)
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Numbers over the run, held within cells: `bounds` (cells + 1,) in outputs.
+    """The model's parameters over a run, constant within each cell, a span of outputs common to all runs.
 
-    `base` (runs, fields); `changing`, the fields that change, with `values` (runs, changing, cells).
+    `bounds` (cells + 1,): outputs at which cells begin; `base` (runs, parameters); `changing`: indices of the
+    parameters that change, with `values` (runs, changing, cells).
     """
 
     bounds: np.ndarray
@@ -187,300 +199,330 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Build (groups, cells, fields, width) of cells first .. last."""
+        """Build the parameters (groups, cells, parameters, width) of the cells first <= cell < last."""
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
-        for k, field in enumerate(self.changing):
-            table[:, :, field] = self.values[:, k, first:last]
-        return in_lanes(table, width)
+        for k, parameter in enumerate(self.changing):
+            table[:, :, parameter] = self.values[:, k, first:last]
+        return pack_lanes(table, width)
 
 
-def cells_of(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Build the cells of a set at `rate` [Hz] of outputs: the blocks of all effects of its members."""
+def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
+    """Build the cells of a set: the blocks of all effects of its members, for `n_out` outputs at `rate` [Hz]."""
     from sealscope.physics.rig import NUMBERS
 
-    numbers = {id(member.numbers): member.numbers for member in members}
-    rows = {
-        key: [float(getattr(numbers_of_block, name)) for name in NUMBERS] for key, numbers_of_block in numbers.items()
-    }
+    distinct = {id(member.numbers): member.numbers for member in members}  # most members share their parameters
+    rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in distinct.items()}
     base = np.array([rows[id(member.numbers)] for member in members])
     effects = [effect for member in members for effect in member.effects]
-    bounds = blocks_of(effects, n_out, rate)
+    bounds = block_bounds(effects, n_out, rate)
     middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
-    fields = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
-    values = np.repeat(base[:, list(fields), None], middles.size, axis=2)
+    changing = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
+    values = np.repeat(base[:, list(changing), None], middles.size, axis=2)
     for run, member in enumerate(members):
-        for name, series in values_of(member.effects, member.numbers, middles).items():
-            values[run, fields.index(NUMBERS.index(name))] = series
-    return Cells(bounds, base, fields, values)
+        for name, series in changing_values(member.effects, member.numbers, middles).items():
+            values[run, changing.index(NUMBERS.index(name))] = series
+    return Cells(bounds, base, changing, values)
 
 
-def with_sizes(experiment: Experiment, size: float) -> Experiment:
-    """Set the coefficient of an experiment's leak."""
+def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
+    """Replace the size of an experiment's leak, if it has one, by a coefficient."""
     if not experiment.leaks:
         return experiment
-    return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=size),))
+    return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
 
 
-def instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build (runs, 2, INSTRUMENT_ROWS) of p_A and p_B for samples first .. last, linear between these."""
+def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
+    """Build the parameters (runs, 2, INSTRUMENT_ROWS) of the instruments of p_A and p_B, linear over first .. last."""
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
     ends = np.array([first, last]) / members[0].experiment.rate
     experiments = [member.experiment for member in members]
-    rows = np.array(
-        [_channels(experiment.rig, experiment.readings(), ends, last - first) for experiment in experiments]
-    )
+    samples = last - first
+    rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
     for row, experiment in zip(rows, experiments, strict=True):
-        if row[:, HUM].any():
+        if row[:, HUM].any():  # 1: a random stream apart from that of the noise
             row[:, HUM_PHASE] = np.random.default_rng([experiment.seed, 1]).random(len(CHAMBERS))
     return rows
 
 
-def _channels(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build (2, INSTRUMENT_ROWS) of p_A and p_B, linear between the two times `ends` [s], `samples` apart."""
-    from sealscope.simulation.batch import signals as at
+def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
+    """Build the parameters (2, INSTRUMENT_ROWS) of the instruments of p_A and p_B between the two times `ends` [s].
 
-    rows, daq = np.zeros((len(CHAMBERS), at.INSTRUMENT_ROWS)), rig.daq
+    Parameters that change are taken as linear over the `samples` between them.
+    """
+    from sealscope.simulation.batch import signals
+
+    rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
     for row, name in zip(rows, CHAMBERS, strict=True):
         sensor = getattr(rig.sensors, name)
-        for place, rise, parameter, value, plus in (
-            (at.GAIN, at.GAIN_RISE, f"sensors.{name}.gain_error", sensor.gain_error, 1.0),
-            (at.OFFSET, at.OFFSET_RISE, f"sensors.{name}.offset", sensor.offset, 0.0),
-            (at.NOISE, at.NOISE_RISE, f"sensors.{name}.noise", sensor.noise, 0.0),
-            (at.COMMON, at.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
+        for start_row, rise_row, parameter, value, addend in (
+            (signals.GAIN, signals.GAIN_RISE, f"sensors.{name}.gain_error", sensor.gain_error, 1.0),
+            (signals.OFFSET, signals.OFFSET_RISE, f"sensors.{name}.offset", sensor.offset, 0.0),
+            (signals.NOISE, signals.NOISE_RISE, f"sensors.{name}.noise", sensor.noise, 0.0),
+            (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
             start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
-            row[place], row[rise] = start_value + plus, (end_value - start_value) / samples
-        row[at.WALK] = sensor.drift / np.sqrt(daq.sample_rate)
-        row[at.HUM], row[at.HUM_TURNS] = sensor.hum, sensor.hum_frequency / daq.sample_rate
-        row[at.LEAST], row[at.LARGEST] = sensor.range_lo, sensor.range_hi
-        row[at.VOLTS] = daq.sensor_volts_lo
-        row[at.PER_PASCAL] = (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
-        row[at.COUNT], row[at.TOP] = daq.step, 2.0 ** (daq.bits - 1)
+            row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
+        row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
+        row[signals.HUM], row[signals.HUM_CYCLES] = sensor.hum, sensor.hum_frequency / daq.sample_rate
+        row[signals.RANGE_MIN], row[signals.RANGE_MAX] = sensor.range_lo, sensor.range_hi
+        row[signals.VOLTS_AT_MIN] = daq.sensor_volts_lo
+        row[signals.VOLTS_PER_PASCAL] = volts_per_pascal(sensor, daq)
+        row[signals.VOLTS_PER_CODE], row[signals.MAX_CODE] = daq.step, 2.0 ** (daq.bits - 1)
     return rows
 
 
-#: Steps of a chunk, and so the arrays of the command's shape; the cells of a chunk never are cut.
-CHUNK_STEPS = 4096
+class _Chunk(NamedTuple):
+    """A part of a run that is advanced at once: first_cell <= cell < end_cell, start <= output < stop."""
+
+    first_cell: int
+    end_cell: int
+    start: int
+    stop: int
+
+
+#: Most steps of a chunk, which bounds the memory of its arrays. Chunks end at cells unless a cell is longer.
+MAX_CHUNK_STEPS = 4096
 
 
 class SetRun:
     """The runs of a set.
 
-    `sizes` (runs,) are the leaks' coefficients, `measured` those whose flow is accounted, `bounds` [s] the segments of
-    the statistics, None for none (flows alone are then of interest).
+    `coefficients` (runs,): those of the leaks; `flow_coefficients` (runs,): those whose mean flow is computed
+    (`build_leak_rows`); `bounds` [s]: segments of the detail statistics, None to compute flows only.
     """
 
     #: Runs of a group.
     width: ClassVar[int] = 8
 
-    def __init__(self, part: LaneSet, step: float, sizes: Array, measured: Array, bounds: Array | None) -> None:
-        from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, nodes_of
+    def __init__(
+        self,
+        experiment_set: ExperimentSet,
+        step: float,
+        coefficients: Array,
+        *,
+        flow_coefficients: Array,
+        bounds: Array | None,
+    ) -> None:
+        """Prepare the runs at standstill; raise SimulationFailed if `step` [s] cannot resolve one of them."""
+        from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
-        from sealscope.physics.vector.runs import ACCOUNTS, CHANNELS, LEAST
+        from sealscope.physics.vector.runs import CHANNELS, MIN_PRESSURE, N_TOTALS
 
-        members, common = part.members, part.experiment
-        self.part, self.runs, self.channels = part, len(members), CHANNELS
+        members, common = experiment_set.members, experiment_set.experiment  # `common`: for the settings all share
+        self.experiment_set, self.n_runs, self.channels = experiment_set, len(members), CHANNELS
         self.method = choose_method(common.rig, common.method)
-        self.factor = oversampling_of(common.rate, step)
-        rate = common.rate * self.factor
-        self.every = steps_per_output(rate, step)
-        self.h = 1.0 / (rate * self.every)
-        self.samples = round(common.duration * common.rate)
-        self.outputs = (self.samples + FILTER_REACH) * self.factor
-        self.nodes = nodes_of(IMPLICIT if self.method == "imex" else EXPLICIT, self.h)
-        self.cells = cells_of(members, self.outputs, rate)
-        self.numbers = members[0].numbers  # of which the choices count; the numbers stand in the table
-        leaks = leak_rows(members, sizes, measured)
-        checked = set()
+        self.oversampling = oversampling_of(common.rate, step)
+        rate = common.rate * self.oversampling
+        self.steps_per_output = steps_per_output(rate, step)
+        self.step = 1.0 / (rate * self.steps_per_output)
+        self.n_samples = round(common.duration * common.rate)
+        self.n_outputs = (self.n_samples + FILTER_REACH) * self.oversampling
+        self.nodes = step_nodes(IMPLICIT if self.method == "imex" else EXPLICIT, self.step)
+        self.cells = build_cells(members, self.n_outputs, rate)
+        self.numbers = members[0].numbers  # for its choices only; the runs' numbers are in the table of the cells
+        leaks = build_leak_rows(members, coefficients, flow_coefficients)
+        checked = set()  # members that share parameters and leak are checked once
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
-            for numbers in member.extremes:
-                what = id(numbers), G, C
-                if not (member.experiment.allow_unresolved or what in checked):
-                    checked.add(what)
-                    refuse_unresolved(numbers, self.h, self.method)
-                    refuse_long(self.h, longest_step(numbers, G, C), f"the leak of run {member.place}")
+            for numbers in member.step_limiting_parameters:
+                case = id(numbers), G, C
+                if not (member.experiment.allow_unresolved or case in checked):
+                    checked.add(case)
+                    refuse_unresolved(numbers, self.step, self.method)
+                    refuse_long(self.step, longest_step(numbers, G, C), f"the leak of run {member.row}")
         experiments = [member.experiment for member in members]
-        states = [state_under(experiment.rig, experiment.load, experiment.x_0) for experiment in experiments]
-        self.state = in_lanes(np.array(states), self.width)
-        self.groups = len(self.state)
-        self.drive = in_lanes(np.array([[m.gain, m.offset] for m in members]), self.width)
-        self.leaks = in_lanes(leaks, self.width)
-        self.account = np.zeros((self.groups, ACCOUNTS, self.width))
-        self.account[:, LEAST] = np.inf
+        states = [loaded_standstill_state(run.rig, run.load, run.x_0) for run in experiments]
+        self.state = pack_lanes(np.array(states), self.width)
+        self.n_groups = len(self.state)
+        self.gains_and_offsets = pack_lanes(np.array([[member.gain, member.offset] for member in members]), self.width)
+        self.leaks = pack_lanes(leaks, self.width)
+        self.totals = np.zeros((self.n_groups, N_TOTALS, self.width))
+        self.totals[:, MIN_PRESSURE] = np.inf
         self._prepare_filters(rate)
         self.bounds = bounds
         if bounds is not None:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Lay out the anti-alias filter of each lane: tap k is of the output k - `before` steps from the sample."""
-        sensors = [member.experiment.rig.sensors for member in self.part.members]
+        """Compute each lane's anti-alias filter; tap k multiplies the output k - `taps_before` from the sample's."""
+        sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
-        taps_by_delay = {delay: anti_alias_taps(self.factor, delay % 1.0) for delay in set(delays.ravel().tolist())}
-        self.after = max(taps.size // 2 for taps in taps_by_delay.values())
-        self.before = self.after + int(delays.max())
-        filters = np.zeros((self.runs, self.channels, self.before + self.after + 1))
-        for place, delay in np.ndenumerate(delays):
+        taps_by_delay = {delay: anti_alias_taps(self.oversampling, delay % 1.0) for delay in np.unique(delays).tolist()}
+        self.taps_after = max(taps.size // 2 for taps in taps_by_delay.values())
+        self.taps_before = self.taps_after + int(delays.max())
+        filters = np.zeros((self.n_runs, self.channels, self.taps_before + self.taps_after + 1))
+        for run_and_channel, delay in np.ndenumerate(delays):
             taps = taps_by_delay[float(delay)]
-            start = self.before - int(delay) - taps.size // 2
-            filters[place][start : start + taps.size] = taps
-        self.taps = in_lanes(filters, self.width)
+            start = self.taps_before - int(delay) - taps.size // 2
+            filters[run_and_channel][start : start + taps.size] = taps
+        self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
+        """Allocate the sums of squared details, for segments that the wavelet's filters see in full."""
         from sealscope.signals.filters import reach
-        from sealscope.simulation.batch.noise import keys
+        from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
 
         before, after = reach()[-1]
-        samples = np.round(bounds * self.part.experiment.rate).astype(np.int64)
-        self.segments = np.clip(samples, before, self.samples - after)
-        self.sums = np.zeros((self.groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
-        self.keys = in_lanes(keys([m.experiment.seed for m in self.part.members]), self.width)
+        samples = np.round(bounds * self.experiment_set.experiment.rate).astype(np.int64)
+        self.segments = np.clip(samples, before, self.n_samples - after)
+        self.sums = np.zeros((self.n_groups, self.channels, self.segments.size - 1, QUANTITIES, self.width))
+        seeds = [member.experiment.seed for member in self.experiment_set.members]
+        self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Run all groups, shared out over `threads` (the compiled parts run in parallel)."""
-        cuts = np.unique(np.linspace(0, self.groups, min(threads, self.groups) + 1).round().astype(int)).tolist()
-        lock, progressed = threading.Lock(), 0.0
+        """Run all groups, divided among `threads` (compiled code releases Python's lock)."""
+        cuts = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
+        lock, completed = threading.Lock(), 0.0
 
-        def tell(share: float) -> None:
-            nonlocal progressed
+        def add_progress(fraction: float) -> None:
+            """Report a further completed fraction of all groups; called by all threads."""
+            nonlocal completed
             if progress is not None:
                 with lock:
-                    progressed += share
-                    progress(progressed)
+                    completed += fraction
+                    progress(completed)
 
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(lambda part: self._run_groups(part, tell), itertools.pairwise(cuts)))
+            list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(cuts)))
 
-    def _chunks(self) -> list[tuple[int, int, int, int]]:
-        """List the chunks: cells first .. last and outputs start .. stop of each."""
-        most = max(1, CHUNK_STEPS // self.every)
+    def _chunks(self) -> list[_Chunk]:
+        """Divide the run into chunks: several whole cells, or a part of a long cell."""
+        max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
         chunks = []
         first = 0
         while first < edges.size - 1:
             last = first + 1
-            while last < edges.size - 1 and edges[last + 1] - edges[first] <= most:
+            while last < edges.size - 1 and edges[last + 1] - edges[first] <= max_outputs:
                 last += 1
             start, stop = int(edges[first]), int(edges[last])
-            chunks += [(first, last, a, min(a + most, stop)) for a in range(start, stop, most)]
+            chunks += [_Chunk(first, last, a, min(a + max_outputs, stop)) for a in range(start, stop, max_outputs)]
             first = last
         return chunks
 
-    def _due(self, stop: int) -> int:
-        """Count the samples that can be read once the outputs up to `stop` are computed."""
-        if stop == self.outputs:
-            return self.samples
-        return min(max(0, (stop - self.after - 1) // self.factor + 1), self.samples)
+    def _readable_samples(self, stop: int) -> int:
+        """Count the samples that can be read once the outputs before `stop` are computed."""
+        if stop == self.n_outputs:
+            return self.n_samples
+        return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
 
-    def _run_groups(self, groups: tuple[int, int], tell: Callable[[float], None]) -> None:
-        """Run the groups first <= g < last from standstill to the end."""
+    def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
+        """Simulate the groups of lanes groups[0] <= g < groups[1] in chunks, from standstill to the end.
+
+        Each chunk's sensor signals are added to the statistics of the runs.
+        """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
         from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
         a, b = groups
-        part = (0, b - a)
-        state, drive, leaks, account = self.state[a:b], self.drive[a:b], self.leaks[a:b], self.account[a:b]
+        local_groups = (0, b - a)  # indices within the slices [a:b] of the arrays
+        state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
-        history = self.before + self.after + self.factor  # outputs that later samples still need
-        longest = max(stop - start for _, _, start, stop in chunks)
+        history = self.taps_before + self.taps_after + self.oversampling  # outputs that later samples still need
+        longest = max(chunk.stop - chunk.start for chunk in chunks)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))
-        walks = np.zeros((b - a, self.channels, self.width))
+        offset_drifts = np.zeros((b - a, self.channels, self.width))
         wavelet = DetailStream((self.channels, (b - a) * self.width))
-        sampled = 0
+        n_read = 0  # samples read so far
+        every = self.steps_per_output
         for first, last, start, stop in chunks:
             if cells != (first, last):
                 table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
-            bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * self.every  # in steps
+            cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * every  # in steps
             advance(
-                part, state, self.h, start * self.every, self.nodes, self._shape(start, stop), drive, leaks, table,
-                bounds, self.numbers, self.every, pressures, history, account,
+                local_groups, state, self.step, start * every, self.nodes, self._inputs_at_nodes(start, stop),
+                self.gains_and_offsets[a:b], leaks, table, cell_bounds, self.numbers, every, pressures, history, totals,
             )  # fmt: skip
-            self._check(groups, stop)
+            self._check_groups(groups, stop)
             if self.bounds is not None:
                 if start == 0:
                     pressures[:, :history] = pressures[:, history : history + 1]  # at standstill before the beginning
-                until = self._due(stop)
-                if until > sampled:
-                    begin = sampled * self.factor - self.before - (start - history)
+                end_sample = self._readable_samples(stop)
+                if end_sample > n_read:
+                    first_tap = n_read * self.oversampling - self.taps_before - (start - history)
                     sense_lanes(
-                        part, pressures, begin, self.factor, self.taps[a:b], sampled, until,
-                        self._sensors(groups, sampled, until), self.keys[a:b], walks, wavelet.taps, wavelet.buffers,
-                        self.segments, self.sums[a:b],
+                        local_groups, pressures, first_tap, self.oversampling, self.taps[a:b], n_read, end_sample,
+                        self._sensors(groups, n_read, end_sample), self.noise_keys[a:b], offset_drifts,
+                        wavelet.taps, wavelet.buffers, self.segments, self.sums[a:b],
                     )  # fmt: skip
-                    sampled = until
+                    n_read = end_sample
                 pressures[:, :history] = pressures[:, stop - start : stop - start + history].copy()
-            tell((stop - start) / self.outputs * (b - a) / self.groups)
+            add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
-    def _shape(self, start: int, stop: int) -> Array:
-        """Compute the command's shape at the nodes of the steps between two outputs, with a load's forces behind it."""
-        t = np.arange(start * self.every, stop * self.every, dtype=np.float64) * self.h
-        times, load = t[:, None] + self.nodes, self.part.experiment.load
-        volts = self.part.shape.volts(times)
+    def _inputs_at_nodes(self, start: int, stop: int) -> Array:
+        """Sample the unscaled command [V], and the load [N] if any, at the nodes of the steps from output `start` on.
+
+        Returns (steps, nodes), or (steps, 2 nodes) with the load in the last columns.
+        """
+        t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
+        times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load
+        volts = self.experiment_set.shape.volts(times)
         return np.ascontiguousarray(
             volts if load is None else np.hstack([volts, np.broadcast_to(load.value_at(times), times.shape)])
         )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the instruments of the groups for samples first .. last, (groups, 2, INSTRUMENT_ROWS, width)."""
-        if self._steady is not None:
-            return self._steady[groups[0] : groups[1]]
-        members = self.part.members[groups[0] * self.width : groups[1] * self.width]
-        return in_lanes(instrument_rows(members, first, last), self.width)
+        """Build the groups' instrument parameters (groups, 2, INSTRUMENT_ROWS, width) for samples first .. last."""
+        if self._constant_sensors is not None:
+            return self._constant_sensors[groups[0] : groups[1]]
+        members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]
+        return pack_lanes(build_instrument_rows(members, first, last), self.width)
 
     @cached_property
-    def _steady(self) -> Array | None:
-        """The instruments of all groups, None where some change within a run."""
-        if any(member.experiment.readings().effects for member in self.part.members):
+    def _constant_sensors(self) -> Array | None:
+        """The instrument parameters of all groups; None if any of them change within a run."""
+        if any(member.experiment.readings().effects for member in self.experiment_set.members):
             return None
-        return in_lanes(instrument_rows(self.part.members, 0, self.samples), self.width)
+        return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
 
-    def _check(self, groups: tuple[int, int], stop: int) -> None:
-        """Raise SimulationFailed for a run that diverged, fell below vacuum or hit a stop too hard for the step."""
+    def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
+        """Raise SimulationFailed if a run of the groups, now at output `stop`, diverged, cavitated or hit a stop."""
         from sealscope.physics.solvers.limits import longest_step_on_stop
-        from sealscope.physics.vector.runs import DIVERGED, LEAST, REACH
+        from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
 
-        account = self.account[groups[0] : groups[1]]
-        time = stop / (self.part.experiment.rate * self.factor)
-        half = 0.5 * float(min(member.numbers.L for member in self.part.members))
-        finite = np.all(account[:, DIVERGED] == 0.0) and account[:, LEAST].min() >= VACUUM
-        if finite and account[:, REACH].max() <= half:
+        totals = self.totals[groups[0] : groups[1]]
+        time = stop / (self.experiment_set.experiment.rate * self.oversampling)
+        min_half_stroke = 0.5 * float(min(member.numbers.L for member in self.experiment_set.members))
+        is_valid = np.all(totals[:, DIVERGED] == 0.0) and totals[:, MIN_PRESSURE].min() >= VACUUM
+        if is_valid and totals[:, MAX_TRAVEL].max() <= min_half_stroke:
             return
-        accounts = out_of_lanes(account, account.shape[0] * self.width)
-        for k, (reach, least, diverged) in enumerate(accounts[:, [REACH, LEAST, DIVERGED]]):
-            place = groups[0] * self.width + k
-            if place >= self.runs:
+        totals_by_run = unpack_lanes(totals, totals.shape[0] * self.width)
+        extremes = totals_by_run[:, [MAX_TRAVEL, MIN_PRESSURE, DIVERGED]]
+        for k, (max_travel, min_pressure, diverged) in enumerate(extremes):
+            index = groups[0] * self.width + k
+            if index >= self.n_runs:  # a spare lane
                 break
-            member = self.part.members[place]
-            if not diverged == 0.0:
+            member = self.experiment_set.members[index]
+            if not diverged == 0.0:  # NaN once a state was not finite
                 raise SimulationFailed(
-                    f"run {member.place} diverged before t = {time:.4g} s; take a smaller step or smaller gains"
+                    f"run {member.row} diverged before t = {time:.4g} s; take a smaller step or smaller gains"
                 )
             if member.experiment.allow_unresolved:
                 continue
-            if reach > 0.5 * member.numbers.L:
+            if max_travel > 0.5 * member.numbers.L:
                 limit = longest_step_on_stop(member.numbers)
-                refuse_long(self.h, limit, f"the hard stop (cylinder.k_stop, d_stop) of run {member.place}")
-            if least < VACUUM:
+                refuse_long(self.step, limit, f"the hard stop (cylinder.k_stop, d_stop) of run {member.row}")
+            if min_pressure < VACUUM:
                 raise SimulationFailed(
-                    f"pressures of run {member.place} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no "
-                    f"cavitation), got {least:.4g} Pa before t = {time:.4g} s; simulate it by itself for the place"
+                    f"pressures of run {member.row} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no "
+                    f"cavitation), got {min_pressure:.4g} Pa before t = {time:.4g} s; simulate it by itself for the "
+                    "place"
                 )
 
     def rms(self) -> Array:
-        """RMS of d1..d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""
-        count = np.diff(self.segments)[:, None]
+        """Compute the RMS of d1, d2, d3, d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""
+        n_samples = np.diff(self.segments)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.sqrt(out_of_lanes(self.sums, self.runs) / count)
+            return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Mean |Q| [m^3/s] of the accounted leaks while open, (runs,)."""
-        from sealscope.physics.vector.runs import FLOW, OPEN
+        """Compute the mean |Q| [m^3/s] of leaks with `flow_coefficients` while open, (runs,); 0 if never open."""
+        from sealscope.physics.vector.runs import FLOW, OPENING
 
-        accounts = out_of_lanes(self.account, self.runs)
-        opened = accounts[:, OPEN]
-        return np.where(opened > 0, accounts[:, FLOW] / np.where(opened > 0, opened, 1.0), 0.0)
+        totals_by_run = unpack_lanes(self.totals, self.n_runs)
+        opening = totals_by_run[:, OPENING]
+        return np.where(opening > 0, totals_by_run[:, FLOW] / np.where(opening > 0, opening, 1.0), 0.0)

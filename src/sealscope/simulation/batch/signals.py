@@ -1,6 +1,6 @@
-"""Instruments and wavelets of runs side by side, block by block: from pressures to sums of squares.
+"""Instruments and wavelet details of runs on lanes: from simulated pressures to sums of squared details.
 
-The laws are those of `instruments.record` and `signals.details`, on lanes.
+The laws are those of `instruments.record` and `signals.details`.
 """
 
 from __future__ import annotations
@@ -10,134 +10,150 @@ from typing import Any
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
-from sealscope.physics.lanes import WIDTH, anywhere, load, nearest_whole, store
+from sealscope.physics.lanes import WIDTH, any_lane, load, nearest_integer, store
 from sealscope.physics.vector.runs import CHANNELS
-from sealscope.signals.kernels import CHUNK, filter_rows, split_levels, turn_back
+from sealscope.signals.kernels import CHUNK, filter_rows, move_history, split_levels
 from sealscope.simulation.batch.noise import half_turn_sine, normals
 
 LEVELS = 4
-#: Quantities of which the squares are summed: d1, d2, d3, d4 and d3 d4.
+#: Number of quantities with summed squares: d1, d2, d3, d4 and the product d3 d4.
 QUANTITIES = LEVELS + 1
-#: Rows of a channel's instrument: gain, offset, own noise, common noise and what each grows by a sample; walk a sample,
-#: hum, hum's turns a sample and at the start; least and largest pressure; volts at the least, volts per pascal, volts
-#: per count, counts at most.
+#: Rows that describe a channel's instrument: gain, offset, noise of the channel, common noise, and the change of each
+#: per sample; drift per sample; hum's amplitude, cycles per sample and phase in cycles; range of pressure; converter's
+#: volts at the lower end of the range, volts per pascal, volts per code, largest code.
 GAIN, OFFSET, NOISE, COMMON, GAIN_RISE, OFFSET_RISE, NOISE_RISE, COMMON_RISE = range(8)
-WALK, HUM, HUM_TURNS, HUM_PHASE = range(8, 12)
-LEAST, LARGEST, VOLTS, PER_PASCAL, COUNT, TOP = range(12, 18)
+DRIFT_STEP, HUM, HUM_CYCLES, HUM_PHASE = range(8, 12)
+RANGE_MIN, RANGE_MAX, VOLTS_AT_MIN, VOLTS_PER_PASCAL, VOLTS_PER_CODE, MAX_CODE = range(12, 18)
 INSTRUMENT_ROWS = 18
 
 
 @contracted
-def converted(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressure [Pa] as read back from the converter (`instruments.convert`)."""
-    least = load(sensor, row + LEAST)
-    within_range = min(max(pressure, least), load(sensor, row + LARGEST))
-    volts = load(sensor, row + VOLTS) + (within_range - least) * load(sensor, row + PER_PASCAL)
-    top = load(sensor, row + TOP)
-    codes = min(max(nearest_whole(volts / load(sensor, row + COUNT)), -top), top - 1.0)
-    return least + (codes * load(sensor, row + COUNT) - load(sensor, row + VOLTS)) / load(sensor, row + PER_PASCAL)
+def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
+    """Compute the pressure [Pa] as read back from the analog-digital converter (`instruments.digitize`)."""
+    range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
+    volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
+    volts_per_code = load(sensor, row + VOLTS_PER_CODE)
+    saturated = min(max(pressure, range_min), load(sensor, row + RANGE_MAX))
+    volts = volts_at_min + (saturated - range_min) * volts_per_pascal
+    code = min(max(nearest_integer(volts / volts_per_code), -max_code), max_code - 1.0)
+    return range_min + (code * volts_per_code - volts_at_min) / volts_per_pascal
 
 
 @contracted
-def _hum(sensor: np.ndarray, row: int, sample: int) -> Any:
-    turns = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_TURNS) * sample
-    turns = turns - nearest_whole(turns)  # -1/2 .. 1/2 of a turn
-    sine = half_turn_sine(turns)
-    cosine = half_turn_sine(0.5 - abs(turns))  # cos(pi turns)
+def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
+    """Compute the mains hum [Pa] at a sample, sin(2 pi cycles) by sin 2a = 2 sin a cos a."""
+    cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
+    cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
+    sine = half_turn_sine(cycles)
+    cosine = half_turn_sine(0.5 - abs(cycles))  # cos(pi cycles)
     return load(sensor, row + HUM) * (2.0 * sine * cosine)
 
 
 @contracted
-def _read(
-    true: Any, sensor: np.ndarray, row: int, noise_of_channel: Any, common: Any, walk: Any, sample: int, since: float
+def _read_pressure(
+    pressure: Any,
+    sensor: np.ndarray,
+    row: int,
+    channel_noise: Any,
+    common_noise: Any,
+    drift: Any,
+    sample: int,
+    samples_since: float,
 ) -> Any:
-    gain = load(sensor, row + GAIN) + since * load(sensor, row + GAIN_RISE)
-    offset = load(sensor, row + OFFSET) + since * load(sensor, row + OFFSET_RISE)
-    noise = load(sensor, row + NOISE) + since * load(sensor, row + NOISE_RISE)
-    shared = load(sensor, row + COMMON) + since * load(sensor, row + COMMON_RISE)
-    reading = gain * true + offset + walk + noise * noise_of_channel + shared * common
-    if anywhere(load(sensor, row + HUM) > 0.0):
-        reading = reading + _hum(sensor, row, sample)
-    return converted(reading, sensor, row)
+    """Compute the reading [Pa] of a filtered `pressure` [Pa] by the instrument in row `row` of `sensor`.
+
+    `channel_noise`, `common_noise`: standard normal; `drift` [Pa]; `samples_since`: age of the values in `sensor`.
+    """
+    gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
+    offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
+    noise = load(sensor, row + NOISE) + samples_since * load(sensor, row + NOISE_RISE)
+    common = load(sensor, row + COMMON) + samples_since * load(sensor, row + COMMON_RISE)
+    reading = gain * pressure + offset + drift + noise * channel_noise + common * common_noise
+    if any_lane(load(sensor, row + HUM) > 0.0):
+        reading = reading + _mains_hum(sensor, row, sample)
+    return convert_lanes(reading, sensor, row)
 
 
 @contracted
-def _add_squares(details: np.ndarray, first: int, m: int, bounds: np.ndarray, sums: np.ndarray, to: int) -> None:
-    """Add the squares of m samples' details, from sample `first` on, to their segments between `bounds`.
+def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, sums: np.ndarray, sums_row: int) -> None:
+    """Add the squared details of the n samples from sample `first` on to the sums of the segments between `bounds`.
 
-    `details`: (LEVELS, CHUNK, WIDTH); `sums` rows to, to + QUANTITIES, .. are the segments'.
+    `details`: (LEVELS, CHUNK, WIDTH); segment k has QUANTITIES rows of `sums` from `sums_row` + k QUANTITIES on.
     """
     for segment in range(bounds.size - 1):
-        row = to + segment * QUANTITIES
-        for i in range(max(bounds[segment] - first, 0), min(bounds[segment + 1] - first, m)):
+        row = sums_row + segment * QUANTITIES
+        for i in range(max(bounds[segment] - first, 0), min(bounds[segment + 1] - first, n)):
             for level in range(LEVELS):
-                x = load(details, level * CHUNK + i)
-                store(sums, row + level, load(sums, row + level) + x * x)
-            x = load(details, 2 * CHUNK + i) * load(details, 3 * CHUNK + i)
-            store(sums, row + LEVELS, load(sums, row + LEVELS) + x * x)
+                detail = load(details, level * CHUNK + i)
+                store(sums, row + level, load(sums, row + level) + detail * detail)
+            d3d4 = load(details, 2 * CHUNK + i) * load(details, 3 * CHUNK + i)  # levels 2 and 3 are d3 and d4
+            store(sums, row + LEVELS, load(sums, row + LEVELS) + d3d4 * d3d4)
 
 
 @contracted
-def sense(
+def add_reading_squares(
     groups: tuple[int, int],
     pressures: np.ndarray,
-    begin: int,
+    first_output: int,
     factor: int,
     taps: np.ndarray,
     first: int,
     last: int,
     sensors: np.ndarray,
     keys: np.ndarray,
-    walks: np.ndarray,
+    drifts: np.ndarray,
     wavelet: tuple[np.ndarray, np.ndarray],
     buffers: np.ndarray,
     bounds: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Read samples first <= s < last of the groups' runs and add the squares of their details to `sums`.
+    """Compute the readings of samples first <= s < last of the groups' runs, and add their squared details to `sums`.
 
-    `pressures`: (groups, outputs, CHANNELS, WIDTH), the first tap of sample `first` on output `begin`, `factor` outputs
-    a sample; `taps` (groups, CHANNELS, taps, WIDTH) of the anti-alias filter; `sensors`: (groups, CHANNELS,
-    INSTRUMENT_ROWS, WIDTH), as at sample `first`; `keys`: (groups, WIDTH) of the noise; `walks`: (groups, CHANNELS,
-    WIDTH) zero drift so far [Pa]; `wavelet`: taps (taps, WIDTH) of the low- and high-pass; `buffers`: (groups,
-    CHANNELS, LEVELS, history + CHUNK, WIDTH) of the filters; `bounds`: (segments + 1,) samples; `sums`: (groups,
-    CHANNELS, segments, QUANTITIES, WIDTH).
+    `pressures`: (groups, outputs, CHANNELS, WIDTH), `factor` outputs a sample, the first filter tap of sample `first`
+    at output `first_output`; `taps` (groups, CHANNELS, taps, WIDTH): anti-alias filter; `sensors` (groups, CHANNELS,
+    INSTRUMENT_ROWS, WIDTH): instruments at sample `first`; `keys` (groups, WIDTH): noise keys; `drifts` (groups,
+    CHANNELS, WIDTH): offset drift so far [Pa]; `wavelet`: taps (taps, WIDTH) of its low- and high-pass; `buffers`
+    (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels; `bounds` (segments + 1,):
+    samples; `sums`: (groups, CHANNELS, segments, QUANTITIES, WIDTH).
     """
-    count, stride, rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
+    n_taps, stride, sum_rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
     low, high = wavelet
     capacity = buffers.shape[3]
-    history, delay = capacity - CHUNK, low.shape[0] // 2 * ((1 << LEVELS) - 1)
+    history, delay = capacity - CHUNK, low.shape[0] // 2 * ((1 << LEVELS) - 1)  # samples by which details lag readings
     details = np.empty((LEVELS, CHUNK, WIDTH))
     for g in range(groups[0], groups[1]):
         key = load(keys, g)
-        A, B = CHANNELS * g, CHANNELS * g + 1
-        walk_A, walk_B = load(walks, A), load(walks, B)
+        A, B = CHANNELS * g, CHANNELS * g + 1  # both channels; rows of lanes in all arrays are counted through
+        drift_A, drift_B = load(drifts, A), load(drifts, B)
         sensor_A, sensor_B = A * INSTRUMENT_ROWS, B * INSTRUMENT_ROWS
         start_A, start_B = A * LEVELS * capacity, B * LEVELS * capacity
         for start in range(first, last, CHUNK):
-            m = min(CHUNK, last - start)
-            source = (g * pressures.shape[1] + begin) * CHANNELS + (start - first) * stride
+            n = min(CHUNK, last - start)
+            source = (g * pressures.shape[1] + first_output) * CHANNELS + (start - first) * stride
             a, b = start_A + history, start_B + history
-            filter_rows(pressures, source, stride, -CHANNELS, taps, A * count, count, buffers, a, m)
-            filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * count, count, buffers, b, m)
-            for i in range(m):
-                s, since = start + i, float(start - first + i)
-                own_A, own_B = normals(key, 3 * s)
-                common, step_A = normals(key, 3 * s + 1)
-                step_B, _ = normals(key, 3 * s + 2)
-                walk_A = walk_A + load(sensors, sensor_A + WALK) * step_A
-                walk_B = walk_B + load(sensors, sensor_B + WALK) * step_B
-                store(buffers, a + i, _read(load(buffers, a + i), sensors, sensor_A, own_A, common, walk_A, s, since))
-                store(buffers, b + i, _read(load(buffers, b + i), sensors, sensor_B, own_B, common, walk_B, s, since))
+            filter_rows(pressures, source, stride, -CHANNELS, taps, A * n_taps, n_taps, buffers, a, n)
+            filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * n_taps, n_taps, buffers, b, n)
+            for i in range(n):
+                s, samples_since = start + i, float(start - first + i)
+                noise_A, noise_B = normals(key, 3 * s)
+                common_noise, drift_step_A = normals(key, 3 * s + 1)
+                drift_step_B, _ = normals(key, 3 * s + 2)
+                drift_A = drift_A + load(sensors, sensor_A + DRIFT_STEP) * drift_step_A
+                drift_B = drift_B + load(sensors, sensor_B + DRIFT_STEP) * drift_step_B
+                p_A, p_B = load(buffers, a + i), load(buffers, b + i)
+                reading_A = _read_pressure(p_A, sensors, sensor_A, noise_A, common_noise, drift_A, s, samples_since)
+                reading_B = _read_pressure(p_B, sensors, sensor_B, noise_B, common_noise, drift_B, s, samples_since)
+                store(buffers, a + i, reading_A)
+                store(buffers, b + i, reading_B)
             for channel, row in ((A, start_A), (B, start_B)):
-                split_levels(buffers, row, history, m, low, high, LEVELS, capacity, details)
-                _add_squares(details, start - delay, m, bounds, sums, channel * rows)
-                turn_back(buffers, row, LEVELS, capacity, history + m, history)
-        store(walks, A, walk_A)
-        store(walks, B, walk_B)
+                split_levels(buffers, row, history, n, low, high, LEVELS, capacity, details)
+                _add_squares(details, start - delay, n, bounds, sums, channel * sum_rows)
+                move_history(buffers, row, LEVELS, capacity, history + n, history)
+        store(drifts, A, drift_A)
+        store(drifts, B, drift_B)
 
 
 @kernel
 def sense_lanes(*run: Any) -> None:
-    """`sense`, compiled for lanes."""
-    sense(*run)
+    """Read the pressures of groups of runs and sum their squared details: `add_reading_squares`, compiled."""
+    add_reading_squares(*run)

@@ -1,4 +1,4 @@
-"""The bench: healthy machines drawn from a profile by a seed; each differs, and each changes within its record."""
+"""The bench: healthy machines drawn at random from a profile, each with parameters and slow drifts of its own."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
 from sealscope.simulation.changes import ParameterDrift, Wander
 from sealscope.simulation.commands import Command, parse_command
-from sealscope.simulation.courses import Force, Position, command_or_target, parse_force
 from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.targets_and_loads import Force, Position, command_or_target, parse_force
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 #: Terms of a wandering drift.
 WANDER_TERMS = 6
+#: Time step [s] at which the piston's path is estimated for `centred_start`.
+_PATH_STEP = 0.05
 
 
 @dataclass(frozen=True)
 class BenchMachine:
-    """One machine on one day: its designed rig, its departures from that, its drifts and its duty.
+    """One healthy machine in one recording: the designed rig, the machine's deviations from it, drifts and duty.
 
-    `overrides`: values of parameters by dotted name, in SI, throttles among them (`closed`; open ones leave
-    `line.orifices` as the rig has it); `duration` [s] of the record over which the drifts have their sizes. A target is
-    followed by the `controller` of that name, which assumes the rig as designed and not the machine.
+    `overrides`: the machine's parameters by dotted name, in SI; `duration` [s]: that of the recording, over which the
+    drifts have their sizes; `closed`: closed fraction of both throttles. A target is followed by the `controller` of
+    that name, built for the designed `rig` and not for the machine.
     """
 
     profile: str
@@ -47,84 +49,88 @@ class BenchMachine:
     controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
-        """Make the experiment of this machine on its duty, from a start that centres its strokes.
+        """Make the experiment of this machine on its duty, starting so that its strokes are centred.
 
-        `arguments`: those of `Experiment.of` (leak, fault), and the machine's own seed, duration and drifts where
-        they are not among them.
+        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts default
+        to the machine's.
         """
-        built = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
+        machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         machine_values = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
         values = {"load": self.load, **machine_values, **arguments}
         if isinstance(values["command"], str):
             values["command"] = command_or_target(values["command"])
         if isinstance(values["command"], Position):
             values.setdefault("controller", controller_named(self.controller, self.rig))
-        values.setdefault("x_0", centred_start(built, values["command"], values["duration"]))
-        return Experiment.of(rig=built, **values)
+        values.setdefault("x_0", centred_start(machine, values["command"], values["duration"]))
+        return Experiment.of(rig=machine, **values)
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Compute the start [m] that centres the strokes of a command about mid-stroke, or comes closest to it.
+    """Estimate the start position [m] that centres a command's strokes at mid-stroke; for a target, its first value.
 
-    That of a target is where the target begins.
-
-    The piston goes with the pump's flow, A v = q_b omega/(2 pi), and an unloaded motor without inertia follows its PI
-    loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve it goes
-    with the valve's flow without a load.
+    The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is an unloaded one without inertia in
+    its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve
+    the piston moves with the valve's flow without load.
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
-    dt, half = 0.05, 0.5 * cylinder.L
+    dt, half_stroke = _PATH_STEP, 0.5 * cylinder.L
     if isinstance(command, Position):
-        return float(np.clip(command.value_at(np.zeros(())), -half, half))
-    area = 0.5 * (cylinder.A_A + cylinder.A_B)
-    if rig.valve.spool == "present":
-        positions = dt * np.cumsum(command.volts(np.arange(0.0, duration + dt, dt))) * drive_of(rig).largest(1.0) / area
-        return float(np.clip(-0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0)), -half, half))
-    demand = motor.omega_per_volt * command.volts(np.arange(0.0, duration + dt, dt))
-    gain = motor.k_p + motor.C_e
-    integral = angle = lowest = highest = 0.0
-    for omega_d in map(float, demand):
-        omega = (motor.k_p * omega_d + motor.K_i * integral) / gain
+        return float(np.clip(command.value_at(np.zeros(())), -half_stroke, half_stroke))
+    area, volts = 0.5 * (cylinder.A_A + cylinder.A_B), command.volts(np.arange(0.0, duration + dt, dt))
+    if rig.circuit.valve_controlled:
+        flow_per_volt = drive_of(rig).unloaded_flow(1.0)
+        positions = dt * np.cumsum(volts) * flow_per_volt / area
+        centre = 0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0))
+        return float(np.clip(-centre, -half_stroke, half_stroke))
+    integral = angle = min_angle = max_angle = 0.0
+    for omega_d in map(float, motor.omega_per_volt * volts):
+        omega = (motor.k_p * omega_d + motor.K_i * integral) / (motor.k_p + motor.C_e)
         integral += dt * (omega_d - omega)
         angle += dt * omega
-        lowest, highest = min(lowest, angle), max(highest, angle)
-    stroke = rig.pump.q_b / (2.0 * np.pi) / area
-    return float(np.clip(-0.5 * stroke * (lowest + highest), -half, half))
+        min_angle, max_angle = min(min_angle, angle), max(max_angle, angle)
+    travel_per_angle = rig.pump.q_b / (2.0 * np.pi) / area
+    return float(np.clip(-0.5 * travel_per_angle * (min_angle + max_angle), -half_stroke, half_stroke))
 
 
-def _random(seed: int, name: str) -> np.random.Generator:
-    """Make the random stream of one nuisance, which no other nuisance of the profile changes."""
+def _random_stream(seed: int, name: str) -> np.random.Generator:
+    """Make the random generator of one nuisance, whose draws do not depend on the other nuisances of a profile."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def _path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
-    """Draw a path with a distance of 1 between its extremes: linear, up or down, or wandering."""
+def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
+    """Draw the path of a drift over `duration` [s]: linear with an end value of +-1, or a wander with a range of 1.
+
+    `warms`: a linear path rises instead of rising or falling at random.
+    """
     shape = shapes[int(random.integers(len(shapes)))]
-    up = random.random() < 0.5 or warms
-    weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)
+    rises = random.random() < 0.5 or warms
+    weights = random.standard_normal(WANDER_TERMS) / (np.arange(WANDER_TERMS) + 0.5)  # standard deviations of `Wander`
     if shape == "linear":
-        return Wander((), duration, 1.0 if up else -1.0)
-    return Wander(tuple(map(float, weights)), duration).scaled(1.0)
+        return Wander((), duration, 1.0 if rises else -1.0)
+    return Wander(tuple(map(float, weights)), duration).scale_to_range(1.0)
 
 
-def _drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    path = _path(random, drift.shapes, oil.duration)
-    shape = oil.times(drift.oil).plus(path.times((1.0 - drift.oil**2) ** 0.5)) if drift.oil else path
-    return shape.scaled(float(random.uniform(*drift.size)))
+def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
+    """Draw a drift: a mixture of the oil temperature's path and a path of its own, scaled to a drawn size."""
+    path = _draw_path(random, drift.shapes, oil.duration)
+    # weights whose squares sum to 1, so that the mixture varies as much as either path
+    mixture = oil.times(drift.oil).plus(path.times((1.0 - drift.oil**2) ** 0.5)) if drift.oil else path
+    return mixture.scale_to_range(float(random.uniform(*drift.size)))
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw the values (or factors) and drifts of one nuisance."""
+    """Draw one nuisance: the value of each parameter by name (a factor on it if the nuisance scales), and drifts."""
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
-    for group in [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]:
-        random = _random(seed, f"{nuisance.name}/{group[0]}" if nuisance.each else nuisance.name)
+    groups = [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]
+    for group in groups:
+        random = _random_stream(seed, f"{nuisance.name}/{group[0]}" if nuisance.each else nuisance.name)
         value = float(random.uniform(nuisance.low, nuisance.high)) if nuisance.high > nuisance.low else nuisance.low
         values |= dict.fromkeys(group, value)
         if nuisance.drift is not None:
-            shape = _drift(random, nuisance.drift, oil)
-            drifts += [ParameterDrift(name, shape, nuisance.drift.absolute) for name in group]
+            path = _draw_drift(random, nuisance.drift, oil)
+            drifts += [ParameterDrift(name, path, nuisance.drift.absolute) for name in group]
     return values, drifts
 
 
@@ -136,51 +142,57 @@ def draw(
     duration: float = 180.0,
     family: str = "",
 ) -> BenchMachine:
-    """Draw a healthy machine of a rig's kind from a profile (or its name, or its file).
+    """Draw a healthy machine like `rig` from a profile (or its name or file); equal seeds give equal machines.
 
-    One seed, one machine.
-
-    `duration` [s] is the record over which the drifts have their sizes; `family`: of the profile, "" for a machine that
-    is of none. Raises InputError for a seed below 0, an unknown family, and where a drawn value is out of its
+    `duration` [s]: that of the recording, over which the drifts have their sizes; `family`: one of the profile's
+    families, "" for none. Raises InputError for a seed below 0, an unknown family, or a drawn value out of its
     parameter's range.
     """
     from sealscope.parameters import load_rig
 
-    nuisances = load_profile(profile) if isinstance(profile, str) else profile
-    warms = bool(family) and nuisances.family(family).warms
-    nuisances = nuisances.of_family(family) if family else nuisances
+    distribution = load_profile(profile) if isinstance(profile, str) else profile
+    warms = bool(family) and distribution.family(family).warms
+    distribution = distribution.of_family(family) if family else distribution
     base = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
     if not (math.isfinite(duration) and duration > 0):
         raise InputError(f"duration must be > 0 s and finite, got {duration}")
-    oil = _path(
-        _random(seed, "temperature of the oil"), ("linear",) if warms else ("linear", "wander"), duration, warms=True
-    )
+    oil_shapes = ("linear",) if warms else ("linear", "wander")
+    oil = _draw_path(_random_stream(seed, "temperature of the oil"), oil_shapes, duration, warms=True)
     overrides: dict[str, float | str] = {}
     drifts: list[ParameterDrift] = []
-    for nuisance in nuisances.nuisances:
+    for nuisance in distribution.nuisances:
         if isinstance(nuisance, NuisanceChoice):
-            value = nuisance.values[int(_random(seed, nuisance.name).integers(len(nuisance.values)))]
+            value = nuisance.values[int(_random_stream(seed, nuisance.name).integers(len(nuisance.values)))]
             overrides |= dict.fromkeys(nuisance.parameters, value)
             continue
-        values, drifting = _draw_nuisance(nuisance, seed, oil)
+        values, nuisance_drifts = _draw_nuisance(nuisance, seed, oil)
         overrides |= {name: float(base[name]) * value for name, value in values.items()} if nuisance.scales else values
-        drifts += drifting
-    random, duty = _random(seed, "duty"), nuisances.duty
+        drifts += nuisance_drifts
+    random, duty = _random_stream(seed, "duty"), distribution.duty
 
-    def one_of(options: Sequence[T]) -> T:
+    def draw_one(options: Sequence[T]) -> T:
         return options[int(random.integers(len(options)))]
 
-    command, closed = command_or_target(one_of(duty.commands)), one_of(duty.closed)
+    command, closed = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
     overrides |= {"line.closed_A": closed, "line.closed_B": closed}
     if closed > 0:
         overrides["line.orifices"] = "present"
     amplitude = float(random.uniform(*duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]
-    load = parse_force(one_of(duty.loads)) if duty.loads else None
-    controller = one_of(duty.controllers) if duty.controllers else "pi"
+    load = parse_force(draw_one(duty.loads)) if duty.loads else None
+    controller = draw_one(duty.controllers) if duty.controllers else "pi"
     return BenchMachine(
-        nuisances.name, seed, base, duration, overrides, tuple(drifts), command, closed, load, controller
+        profile=distribution.name,
+        seed=seed,
+        rig=base,
+        duration=duration,
+        overrides=overrides,
+        drifts=tuple(drifts),
+        command=command,
+        closed=closed,
+        load=load,
+        controller=controller,
     )

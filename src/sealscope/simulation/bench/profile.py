@@ -1,4 +1,4 @@
-"""Profiles of nuisances as files: the differences between healthy machines, and the changes within a record."""
+"""Profiles of nuisances as files: differences between healthy machines, and drifts within a recording."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from sealscope.errors import InputError
 from sealscope.parameters import declared_names
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.names import resolve
-from sealscope.parameters.rig import declared
-from sealscope.simulation.changes import ParameterDrift, drifts_absolutely, linear
-from sealscope.simulation.courses import Position, command_or_target, parse_force
-from sealscope.storage.plain_values import as_type
+from sealscope.parameters.names import resolve_name
+from sealscope.parameters.rig import declared_fields
+from sealscope.simulation.changes import ParameterDrift, is_absolute_drift, linear_path
+from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
+from sealscope.storage.plain_values import convert_type
 from sealscope.storage.toml_file import read_toml
 from sealscope.units import to_si
 
@@ -25,7 +25,8 @@ _KNOWN_ONLY = ConfigDict(extra="forbid")
 _Entries = TypeVar("_Entries", bound=tuple[Any, ...])
 
 
-def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+def _check_rising(pair: tuple[float, float]) -> tuple[float, float]:
+    """Check that a pair is [low, high] and return it (a pydantic validator); raise ValueError otherwise."""
     if pair[0] > pair[1]:
         raise ValueError(f"must be [low, high] with low <= high, got {list(pair)}")
     return pair
@@ -34,7 +35,7 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 _Text = Annotated[str, Field(pattern=r"\S")]
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Pair = Annotated[tuple[_Number, _Number], AfterValidator(_rising)]
+_Pair = Annotated[tuple[_Number, _Number], AfterValidator(_check_rising)]
 _Flag = Annotated[bool, Field(strict=True)]
 _Closed = Annotated[_Number, Field(ge=0.0, le=99.0), AfterValidator(lambda percent: percent / 100.0)]
 
@@ -62,10 +63,10 @@ class _NuisanceEntry(BaseModel):
 
 @dataclass(frozen=True)
 class DriftRange:
-    """The size, shape and cause of a parameter's drift.
+    """The distribution of a parameter's drift.
 
-    `size` low and high of the distance between its extremes (a share, or SI if `absolute`); forms it may take; weight
-    `oil` of the oil's temperature in it, the rest wanders.
+    `size`: (low, high) of its range, relative or in SI if `absolute`; `shapes`: paths to choose from; `oil`: weight of
+    the oil temperature's path in it.
     """
 
     size: tuple[float, float]
@@ -76,9 +77,10 @@ class DriftRange:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One thing that differs between machines, uniformly between `low` and `high`.
+    """A difference between machines that is distributed uniformly between `low` and `high`.
 
-    a value in SI, or a factor on the rig's own (`scales`); `each`: a draw for each parameter, else one for all.
+    They are values in SI, or factors on the rig's values if it `scales`; `each`: one draw for each parameter, else one
+    for all; `why`: the reason for the range.
     """
 
     name: str
@@ -93,7 +95,7 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class NuisanceChoice:
-    """One thing that differs between machines: one of `values`, in SI or texts of a choice, for all `parameters`."""
+    """A difference between machines that is one of `values` (SI, or texts of a choice) for all `parameters`."""
 
     name: str
     parameters: tuple[str, ...]
@@ -103,11 +105,10 @@ class NuisanceChoice:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Duty:
-    """The commands, targets, loads and controllers of the machines of a profile.
+    """The duties of a profile's machines, of which each machine has one.
 
-    One of `commands`, times a factor within `amplitude`, both throttles `closed` by one of these shares (in the file:
-    per cent). Where commands are targets for the piston, one of `controllers` follows them (none: PI); one of `loads`
-    acts on the rod.
+    Drawn are one of `commands`, a factor on it within `amplitude`, the closed fraction of both throttles from `closed`
+    (in the file: per cent), one of `loads` on the rod, and for a position target one of `controllers` (default: PI).
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -138,18 +139,19 @@ class Duty:
 AnyNuisance = Nuisance | NuisanceChoice
 
 
-def _nuisance(table: Any) -> AnyNuisance:
-    """Read the nuisance of a file's entry."""
+def _parse_nuisance(table: Any) -> AnyNuisance:
+    """Parse a nuisance from an entry of a file; raise InputError with its name if it breaks a rule."""
     entry = _NuisanceEntry.model_validate(table)
     try:
-        return _in_si(entry)
+        return _convert_to_si(entry)
     except InputError as error:
         raise InputError(f"{entry.name}: {error}") from None
 
 
-def _in_si(entry: _NuisanceEntry) -> AnyNuisance:
-    parameters = tuple(resolve(name, declared_names()) for name in entry.parameters)
-    declarations = [declared()[parameter] for parameter in parameters]
+def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
+    """Convert an entry to a nuisance in SI units; raise InputError if its fields do not fit together."""
+    parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
+    declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
     choices, si_unit = next(iter(kinds))
     if entry.values is not None:
@@ -157,8 +159,8 @@ def _in_si(entry: _NuisanceEntry) -> AnyNuisance:
             raise InputError(
                 "a list of values must be of parameters of one kind and unit, with neither range nor drift"
             )
-        return NuisanceChoice(entry.name, parameters, _values(entry, choices, si_unit), entry.why)
-    if any(chosen for chosen, _ in kinds):
+        return NuisanceChoice(entry.name, parameters, _convert_values(entry, choices, si_unit), entry.why)
+    if any(kind_choices for kind_choices, _ in kinds):
         raise InputError(f"{', '.join(parameters)}: a choice cannot be drawn from a range")
     if entry.scale is not None and entry.range is None and entry.unit is None:
         low, high = entry.scale
@@ -167,17 +169,18 @@ def _in_si(entry: _NuisanceEntry) -> AnyNuisance:
     elif entry.range is not None and entry.scale is None and entry.unit is not None:
         if len(kinds) > 1:
             raise InputError(
-                f"parameters of one range must have one unit, got {', '.join(sorted(u for _, u in kinds))}"
+                f"parameters of one range must have one unit, got {', '.join(sorted(unit for _, unit in kinds))}"
             )
         low, high = (to_si(value, entry.unit, si_unit, name="range") for value in entry.range)
     else:
         raise InputError("there must be a range with its unit or a scale without one")
-    drift = None if entry.drift is None else _drift(entry.drift, parameters, si_unit)
-    return Nuisance(entry.name, parameters, low, high, entry.scale is not None, entry.each, drift, entry.why)
+    drift = None if entry.drift is None else _parse_drift(entry.drift, parameters, si_unit)
+    scales = entry.scale is not None
+    return Nuisance(entry.name, parameters, low, high, scales=scales, each=entry.each, drift=drift, why=entry.why)
 
 
-def _values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Read the values of a `NuisanceChoice`: of a choice unchanged, of a number in SI."""
+def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
+    """Convert the values of an entry to SI; raise InputError for a value that the parameter cannot have."""
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -189,13 +192,14 @@ def _values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tu
     return tuple(to_si(float(value), entry.unit or "", si_unit, name="values") for value in values)
 
 
-def _drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    absolute = drifts_absolutely(parameters[0])
+def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
+    """Convert an entry's drift to SI or to fractions; raise InputError for a drift that its parameters cannot have."""
+    absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
-        ParameterDrift(parameter, linear(0.0, 1.0), absolute)
+        ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
-    falls = entry.oil != 1.0  # with the oil alone, which warms, it only rises
-    if low < 0 or (not absolute and falls and high >= 1):
+    can_fall = entry.oil != 1.0  # the oil alone only warms, so its drift only rises
+    if low < 0 or (not absolute and can_fall and high >= 1):
         raise InputError(f"size of the drift must be >= 0 and < 100 %, got {low:g} to {high:g}")
     if entry.shapes is not None and entry.oil is not None:
         raise InputError("the drift must have shapes or oil, got both")
@@ -203,31 +207,34 @@ def _drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> Dri
     return DriftRange((low, high), absolute, shapes, float(entry.oil or 0.0))
 
 
-def _distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Check that no two nuisances share a parameter or a name, and return them."""
+def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
+    """Check that no two nuisances share a parameter or a name, and return them; raise InputError otherwise."""
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
             if owner.setdefault(parameter, nuisance.name) != nuisance.name:
                 raise InputError(f"{parameter} must be in one nuisance, got {owner[parameter]} and {nuisance.name}")
-    return _distinct_names(nuisances)
+    return _check_distinct_names(nuisances)
 
 
-def _distinct_names(entries: _Entries) -> _Entries:
+def _check_distinct_names(entries: _Entries) -> _Entries:
+    """Check that no two entries have one name, and return them; raise InputError otherwise."""
     if len({entry.name for entry in entries}) < len(entries):
         raise InputError("they must have names of their own")
     return entries
 
 
-_Nuisances = Annotated[tuple[Annotated[AnyNuisance, BeforeValidator(_nuisance)], ...], AfterValidator(_distinct)]
+_Nuisances = Annotated[
+    tuple[Annotated[AnyNuisance, BeforeValidator(_parse_nuisance)], ...], AfterValidator(_check_distinct)
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Family:
-    """Machines that depart from the others of a profile in one way.
+    """A family of machines, which differs from the other machines of a profile in one respect.
 
-    `nuisances` take the place of the profile's for the same parameters, `duty` (None: the profile's) that of its duty;
-    `warms`: the oil warms evenly in all of them.
+    `nuisances` replace those of the profile for the same parameters; `duty` replaces the profile's, None keeps it;
+    `warms`: the oil warms linearly in all of them.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -240,9 +247,9 @@ class Family:
 
 @dataclass(frozen=True)
 class Profile:
-    """All nuisances of a kind of machines, and their duty; `families` of machines that depart from it.
+    """The nuisances of a kind of machines, their duty, and `families` of machines that differ from the others.
 
-    `seeds`: name that the seeds of cases derive from, "" for its own: a renamed profile draws the same machines.
+    `seeds`: name that the seeds of cases derive from, "" for the profile's: so a renamed profile draws the same cases.
     """
 
     name: str
@@ -254,7 +261,7 @@ class Profile:
     seeds: str = field(default="", repr=False)
 
     def family(self, name: str) -> Family:
-        """Return the family of a name; raise InputError where there is none."""
+        """Return the family of a name; raise InputError if there is none."""
         for family in self.families:
             if family.name == name:
                 return family
@@ -262,7 +269,7 @@ class Profile:
         raise InputError(f"a family of {self.name} must be one of its own ({names}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
-        """Build the profile of one family's machines: its nuisances in place of this profile's."""
+        """Build the profile of one family's machines, with its nuisances and duty in place of this profile's."""
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
         return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
@@ -271,13 +278,13 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Replace the nuisances that share a parameter with one of `replacing`."""
+    """Append the nuisances `replacing`, and remove their parameters from the others."""
     replaced = {parameter for nuisance in replacing for parameter in nuisance.parameters}
-    unchanged: list[AnyNuisance] = []
+    remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
-        rest = tuple(parameter for parameter in nuisance.parameters if parameter not in replaced)
-        unchanged += [replace(nuisance, parameters=rest)] if rest else []
-    return (*unchanged, *replacing)
+        parameters = tuple(parameter for parameter in nuisance.parameters if parameter not in replaced)
+        remaining += [replace(nuisance, parameters=parameters)] if parameters else []
+    return (*remaining, *replacing)
 
 
 def profile_names() -> tuple[str, ...]:
@@ -286,16 +293,16 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Read the profile of a name, or of a TOML file laid out like `profiles/bench.toml`.
+    """Read a packaged profile by its name, or a TOML file laid out like `profiles/bench.toml`.
 
-    Raises InputError where the file cannot be read, a name or unit is unknown, a range is none or a reason is missing.
+    Raises InputError if the file cannot be read, a name or unit is unknown, a range is empty or a reason is missing.
     """
     text = os.fspath(name_or_path)
     if text in profile_names():
-        return _profile(_PACKAGED / f"{text}.toml", f"profiles/{text}.toml")
+        return _read_profile(_PACKAGED / f"{text}.toml", f"profiles/{text}.toml")
     if not (text.endswith(".toml") or os.sep in text):
         raise InputError(f"{text!r} is no packaged profile ({', '.join(profile_names())}) and no .toml file")
-    return _profile(Path(text), text)
+    return _read_profile(Path(text), text)
 
 
 class _Head(BaseModel):
@@ -311,13 +318,14 @@ class _File(BaseModel):
     profile: _Head
     duty: Duty | None = None
     nuisance: _Nuisances = ()
-    family: Annotated[tuple[Family, ...], AfterValidator(_distinct_names)] = ()
+    family: Annotated[tuple[Family, ...], AfterValidator(_check_distinct_names)] = ()
 
 
-def _profile(path: Path, place: str) -> Profile:
+def _read_profile(path: Path, place: str) -> Profile:
+    """Read the profile in a file over the one it extends; `place` names the file in messages."""
     tree = read_toml(path, "a profile", place)
     try:
-        file = as_type(_File, tree)
+        file = convert_type(_File, tree)
     except ValueError as error:
         raise InputError(f"{error} ({place})") from None
     head = file.profile

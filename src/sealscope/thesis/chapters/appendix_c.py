@@ -1,4 +1,4 @@
-"""Appendix C simulated and compared with the thesis's own sheet; and Figs. 5.90 to 5.95."""
+"""Compare the simulated tests of Appendix C with the thesis's data sheet, and draw Figs. 5.90 to 5.95."""
 
 from __future__ import annotations
 
@@ -15,55 +15,63 @@ from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, 
 from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, UNITS, DataSheet, mean_leaks
 
 
-def _difference(pairs: Array) -> Array:
+def _percent_change(pairs: Array) -> Array:
+    """Compute the change [%] from the first to the second of each pair (n, 2)."""
     return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
 
 
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
-    """Tabulate one chamber as the thesis does: RMS without and with leak and the difference [%], with both sources."""
+    """Tabulate one chamber as the thesis does: RMS without leak, with leak and change [%], simulated and measured."""
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
     for name in QUANTITIES:
         for label, source in (("simulated", sheet), ("measured", measured)):
             heads += [f"{name} {when}, {label} [{UNITS[name]}]" for when in ("no leak", "leak")]
             heads.append(f"{name} diff, {label} [%]")
-            pairs = None if source is None else source.rms[chamber][name]
-            values = (None,) * 3 if pairs is None else (pairs[:, 0], pairs[:, 1], _difference(pairs))
-            columns += [[None] * len(APPENDIX_C) if series is None else series.tolist() for series in values]
+            if source is None:
+                columns += [[None] * len(APPENDIX_C)] * 3
+            else:
+                pairs = source.rms[chamber][name]
+                columns += np.vstack([pairs.T, _percent_change(pairs)]).tolist()
     rows = (
-        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(values[k] for values in columns))
+        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(column[k] for column in columns))
         for k, row in enumerate(APPENDIX_C)
     )
     tail, title = f"-p{chamber[-1].lower()}", f"Appendix C, RMS of the wavelet details of {chamber}"
     return item.table(rows, "", heads, tail=tail, title=title)
 
 
-def agreement(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
-    """Compare the simulated sheet with the measured one, a row for each chamber and detail."""
+def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
+    """Compare the simulated sheet with the measured one; return a row for each chamber and detail.
+
+    A row: chamber, detail, simulated and measured mean change [%], geometric mean and scatter of the ratio of the
+    leak-free RMS, number of tests with a change of the same sign, correlation of the changes. None if not measured.
+    """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
-        change = sheet.log_change(chamber, name)
-        compared: tuple[Cell, ...] = (None,) * 5
+        simulated_change = sheet.log_change(chamber, name)
+        comparison: tuple[Cell, ...] = (None,) * 5
         if measured is not None:
-            real = measured.log_change(chamber, name)
-            ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
-            same_sign, correlation = int(np.sum(np.sign(change) == np.sign(real))), np.corrcoef(change, real)[0, 1]
-            numbers = (100 * np.expm1(real.mean()), np.exp(ratio.mean()), np.exp(ratio.std(ddof=1)))
-            compared = (*map(float, numbers), same_sign, float(correlation))
-        rows.append((chamber, name, float(100 * np.expm1(change.mean())), *compared))
+            measured_change = measured.log_change(chamber, name)
+            log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
+            same_sign = int(np.sum(np.sign(simulated_change) == np.sign(measured_change)))
+            correlation = np.corrcoef(simulated_change, measured_change)[0, 1]
+            numbers = 100 * np.expm1(measured_change.mean()), np.exp(log_ratio.mean()), np.exp(log_ratio.std(ddof=1))
+            comparison = (*map(float, numbers), same_sign, float(correlation))
+        rows.append((chamber, name, float(100 * np.expm1(simulated_change.mean())), *comparison))
     return rows
 
 
-def appendix(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the agreement of simulation and sheet, and the thesis's two tables with both of them."""
+def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
+    """Tabulate the agreement of the simulated and the measured sheet, and both in the thesis's two tables."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
-    summary = item.table(agreement(sheet, context.sheet), notes, resolved=table.resolved)
+    summary = item.table(compare_sheets(sheet, context.sheet), notes, resolved=table.resolved)
     return summary, *(_chamber_table(sheet, context.sheet, chamber, item) for chamber in CHAMBERS)
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the change of a detail's RMS against the mean leak: measured, simulated, simulated without a leak."""
+    """Draw the change of a detail's RMS over the mean leak: measured, simulated, and simulated without a leak."""
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()
     sources: tuple[tuple[DataSheet | None, str, Role], ...] = (
@@ -77,16 +85,16 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
             continue
         pairs, change = source.rms[chamber][name], source.log_change(chamber, name)
         absolute.append(FigureCurve(leak, pairs[:, 1] - pairs[:, 0], label, role, "points"))
-        relative.append(FigureCurve(leak, _difference(pairs), label, role, "points"))
-        k = int(np.sum(change < 0 if direction == "down" else change > 0))
-        low, high = clopper_pearson(k, change.size)
+        relative.append(FigureCurve(leak, _percent_change(pairs), label, role, "points"))
+        n_moved = int(np.sum(change < 0 if direction == "down" else change > 0))
+        low, high = clopper_pearson(n_moved, change.size)
         numbers += [
-            Number(f"{label}: tests that go {direction}", f"{k} of {change.size}"),
-            Number(f"{label}: rate, 95 % interval", f"{k / change.size:.3f} ({low:.3f} to {high:.3f})"),
+            Number(f"{label}: tests that go {direction}", f"{n_moved} of {change.size}"),
+            Number(f"{label}: rate, 95 % interval", f"{n_moved / change.size:.3f} ({low:.3f} to {high:.3f})"),
             Number(f"{label}: correlation of the change with the leak", float(np.corrcoef(change, leak)[0, 1])),
         ]
-    zero = FigureCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
-    heads = (f"RMS with - without leak, {name} [{UNITS[name]}]", f"change of the RMS of {name} [%]")
-    lines = zip(heads, (absolute, relative), strict=True)
-    panels = tuple(Panel("mean leak [L/min]", head, (*curves, zero)) for head, curves in lines)
+    no_change = FigureCurve(np.array([leak.min(), leak.max()]), np.zeros(2), "no change", "reference")
+    labels = (f"RMS with - without leak, {name} [{UNITS[name]}]", f"change of the RMS of {name} [%]")
+    curves_by_label = zip(labels, (absolute, relative), strict=True)
+    panels = tuple(Panel("mean leak [L/min]", label, (*curves, no_change)) for label, curves in curves_by_label)
     return (item.figure(panels, numbers, table.resolved, table.notes),)

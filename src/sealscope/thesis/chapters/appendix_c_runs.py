@@ -1,7 +1,7 @@
-"""The 41 tests of Appendix C run on the simulated rig, reduced to the RMS of the details before and after.
+"""Simulate the 41 tests of Appendix C and reduce each to the RMS of the wavelet details in its two halves.
 
-The same tests are run with their leak, with nothing leaking, and with nothing leaking on a rig that drifts. Records are
-reduced at once and not kept: all of them would fill gigabytes.
+The tests are simulated with their leak, without any leak, and without a leak on a rig whose parameters drift. Only the
+RMS is stored, as the recordings would take gigabytes.
 """
 
 from __future__ import annotations
@@ -17,42 +17,45 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.signals.filters import reach
 from sealscope.simulation.changes import ParameterDrift
-from sealscope.simulation.commands import tabulated
+from sealscope.simulation.commands import polyline_from_table
 from sealscope.simulation.experiment import Experiment
-from sealscope.thesis.engine.context import Context, first_table, simulated_run
+from sealscope.thesis.engine.context import Context, first_table, simulate_run
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.engine.texts import note, texts_of
+from sealscope.thesis.engine.texts import format_note, load_texts
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition, DataSheet, experiment_values
 from sealscope.units import PSI
 
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
 HALF, QUICK_HALF = 90.0, 40.0
-#: What is left out of each record's beginning [s]: the rig starts at standstill, the thesis's was running.
+#: Beginning of each record that is left out [s]: the simulated rig starts at standstill, the thesis's was running.
 SETTLING = 5.0
-#: What happens at half time, and the seed of the first test of each kind of runs.
+#: Kind of runs: what changes at half time; and the seed of the first test of each kind.
 Runs = Literal["leak", "no-leak", "drift"]
 _SEEDS: Mapping[Runs, int] = {"leak": 0, "no-leak": 1000, "drift": 2000}
-#: RMS without and with what happened at half time, by chamber and quantity.
-Pairs = Mapping[str, Mapping[str, tuple[float, ...]]]
+#: RMS before and after half time, by chamber and quantity.
+RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
-def drawn_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw the drifts of a test's rig at half time: each share uniform within its bounds, up or down, independent."""
-    random, drifting = np.random.default_rng([_SEEDS["drift"], draw, number]), texts_of("cases.toml")["drifts"].values()
-    shares = [random.uniform(*part["shares"]) for part in drifting]
-    signed_shares = random.choice([-1.0, 1.0], size=len(shares)) * shares
+def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
+    """Draw the relative changes of a test's parameters at half time: uniform size, random sign, all independent.
+
+    `number`: of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
+    """
+    rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
+    sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
+    changes = rng.choice([-1.0, 1.0], size=len(sizes)) * sizes
     return tuple(
-        ParameterDrift(name, tabulated(np.array([half, half]), np.array([0.0, share])))
-        for part, share in zip(drifting, signed_shares, strict=True)
-        for name in part["parameters"]
+        ParameterDrift(name, polyline_from_table(np.array([half, half]), np.array([0.0, change])))
+        for drift, change in zip(drifts, changes, strict=True)
+        for name in drift["parameters"]
     )
 
 
 def leak_test(
-    condition: Condition, half: float, seed: int, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
+    condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the run of a test: its command and throttles on the identified rig, its mean leak from half time on."""
+    """Build the experiment of a test on the identified rig: its command and throttles, its leak from half time on."""
     return Experiment.of(
         rig=BENCH_RIG,
         command=condition.command,
@@ -64,18 +67,18 @@ def leak_test(
     )
 
 
-def experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
-    """Build the runs of the tests of Appendix C; of a drift two draws each, one where it is `quick`."""
+def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
+    """Build the experiments of all tests of Appendix C; each test has two draws of the drift, or one if `quick`."""
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
-        drifts = drawn_drifts(condition.number, half, draw) if kind == "drift" else ()
+        drifts = draw_drifts(condition.number, half, draw) if kind == "drift" else ()
         seed = _SEEDS[kind] + 100 * draw + condition.number
-        runs.append((condition, leak_test(condition, half, seed, kind == "leak", drifts)))
+        runs.append((condition, leak_test(condition, half, seed, leak=kind == "leak", drifts=drifts)))
     return runs
 
 
-def _at_half_time(experiment: Experiment) -> str:
-    """Describe the change at half time in words."""
+def _describe_change(experiment: Experiment) -> str:
+    """Describe an experiment's change at half time."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -83,22 +86,23 @@ def _at_half_time(experiment: Experiment) -> str:
     return ", ".join(factors) or "nothing"
 
 
-def detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> dict[str, dict[str, tuple[float, ...]]]:
+def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
     """Compute the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers within each part (from, to) [s].
 
-    A part is narrowed by the transform's reach on both sides, so that no coefficient saw anything outside of it.
+    A part is narrowed by the filters' reach, so that no coefficient depends on samples outside of it.
     """
     before, after = reach("db8", 4)[-1]
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
     result = {}
     for chamber in CHAMBERS:
+        # the even intervals between the bounds are the parts
         squares = mean_squares(details(recording[chamber] / PSI), bounds.ravel())[::2]
         result[chamber] = {q: tuple(rms.tolist()) for q, rms in zip(QUANTITIES, np.sqrt(squares).T, strict=True)}
     return result
 
 
 def pressure_range(values: Array) -> float:
-    """Compute the 5 to 95 % range of a pressure."""
+    """Compute the range of a pressure from its 5 % to its 95 % quantile, in its unit."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
@@ -115,55 +119,54 @@ COLUMNS = (
 )
 
 
-def row_of(
-    condition: Condition, happened: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: Pairs
+def make_row(
+    condition: Condition, change: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: RmsPairs
 ) -> tuple[Cell, ...]:
-    """Build the row of a test under `COLUMNS`; `sheet_of` reads the RMS back."""
+    """Build the row of a test with the columns `COLUMNS`; `change` describes what changed at half time."""
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
-    return (condition.number, condition.command, condition.closed_pct, happened, mean_leak_lpm, *ranges_MPa, *values)
+    return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
 
 
 def column(table: ThesisTable, head: str) -> Array:
-    """Return the numbers of one column of a table, NaN where there is none."""
-    place = table.columns.index(head)
-    return np.array([np.nan if row[place] is None else float(row[place]) for row in table.rows])  # type: ignore[arg-type]
+    """Return the numbers of one column of a table, NaN for empty cells."""
+    k = table.columns.index(head)
+    return np.array([np.nan if row[k] is None else float(row[k]) for row in table.rows])  # type: ignore[arg-type]
 
 
-def sheet_of(table: ThesisTable) -> DataSheet:
-    """Read the RMS columns of a table of such rows as a sheet, in the table's order."""
+def parse_sheet(table: ThesisTable) -> DataSheet:
+    """Build the data sheet from the RMS columns of a table with the columns `COLUMNS`."""
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the 41 tests with their leak from half time on, without a change there, or with a drift.
+    """Tabulate the 41 tests with their leak from half time on, without any change, or with drifting parameters.
 
-    With the leak the first test of each condition is proved by halving the step, except in a quick reproduction.
+    The first test with a leak of each condition is checked by halving the step, except in a quick reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
-    rows, proved = [], dict[tuple[str, float], bool | None]()
-    for condition, experiment in experiments(kind, half, context.quick):
+    rows, proved = [], dict[tuple[str, float], bool | None]()  # condition -> whether its proved run is resolved
+    for condition, experiment in build_experiments(kind, half, context.quick):
         prove = kind == "leak" and not context.quick and condition.group not in proved
-        run = simulated_run(experiment, prove)
+        run = simulate_run(experiment, prove)
         if prove:
             proved[condition.group] = run.resolved
-        rms = detail_rms(run.recorded, ((SETTLING, half), (half, 2 * half)))
-        before = (run.t >= SETTLING) & (run.t < half)
-        ranges = [pressure_range(run.outputs[chamber][before]) / 1e6 for chamber in CHAMBERS]
-        rows.append(row_of(condition, _at_half_time(experiment), run.mean_leak_lpm, ranges, rms))
-    proof = (
-        "No run is proved (quick)." if context.quick else "One test of each condition is proved by halving the step."
-    )
-    drifts = texts_of("cases.toml")["drifts"]
-    bounds = {
-        name: "{:g} to {:g} %".format(*(100 * share for share in part["shares"])) for name, part in drifts.items()
-    }
-    detail_note = note(f"runs-{kind}", proof=proof, **bounds)
-    notes = note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=detail_note)
+        rms = part_detail_rms(run.recorded, ((SETTLING, half), (half, 2 * half)))
+        is_before = (run.t >= SETTLING) & (run.t < half)
+        ranges = [pressure_range(run.outputs[chamber][is_before]) / 1e6 for chamber in CHAMBERS]
+        rows.append(make_row(condition, _describe_change(experiment), run.mean_leak_lpm, ranges, rms))
+    proof = "One test of each condition is proved by halving the step."
+    proof = "No run is proved (quick)." if context.quick else proof
+    bounds = {}  # name of a drift -> text of the sizes from which it is drawn
+    for name, drift in load_texts("cases.toml")["drifts"].items():
+        low, high = drift["shares"]
+        bounds[name] = f"{100 * low:g} to {100 * high:g} %"
+    detail_note = format_note(f"runs-{kind}", proof=proof, **bounds)
+    notes = format_note("runs", rig=BENCH_RIG, half=half, quick=" (quick)" if context.quick else "", of=detail_note)
     return (item.table(rows, notes, COLUMNS, resolved=all(proved.values()) if proved else None),)
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
     """Return the table of the simulated tests (`leak`, `no-leak` or `drift`), and the sheet in it."""
     table = first_table(context, f"appendix-c-{runs}")
-    return table, sheet_of(table)
+    return table, parse_sheet(table)

@@ -1,4 +1,4 @@
-"""Table 5.1 counted anew, from the sheet and from simulation, with the false alarms of its rules."""
+"""Recount Table 5.1 on the data sheet and in simulation, with the false alarms of its rules."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95
+from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
-from sealscope.thesis.engine.texts import note, texts_of
+from sealscope.thesis.engine.texts import format_note, load_texts
 from sealscope.thesis.sheet import COLUMNS, DataSheet
 
-#: The direction in which each chamber's RMS is said to move when a leak opens, section 5.6.
+#: Sign of the change of each chamber's RMS when a leak opens, as section 5.6 states it.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
 #: False-alarm probability at which the rules with a threshold are set.
 FALSE_ALARMS = 0.05
-
 Fires = NDArray[np.bool_]
+_Row = tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of Table 5.1: it fires when every named detail moves in its chamber's direction.
+    """A rule of Table 5.1: it fires if every one of its details moves in its chamber's direction.
 
-    `printed` [%]: as the thesis has it (with its variants), empty for one it does not claim.
+    `details`: (chamber, detail) pairs; `printed`: rates [%] in the thesis, empty for a rule it does not claim.
     """
 
     name: str
@@ -37,21 +37,24 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Find the tests in which the rule fires, (n,) truth values."""
+        """Return the mask (n,) of the tests in which the rule fires."""
         moves = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
         return np.asarray(np.all(moves, axis=0))
 
 
-def _rules(name: str) -> tuple[Rule, ...]:
-    return tuple(Rule(*row) for row in texts_of("cases.toml")[name])
+def _load_rules(name: str) -> tuple[Rule, ...]:
+    """Load the rules of an entry of `cases.toml`."""
+    return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
 
 
 #: The six cells of Table 5.1 and the cumulative one; and the columns of Appendix C that the table leaves out.
-CLAIMED, UNCLAIMED = _rules("claimed"), _rules("unclaimed")
+CLAIMED, UNCLAIMED = _load_rules("claimed"), _load_rules("unclaimed")
+#: The rules of Table 5.1 without the cumulative one: each has one detail.
+CLAIMED_CELLS = CLAIMED[:6]
 
 
-def _count_cells(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Count as "k/n", share of the tests and its interval [%]."""
+def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
+    """Format the tests in which a rule fires as cells: "k/n", rate and its 95 % interval [%]; None for no tests."""
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -59,13 +62,14 @@ def _count_cells(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
     return f"{k}/{n}", 100.0 * k / n, 100.0 * low, 100.0 * high
 
 
-def _heads(what: str, count: str) -> tuple[str, ...]:
-    return tuple(f"{what}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
+def _count_heads(source: str, count: str) -> tuple[str, ...]:
+    """Build the heads of the columns of `_format_count` for a sheet; `count`: head of the first one."""
+    return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
 _SOURCES = ("sheet", "simulated leak", "simulated, no leak", "simulated, drift only")
 RATES = (
-    *("rule", "printed [%]", *(head for source in _SOURCES for head in _heads(source, "fires"))),
+    *("rule", "printed [%]", *(head for source in _SOURCES for head in _count_heads(source, "fires"))),
     "simulated leak less drift [points]",
 )
 TESTS = (
@@ -73,34 +77,35 @@ TESTS = (
     *("sign test p", "p, Holm over ten columns", "moves (p < 0.05)"),
 )
 THRESHOLDS = (
-    *("rule", "sheet: threshold from d1's scatter [%]", *_heads("sheet", "finds")),
-    *("simulated: threshold from drift only [%]", *_heads("simulated leak", "finds")),
+    *("rule", "sheet: threshold from d1's scatter [%]", *_count_heads("sheet", "finds")),
+    *("simulated: threshold from drift only [%]", *_count_heads("simulated leak", "finds")),
 )
 
 
-def counts(measured: DataSheet | None, leak: DataSheet, still: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
-    """Count each rule of Table 5.1 on the sheet, in simulation with leak, with none, and with drift but no leak.
+def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
+    """Count how often each rule of Table 5.1 fires, as rows with the columns `RATES`.
 
-    The last rows are the rules that always and never fire.
+    The sheets: measured (None if not given), and simulated with leak, without, and without leak but with drift. The
+    last two rows are rules that always and never fire.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
         "always fires": ("", lambda sheet: np.full(sheet.tests, True)),
         "never fires": ("", lambda sheet: np.full(sheet.tests, False)),
     }
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[_Row] = []
     for name, (printed, fires) in rules.items():
-        sheets = (measured, leak, still, drift)
-        cells = [cell for sheet in sheets for cell in _count_cells(None if sheet is None else fires(sheet))]
-        rows.append((name, printed or None, *cells, 100.0 * float(fires(leak).mean() - fires(drift).mean())))
+        sheets = (measured, leak, no_leak, drift)
+        cells = [cell for sheet in sheets for cell in _format_count(None if sheet is None else fires(sheet))]
+        difference = 100.0 * float(fires(leak).mean() - fires(drift).mean())
+        rows.append((name, printed or None, *cells, difference))
     return rows
 
 
-def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
-    """Test every column of a sheet.
+def column_tests(sheet: DataSheet) -> list[_Row]:
+    """Test whether each column of a sheet changes with the leak; return rows with the columns `TESTS` after the source.
 
-    How many tests fell and rose, the sign test's p, and p corrected (Holm) for all ten columns that were there to
-    choose from.
+    Holm's correction covers all ten columns, since Table 5.1 chose among them.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -113,50 +118,53 @@ def column_tests(sheet: DataSheet) -> list[tuple[Cell, ...]]:
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
-    """Compute the log change that noise alone passes with probability `FALSE_ALARMS`, to one side or to either.
+    """Compute the log change that noise exceeds with probability `FALSE_ALARMS`, to one or to either side.
 
-    From the scatter of d1 about zero: ``1.645 rms(log change of d1)``, or 1.960 times it. d1 is noise: no leak moves
-    it, so its changes between the halves are those of a leak-free rig. The other details can only scatter more.
+    It is ``1.645 rms(log change of d1)``, or 1.960 times it for either side. d1 is noise and does not depend on the
+    leak, so that its changes between the halves are those of a leak-free rig. The other details scatter at least as
+    much.
     """
     change = sheet.log_change(chamber, "d1")
-    return float((WITHIN_95 if either_side else BELOW_95) * np.sqrt(np.mean(change**2)))
+    return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
-    """Compute the log change, in the chamber's direction, that drift alone passes with probability `FALSE_ALARMS`."""
+    """Compute the log change in the chamber's direction that drift alone exceeds with probability `FALSE_ALARMS`."""
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
-def thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[tuple[Cell, ...]]:
-    """Count the leaks that each single-detail rule still finds with a threshold instead of the bare sign."""
-    rows: list[tuple[Cell, ...]] = []
-    for rule in (*CLAIMED[:6], *UNCLAIMED):
+def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
+    """Count the leaks that each rule of one detail finds with a threshold, as rows with the columns `THRESHOLDS`."""
+    rows: list[_Row] = []
+    for rule in (*CLAIMED_CELLS, *UNCLAIMED):
         ((chamber, detail),) = rule.details
         row: list[Cell] = [rule.name]
-        by_d1 = None if measured is None else d1_threshold(measured, chamber)
-        for sheet, limit in ((measured, by_d1), (leak, drift_threshold(drift, chamber, detail))):
+        d1_limit = None if measured is None else d1_threshold(measured, chamber)
+        for sheet, limit in ((measured, d1_limit), (leak, drift_threshold(drift, chamber, detail))):
             if sheet is None or limit is None:
-                row += [None] * 5
+                row += [None, *_format_count(None)]
                 continue
             fires = sheet.log_change(chamber, detail) * DIRECTION[chamber] > limit
-            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_count_cells(fires)]
+            row += [100.0 * float(np.expm1(DIRECTION[chamber] * limit)), *_format_count(fires)]
         rows.append(tuple(row))
     return rows
 
 
-def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate Table 5.1 with its controls, the sign tests of every column, and the rules with a threshold."""
-    (leak_runs, leak), (_, still), (_, drift) = (
-        simulated_sheet(context, runs) for runs in ("leak", "no-leak", "drift")
-    )
+def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
+    """Tabulate Table 5.1 with false alarms, the sign tests of all columns, and the rules with thresholds."""
+    leak_runs, leak = simulated_sheet(context, "leak")
+    no_leak, drift = (simulated_sheet(context, runs)[1] for runs in ("no-leak", "drift"))
     measured, resolved = context.sheet, leak_runs.resolved
-    sheets = dict(zip(_SOURCES, (measured, leak, still, drift), strict=True))
+    sheets = dict(zip(_SOURCES, (measured, leak, no_leak, drift), strict=True))
     tests = [(name, *row) for name, sheet in sheets.items() if sheet is not None for row in column_tests(sheet)]
-    notes = note("rates", none="" if measured else " No measured sheet was given.", runs=leak_runs.notes)
-    of_columns, set_for = "Sign tests of every column of Appendix C", f"{100 * FALSE_ALARMS:g} % false alarms"
-    limits, title = thresholds(measured, leak, drift), f"The rules of Table 5.1 set for {set_for}"
+    notes = format_note("rates", none="" if measured else " No measured sheet was given.", runs=leak_runs.notes)
+    tests_title = "Sign tests of every column of Appendix C"
+    limits_title = f"The rules of Table 5.1 set for {100 * FALSE_ALARMS:g} % false alarms"
+    limits = count_with_thresholds(measured, leak, drift)
     return (
-        item.table(counts(measured, leak, still, drift), notes, RATES, resolved=resolved),
-        item.table(tests, note("column-tests"), TESTS, tail="-columns", title=of_columns, resolved=resolved),
-        item.table(limits, note("thresholds"), THRESHOLDS, tail="-thresholds", title=title, resolved=resolved),
+        item.table(count_rules(measured, leak, no_leak, drift), notes, RATES, resolved=resolved),
+        item.table(tests, format_note("column-tests"), TESTS, tail="-columns", title=tests_title, resolved=resolved),
+        item.table(
+            limits, format_note("thresholds"), THRESHOLDS, tail="-thresholds", title=limits_title, resolved=resolved
+        ),
     )

@@ -1,4 +1,4 @@
-"""Every testable sentence of the thesis with its verdict: the chapters' own claims and those on detection."""
+"""Judge the thesis's claims on detection, and tabulate all claims of all chapters with their verdicts."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from dataclasses import astuple, replace
 from typing import get_args
 
 from sealscope.thesis.claims import rig, sheet
-from sealscope.thesis.claims.evidence import gather
+from sealscope.thesis.claims.evidence import gather_evidence
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 
 
-def detection(context: Context, item: Item) -> tuple[Claim, ...]:
+def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
-    evidence = gather(context)
-    claims = (*sheet.levels(), *sheet.claims(evidence), *sheet.curves(evidence), *rig.claims(evidence))
-    return tuple(sorted(claims, key=_place))
+    evidence = gather_evidence(context)
+    claims = (*sheet.leak_level_claims(), *sheet.claims(evidence), *sheet.curve_claims(evidence), *rig.claims(evidence))
+    return tuple(sorted(claims, key=_claim_order))
 
 
-def _place(claim: Claim) -> tuple[int, ...]:
-    """Return the order of a claim: the abstract first, then by the numbers of its id."""
+def _claim_order(claim: Claim) -> tuple[int, ...]:
+    """Return the sorting key of a claim: the abstract first, then by the numbers of its id."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
-def table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate every claim of every chapter, and count the verdicts."""
+def claims_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
+    """Tabulate all claims of all chapters, and count the verdicts."""
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
-    claims.sort(key=_place)
+    claims.sort(key=_claim_order)
     verdicts = Counter(claim.verdict for claim in claims)
     rows = map(astuple, claims)
     missing = "" if context.sheet else " The data sheet was not given: claims that rest on it could not be tested."

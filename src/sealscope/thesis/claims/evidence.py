@@ -1,10 +1,11 @@
-"""Evidence for the claims on detection: sheets and shown tests, counts, correlations and regressions.
+"""Collect the evidence for the claims on detection: data sheets, measured tests, counts, correlations, regressions.
 
-The regressions leave out the answer: a left-out test takes no part in its own prediction.
+The regressions are cross-validated: no test takes part in the fit that predicts it.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from sealscope.evaluation.roc import auc
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
-from sealscope.thesis.chapters.chapter5 import TESTS, ShownMeasures, measure_test
+from sealscope.thesis.chapters.chapter5 import TESTS, LeakTestMeasures, measure_test
 from sealscope.thesis.chapters.success_rates import DIRECTION, Rule, column_tests
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
@@ -34,110 +35,120 @@ SENSITIVE = ("d3", "d4", "d3d4")
 class ClaimEvidence:
     """The data by which the claims are judged.
 
-    The measured sheet (None: not given), the simulated sheets with leak, with none and with drift only, the table of
-    the first, the ten tests of chapter 5 by section, and the first of them without its leak.
+    `measured_sheet`: None if not given; `leak_sheet`, `no_leak_sheet`, `drift_sheet`: simulated sheets with leak,
+    without leak, and without leak but with drift; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of
+    the ten tests that chapter 5 prints, by section; `no_leak_measures`: those of test 5.2a without its leak.
     """
 
-    measured: DataSheet | None
-    leak: DataSheet
-    still: DataSheet
-    drift: DataSheet
-    table: ThesisTable
-    shown: dict[str, ShownMeasures]
-    control: ShownMeasures
+    measured_sheet: DataSheet | None
+    leak_sheet: DataSheet
+    no_leak_sheet: DataSheet
+    drift_sheet: DataSheet
+    leak_table: ThesisTable
+    test_measures: dict[str, LeakTestMeasures]
+    no_leak_measures: LeakTestMeasures
 
 
-def gather(context: Context) -> ClaimEvidence:
-    """Gather the evidence from the context's items and runs."""
-    table, leak = simulated_sheet(context, "leak")
-    _, still = simulated_sheet(context, "no-leak")
-    _, drift = simulated_sheet(context, "drift")
-    control = measure_test(context, TESTS["5.2a"], leak=False)
-    shown = {section: measure_test(context, test) for section, test in TESTS.items()}
-    return ClaimEvidence(context.sheet, leak, still, drift, table, shown, control)
+def gather_evidence(context: Context) -> ClaimEvidence:
+    """Simulate the sheet with a leak, without, and with drift, and simulate and measure each test of chapter 5."""
+    leak_table, leak_sheet = simulated_sheet(context, "leak")
+    return ClaimEvidence(
+        measured_sheet=context.sheet,
+        leak_sheet=leak_sheet,
+        no_leak_sheet=simulated_sheet(context, "no-leak")[1],
+        drift_sheet=simulated_sheet(context, "drift")[1],
+        leak_table=leak_table,
+        test_measures={section: measure_test(context, test) for section, test in TESTS.items()},
+        no_leak_measures=measure_test(context, TESTS["5.2a"], leak=False),
+    )
 
 
-#: A finding on a sheet, measured or simulated: its words, and which of the claim's parts hold.
+#: A finding on a sheet: its text, and which parts of the claim are true.
 Finding = tuple[str, Sequence[bool]]
-#: Finds in a sheet what a claim says of it.
+#: Tests a claim on a measured or simulated sheet.
 SheetTest = Callable[[DataSheet], Iterable[Finding]]
 
 
 @dataclass(frozen=True)
 class SheetClaim:
-    """A claim's test on a sheet.
+    """A claim that is tested on a sheet.
 
-    `test` gives the findings, written after `head` with `joint` between them; `values` of the other texts of the claim.
+    `test` yields the findings; their texts follow `head`, joined by `separator`; `values`: computes the values of
+    placeholders in the claim's other texts.
     """
 
     test: SheetTest
     head: str = ""
-    joint: str = "; "
+    separator: str = "; "
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
 
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge by the measured sheet, and state the same test on the simulated sheet."""
+        """Judge the claim by the measured sheet, and state the findings on the simulated sheet."""
 
-        def findings(sheet: DataSheet) -> tuple[str, list[bool]]:
+        def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
+            """Return the text of all findings on a sheet, and the results of all parts."""
             texts, parts = zip(*self.test(sheet), strict=True)
-            return self.head + self.joint.join(texts), [part for found in parts for part in found]
+            return self.head + self.separator.join(texts), list(itertools.chain.from_iterable(parts))
 
-        result, parts = (NO_SHEET, []) if evidence.measured is None else findings(evidence.measured)
-        values = self.values(evidence, evidence.measured or evidence.leak)
-        return judge_claim(id, parts, kind, sheet=result, simulation=findings(evidence.leak)[0], **values)
-
-
-def fired_share(sheet: DataSheet, rule: Rule) -> str:
-    """Format `k/n = share %` of the tests that a rule fires in, with its exact 95 % interval."""
-    return counted_share(rule.fires(sheet))
+        measured = evidence.measured_sheet
+        sheet_text, parts = (NO_SHEET, []) if measured is None else state_findings(measured)
+        simulation_text, _ = state_findings(evidence.leak_sheet)
+        values = self.values(evidence, measured or evidence.leak_sheet)
+        return judge_claim(id, parts, kind, sheet=sheet_text, simulation=simulation_text, **values)
 
 
-def counted_share(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format `k/n = share % (low to high)` of the tests that are true, with the exact 95 % interval."""
+def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
+    """Format the rate at which a rule fires on a sheet (`format_rate`)."""
+    return format_rate(rule.fires(sheet))
+
+
+def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
+    """Format `k/n = rate % (low to high %)` of the true values, with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def in_percent(change: Array | float) -> float:
+def log_change_to_percent(change: Array | float) -> float:
     """Convert a log change, or the mean of several, to percent."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
-def corrected_p(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the sign-test p of every column, corrected (Holm) for all ten."""
-    return {(str(row[0]), str(row[1])): float(row[-2]) for row in column_tests(sheet)}  # type: ignore[arg-type]
+def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
+    """Compute the p-value of each column's sign test with Holm's correction for all ten columns."""
+    return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
-    """Return True if a column moves in the chamber's direction beyond chance (5 %, corrected for ten columns)."""
+    """Return True if a detail moves in its chamber's direction with a corrected p-value below 5 %."""
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]
-    return bool(np.sum(change > 0) > np.sum(change < 0) and corrected_p(sheet)[chamber, name] < 0.05)
+    return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
 
 
-def correlated(r: float, n: int, controls: int = 0) -> bool:
-    """Return True if a (partial) correlation of n points differs from 0 at 5 %, with `controls` columns taken out.
+def is_correlated(r: float, n: int, controls: int = 0) -> bool:
+    """Return True if a correlation `r` of n points, partial to `controls` columns, differs from 0 at the 5 % level.
 
-    By Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
+    Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """
-    return bool(abs(np.arctanh(np.clip(r, -0.999999, 0.999999))) * np.sqrt(n - 3 - controls) > WITHIN_95)
+    z = np.arctanh(np.clip(r, -0.999999, 0.999999))  # clipped, as artanh(1) is infinite
+    return bool(abs(z) * np.sqrt(n - 3 - controls) > WITHIN_95)
 
 
-def condition_columns() -> Array:
-    """Build the operating condition as columns (n, commands + 1): one indicator a command, and the closed share."""
+def condition_design() -> Array:
+    """Build the design matrix (n, commands + 1) of the operating condition: indicators of the commands, and closing."""
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the correlation of `x` and `y`, (n,), after least squares of both on `controls`, (n, k)."""
+    """Compute the correlation of the residuals of `x` and `y`, (n,), after least squares on `controls`, (n, k)."""
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
 
-def left_out_r2(columns: Array, y: Array) -> float:
-    """Compute R^2 of least squares on `columns`, (n, k), with each test predicted from the others.
+def leave_one_out_r2(columns: Array, y: Array) -> float:
+    """Compute R^2 of least squares on `columns`, (n, k), with each value predicted from all others.
 
     ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
     Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
@@ -147,18 +158,18 @@ def left_out_r2(columns: Array, y: Array) -> float:
     return float(1.0 - np.sum(residuals**2) / np.sum((y - y.mean()) ** 2))
 
 
-def change_columns(sheet: DataSheet) -> Array:
-    """Build a column of ones and the six log changes of Table 5.1, (n, 7)."""
+def change_design(sheet: DataSheet) -> Array:
+    """Build the design matrix (n, 7) of a constant and the six log changes of Table 5.1."""
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
     return np.column_stack([np.ones_like(changes[0]), *changes])
 
 
-def separation_by_levels(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
-    """Tell leak from no leak by the log RMS of d1..d4 of both chambers, without a baseline of the test's own.
+def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
+    """Classify halves of tests as leaking or not by the log RMS of d1..d4 of both chambers, without a baseline.
 
-    A logistic regression with a ridge of 1 on standardised levels judges each test, or each operating condition, by a
-    fit that saw none of its samples. Return the accuracy and the area under the ROC. Raises MissingExtra where
-    scikit-learn is absent.
+    A logistic regression with an L2 penalty of 1 on standardised columns is cross-validated with one test, or one
+    operating condition, left out. Returns the accuracy and the area under the ROC. Raises MissingExtra if scikit-learn
+    is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression
@@ -168,12 +179,11 @@ def separation_by_levels(sheet: DataSheet, leave_out: Literal["test", "condition
     except ImportError:
         raise MissingExtra("a regression on levels needs scikit-learn: pip install 'sealscope[learn]'") from None
 
-    levels = [sheet.rms[chamber][f"d{level}"] for chamber in CHAMBERS for level in range(1, 5)]
-    columns = np.column_stack([np.log(rms).T.ravel() for rms in levels])  # all tests without, then with their leaks
-    leaking = np.repeat([False, True], len(APPENDIX_C))
+    detail_rms = [sheet.rms[chamber][f"d{level}"] for chamber in CHAMBERS for level in range(1, 5)]
+    columns = np.column_stack([np.log(rms).T.ravel() for rms in detail_rms])  # all tests without, then with their leaks
+    is_leaking = np.repeat([False, True], len(APPENDIX_C))
     groups = [row.number if leave_out == "test" else f"{row.command} at {row.closed_pct:g} %" for row in APPENDIX_C] * 2
     regression = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, tol=1e-9))
-    odds = cross_val_predict(
-        regression, columns, leaking, groups=groups, cv=LeaveOneGroupOut(), method="decision_function"
-    )
-    return float(np.mean((odds > 0) == leaking)), auc(odds[~leaking], odds[leaking]).value
+    cross_validation: dict[str, Any] = {"groups": groups, "cv": LeaveOneGroupOut(), "method": "decision_function"}
+    log_odds = cross_val_predict(regression, columns, is_leaking, **cross_validation)
+    return float(np.mean((log_odds > 0) == is_leaking)), auc(log_odds[~is_leaking], log_odds[is_leaking]).value

@@ -1,4 +1,4 @@
-"""Claims of chapters 1, 5 and 6 that the sheet is silent on, judged by the simulated rig, with controls."""
+"""Judge claims of chapters 1, 5 and 6 that the data sheet cannot decide, by simulations with and without the leak."""
 
 from __future__ import annotations
 
@@ -12,43 +12,56 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
-from sealscope.thesis.chapters.success_rates import CLAIMED
-from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, counted_share, fired_share
+from sealscope.thesis.chapters.success_rates import CLAIMED, FALSE_ALARMS
+from sealscope.thesis.claims.evidence import NO_SHEET, ClaimEvidence, format_rate, format_rule_rate
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.engine.texts import judge_claim
 from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG
 
-#: How near an estimated onset must come [s].
-_NEAR = 10.0
+#: Changes [%] below which a quantity counts as unchanged, and above which a change counts as severe.
+_NEGLIGIBLE_CHANGE, _SEVERE_CHANGE = 1.0, 5.0
+#: A drift counts as lowered by the leak if it falls by this fraction more than in the same run without its leak.
+_MIN_EXTRA_FALL = 0.1
+#: Largest factor between two RMS that agree, and smallest number of tests, of 41, that agree in a sign.
+_MAX_RMS_RATIO, _MIN_AGREEING_TESTS = 1.25, 39
+#: Operations per second that any small controller can make.
+_FEW_OPERATIONS = 1e7
+#: Largest error of an estimated onset [s].
+_ONSET_TOLERANCE = 10.0
+#: Smallest rise of a pressure range, as a fraction of that with open throttles, that counts as raised.
+_MIN_RELATIVE_RISE = 0.01
+#: Closing [%] at which Appendix C has several amplitudes to compare.
+_COMPARED_CLOSING = 75.0
 
 
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
-    """Judge claims of the abstract and of chapters 1, 5 and 6 that only a simulation, or nothing here, can judge."""
+    """Judge the claims of the abstract and of chapters 1, 5 and 6 that need a simulation or cannot be tested."""
     return (
         judge_claim("1.3.1", [None]),
-        *_method(),
-        *_shown_tests(evidence),
-        *_leak(evidence),
-        _throttles(evidence),
-        _similar(evidence),
+        *_wavelet_claims(),
+        *_printed_test_claims(evidence),
+        _d3_sign_claim(evidence),
+        _throttle_claim(evidence),
+        _agreement_claim(evidence),
     )
 
 
-def _method() -> Iterator[Claim]:
-    """Judge the claims on the wavelet and its cost."""
-    shares = {}
+def _wavelet_claims() -> Iterator[Claim]:
+    """Judge the claims on the wavelet: separation of the frequency bands, and computing cost."""
+    overlaps = {}  # order -> fraction of the high-pass filter's energy below its band
     for order in (1, 2, 4, 8):
-        response = np.abs(np.fft.rfft(decomposition_filters(f"db{order}")[1], 4096)) ** 2
-        shares[order] = float(response[: response.size // 2].sum() / response.sum())
-    falls = [lower < higher for higher, lower in itertools.pairwise(shares.values())]
-    yield judge_claim(
-        "5.7.5", falls, shares=", ".join(f"db{order} {100 * share:.1f} %" for order, share in shares.items())
-    )
+        _, high_pass = decomposition_filters(f"db{order}")
+        energy = np.abs(np.fft.rfft(high_pass, 4096)) ** 2  # padded for a fine spectrum
+        overlaps[order] = float(energy[: energy.size // 2].sum() / energy.sum())
+    falls = [later < earlier for earlier, later in itertools.pairwise(overlaps.values())]
+    text = ", ".join(f"db{order} {100 * fraction:.1f} %" for order, fraction in overlaps.items())
+    yield judge_claim("5.7.5", falls, shares=text)
     rate = load_rig(BENCH_RIG).daq.sample_rate
-    operations, wait = 4 * 2 * decomposition_filters("db8")[0].size, int(reach("db8", 4)[-1][1])
+    operations = 4 * 2 * decomposition_filters("db8")[0].size  # of two filters at each of four levels
+    _, wait = reach("db8", 4)[-1].tolist()  # number of later samples on which d4 depends
     yield judge_claim(
         "a.3",
-        [operations * rate < 1e7],
+        [operations * rate < _FEW_OPERATIONS],
         operations=operations,
         millions=operations * rate / 1e6,
         rate=rate,
@@ -58,83 +71,90 @@ def _method() -> Iterator[Claim]:
     )
 
 
-def _change(pair: tuple[float, float]) -> float:
-    """Compute the change from without to with the leak [%]."""
-    return 100.0 * (pair[1] / pair[0] - 1.0)
+def _percent_change(pair: tuple[float, float]) -> float:
+    """Compute the change [%] from the first value, without leak, to the second, with leak."""
+    before, after = pair
+    return 100.0 * (after / before - 1.0)
 
 
-def _between(values: Iterable[float]) -> str:
+def _format_range(values: Iterable[float]) -> str:
+    """Format minimum and maximum of some percentages."""
     values = list(values)
     return f"{min(values):+.2f} to {max(values):+.2f} %"
 
 
-def _shown_tests(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims on the ten tests shown."""
-    tests = evidence.shown
-    speed_changes = {name: abs(_change(test.speed)) for name, test in tests.items()}
+def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
+    """Judge the claims on the ten tests of chapter 5: speed, drift, severity, pressure ranges, time of the onset."""
+    tests = evidence.test_measures
+    speed_changes = {name: abs(_percent_change(test.speed)) for name, test in tests.items()}
     worst = max(speed_changes, key=lambda name: speed_changes[name])
-    small = [change < 1.0 for change in speed_changes.values()]
-    yield judge_claim("5.7.1", small, moved=speed_changes[worst], worst=worst, tests=len(speed_changes))
-    drifts = [[1e3 * drift for drift in test.drift] for test in (tests["5.2a"], evidence.control)]
-    fell, fell_anyway = (abs(before) - abs(after) for before, after in drifts)
-    more = fell - fell_anyway > 0.1 * abs(fell_anyway)
-    yield judge_claim("5.7.2", [more], leaking=drifts[0], control=drifts[1])
-    velocity = [_change(test.velocity) for test in tests.values()]
-    pressure = [_change(test.range_MPa[c]) for test in tests.values() for c in CHAMBERS]
-    severe = [max(np.abs(change)) > 5.0 for change in (velocity, pressure)]
-    yield judge_claim("6.1.2", severe, velocity=_between(velocity), pressure=_between(pressure))
+    is_small = [change < _NEGLIGIBLE_CHANGE for change in speed_changes.values()]
+    yield judge_claim("5.7.1", is_small, moved=speed_changes[worst], worst=worst, tests=len(speed_changes))
+    drifts = [[1e3 * drift for drift in test.drift] for test in (tests["5.2a"], evidence.no_leak_measures)]
+    fall, fall_without_leak = (abs(before) - abs(after) for before, after in drifts)  # [um/s]
+    falls_more = fall - fall_without_leak > _MIN_EXTRA_FALL * abs(fall_without_leak)
+    yield judge_claim("5.7.2", [falls_more], leaking=drifts[0], control=drifts[1])
+    velocity = [_percent_change(test.velocity) for test in tests.values()]
+    pressure = [_percent_change(test.range_MPa[c]) for test in tests.values() for c in CHAMBERS]
+    is_severe = [max(np.abs(changes)) > _SEVERE_CHANGE for changes in (velocity, pressure)]
+    yield judge_claim("6.1.2", is_severe, velocity=_format_range(velocity), pressure=_format_range(pressure))
     ranges = tests["5.3a"].range_MPa
     texts = [f"{c} {1e3 * ranges[c][0]:.1f} to {1e3 * ranges[c][1]:.1f} kPa" for c in CHAMBERS]
-    yield judge_claim("5.7.3", [abs(_change(ranges[c])) > 5.0 for c in CHAMBERS], ranges=", ".join(texts))
+    is_changed = [abs(_percent_change(ranges[c])) > _SEVERE_CHANGE for c in CHAMBERS]
+    yield judge_claim("5.7.3", is_changed, ranges=", ".join(texts))
     texts, parts = [], []
     for chamber in CHAMBERS:
         errors = [abs(test.step_s[chamber] - test.test.half) for test in tests.values()]
-        near = [error <= _NEAR for error in errors]
-        texts.append(
-            f"{chamber}: {counted_share(near)}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s"
-        )
-        parts.append(all(near))
-    yield judge_claim("5.7.4", parts, near=_NEAR, errors="; ".join(texts))
+        is_near = [error <= _ONSET_TOLERANCE for error in errors]
+        rate = format_rate(is_near)
+        texts.append(f"{chamber}: {rate}, median error {np.median(errors):.0f} s, worst {max(errors):.0f} s")
+        parts.append(all(is_near))
+    yield judge_claim("5.7.4", parts, near=_ONSET_TOLERANCE, errors="; ".join(texts))
 
 
-def _leak(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge whether the fall of d3 on P_A is the sign of a leak."""
-    controls = [float(CLAIMED[0].fires(sheet).mean()) < 0.05 for sheet in (evidence.still, evidence.drift)]
-    counts = {name: fired_share(getattr(evidence, name), CLAIMED[0]) for name in ("leak", "still", "drift")}
-    yield judge_claim("5.7.6", controls, **counts)
+def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
+    """Judge whether a fall of d3 of p_A indicates a leak: the rule must fire rarely without a leak and with drift."""
+    d3_rule = CLAIMED[0]
+    sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
+    is_rare = [float(d3_rule.fires(sheets[name]).mean()) < FALSE_ALARMS for name in ("no_leak", "drift")]
+    counts = {name: format_rule_rate(sheet, d3_rule) for name, sheet in sheets.items()}
+    return judge_claim("5.7.6", is_rare, **counts)
 
 
-def _throttles(evidence: ClaimEvidence) -> Claim:
-    """Judge by the leak-free pressure range of each command with open and with the most closed throttles."""
-    ranges = np.stack([column(evidence.table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
+def _throttle_claim(evidence: ClaimEvidence) -> Claim:
+    """Judge claim 6.1.3: throttles raise the leak-free pressure range, and more so at larger commands."""
+    ranges = np.stack([column(evidence.leak_table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
     closed_pct = np.array([row.closed_pct for row in APPENDIX_C])
-    texts, rises, grown = [], [], []
+    texts, is_raised, amplitude_rises = [], [], []
     for command in sorted({row.command for row in APPENDIX_C}):
-        rows = np.array([row.command == command for row in APPENDIX_C])
-        most = closed_pct[rows].max()
-        opened, throttled = (ranges[:, rows & (closed_pct == end)].mean(axis=1) for end in (0.0, most))
-        rise = throttled - opened
-        texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {most:g} %")
-        rises += list(rise > 0.01 * opened)
-        if most == 75.0:
-            grown.append((float(command.split(maxsplit=1)[0]), float(np.mean(rise))))
-    ordered = [rise for _, rise in sorted(grown)]
-    return judge_claim("6.1.3", [*rises, ordered == sorted(ordered)], rises="; ".join(texts))
+        is_command = np.array([row.command == command for row in APPENDIX_C])
+        max_closed = closed_pct[is_command].max()
+        masks = (is_command & (closed_pct == closed) for closed in (0.0, max_closed))
+        range_open, range_throttled = (ranges[:, mask].mean(axis=1) for mask in masks)
+        rise = range_throttled - range_open
+        texts.append(f"{command} {1e3 * rise[0]:+.2f} and {1e3 * rise[1]:+.2f} kPa at {max_closed:g} %")
+        is_raised += list(rise > _MIN_RELATIVE_RISE * range_open)
+        if max_closed == _COMPARED_CLOSING:
+            amplitude_V = float(command.split(maxsplit=1)[0])
+            amplitude_rises.append((amplitude_V, float(np.mean(rise))))
+    rises = [rise for _, rise in sorted(amplitude_rises)]
+    return judge_claim("6.1.3", [*is_raised, rises == sorted(rises)], rises="; ".join(texts))
 
 
-def _similar(evidence: ClaimEvidence) -> Claim:
-    measured, leak = evidence.measured, evidence.leak
+def _agreement_claim(evidence: ClaimEvidence) -> Claim:
+    """Judge claim 6.1.4: simulation and measurement agree in leak-free RMS and in the sign of d3's change."""
+    measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:
         return judge_claim("6.1.4", [], compared="compared with the sheet only", sheet=NO_SHEET)
-    ratios = {
-        f"{c} {name}": float(np.exp(np.mean(np.log(leak.rms[c][name][:, 0] / measured.rms[c][name][:, 0]))))
-        for c in CHAMBERS
-        for name in ("d1", "d2", "d3", "d4")
-    }
+    ratios = {}  # of the RMS without leak, geometric means
+    for c, name in itertools.product(CHAMBERS, ("d1", "d2", "d3", "d4")):
+        log_ratios = np.log(leak.rms[c][name][:, 0] / measured.rms[c][name][:, 0])
+        ratios[f"{c} {name}"] = float(np.exp(np.mean(log_ratios)))
     same_sign = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
     text = (
         f"leak-free RMS over the sheet's: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}; "
         f"d3 of P_A moves the same way in {int(same_sign.sum())} of {same_sign.size}"
     )
-    parts = [1 / 1.25 <= ratio <= 1.25 for ratio in ratios.values()] + [bool(same_sign.sum() >= 39)]
+    is_near = [1 / _MAX_RMS_RATIO <= ratio <= _MAX_RMS_RATIO for ratio in ratios.values()]
+    parts = [*is_near, bool(same_sign.sum() >= _MIN_AGREEING_TESTS)]
     return judge_claim("6.1.4", parts, compared=text, sheet="the reference")

@@ -1,4 +1,7 @@
-"""Claims of chapter 5, the abstract and the conclusions on leaks, details and success rates, judged by the sheet."""
+"""Judge the claims of the abstract, chapter 5 and the conclusions on leaks, details and success rates by the sheet.
+
+A function `_test_...` yields the findings on a sheet: a text, and which parts of the claim are true.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,10 @@ from typing import Any, Literal
 import numpy as np
 
 from sealscope.errors import MissingExtra
-from sealscope.evaluation.binomial import at_least
+from sealscope.evaluation.binomial import upper_tail
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, ShownTest
+from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, PrintedTest
 from sealscope.thesis.chapters.success_rates import CLAIMED, DIRECTION, UNCLAIMED, Rule, d1_threshold, drift_threshold
-from sealscope.thesis.claims import evidence as ev
 from sealscope.thesis.claims.evidence import (
     NO_SHEET,
     SENSITIVE,
@@ -23,60 +25,80 @@ from sealscope.thesis.claims.evidence import (
     Finding,
     SheetClaim,
     SheetTest,
-    corrected_p,
-    correlated,
-    counted_share,
-    fired_share,
-    in_percent,
+    change_design,
+    classify_without_baseline,
+    condition_design,
+    format_rate,
+    format_rule_rate,
+    holm_p_values,
+    is_correlated,
+    leave_one_out_r2,
+    log_change_to_percent,
     moves_beyond_chance,
+    partial_correlation,
 )
 from sealscope.thesis.engine.products import Claim
-from sealscope.thesis.engine.texts import judge_claim, texts_of
+from sealscope.thesis.engine.texts import judge_claim, load_texts
 from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
 
-_N = len(APPENDIX_C)
-_A_D3, _, _A_BOTH, _, _, _B_BOTH, _TOGETHER = CLAIMED
+_N_TESTS = len(APPENDIX_C)
+#: Largest rounding error of a leak printed with four decimals [L/min].
+_ROUNDING_LPM = 5e-5
+#: Leak [L/min] that section 5.2 a states for the large test at 3 sin(4t).
+_STATED_LPM = 0.0087
+#: Ratios that sections 5.3 to 5.5 state: medium over large, small over medium, extra-small over large.
+_STATED_RATIOS = (0.5, 0.5, 1.0 / 16.0)
+#: Rules of Table 5.1: d3 of p_A, d3d4 of p_A, d3d4 of p_B, and d3d4 of both chambers.
+_A_D3, _, _A_D3D4, _, _, _B_D3D4, _BOTH_D3D4 = CLAIMED
+_CELLS = CLAIMED[:6]  # without the last, which has two details
 
 
-def _past_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
-    """Select the tests whose change moves in the chamber's direction beyond d1's of one time in twenty."""
+def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
+    """Return the mask of the tests whose change in the chamber's direction exceeds the noise (`d1_threshold`)."""
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
-def _controls(evidence: ClaimEvidence, rule: Rule) -> str:
+def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
+    """Format a rule's rates in simulations without a leak, without and with drift."""
     return (
-        f"In simulation the rule fires in {fired_share(evidence.still, rule)} with no leak and in "
-        f"{fired_share(evidence.drift, rule)} with drift alone"
+        f"In simulation the rule fires in {format_rule_rate(evidence.no_leak_sheet, rule)} with no leak and in "
+        f"{format_rule_rate(evidence.drift_sheet, rule)} with drift alone"
     )
 
 
-def _cell(rule: Rule, where: str) -> SheetClaim:
+def _rate_claim(rule: Rule, where: str) -> SheetClaim:
+    """Build the claim on the printed success rate of a rule, which stands at `where` in the thesis."""
+    # without an effect each of the rule's details moves in its direction with probability 1/2
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
-    def test(sheet: DataSheet) -> Iterator[Finding]:
+    def test_rate(sheet: DataSheet) -> Iterator[Finding]:
+        """Test whether the rate is within 1 % of a printed one, and beyond chance."""
         fires = rule.fires(sheet)
-        p = at_least(int(fires.sum()), fires.size, chance)
-        near = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
-        yield f"{fired_share(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %", [near, p < 0.05 / 10]
+        p = upper_tail(int(fires.sum()), fires.size, chance)
+        as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
+        text = f"{format_rule_rate(sheet, rule)}; p = {p:.2g} against chance of {100 * chance:g} %"
+        yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
-    def values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        a, b = (float(part.fires(sheet).mean()) for part in (_A_BOTH, _B_BOTH))
+    def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
+        """Format the rule, its printed rates and its false alarms for the claim's texts."""
+        rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (
             f"; the printed 65 is near the product of the two printed rates, 0.85 x 0.76 = {0.85 * 0.76:.3f} "
-            f"(counted: {a:.3f} x {b:.3f} = {a * b:.3f}), not a count of tests"
+            f"(counted: {rate_A:.3f} x {rate_B:.3f} = {rate_A * rate_B:.3f}), not a count of tests"
         )
         return {
             "where": where,
             "name": rule.name,
             "rates": " or ".join(f"{rate} %" for rate in printed),
-            "product": product if rule is _TOGETHER else "",
-            "controls": _controls(evidence, rule),
+            "product": product if rule is _BOTH_D3D4 else "",
+            "controls": _format_controls(evidence, rule),
         }
 
-    return SheetClaim(test, values=values)
+    return SheetClaim(test_rate, values=format_values)
 
 
-def _before_table(sheet: DataSheet) -> Iterator[Finding]:
+def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.5.7: each detail moves against its chamber's direction in most tests."""
     for chamber in CHAMBERS:
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
@@ -84,221 +106,253 @@ def _before_table(sheet: DataSheet) -> Iterator[Finding]:
             yield f"{chamber} {name} {count}", [count > change.size / 2]
 
 
-def _over_80(sheet: DataSheet) -> Iterator[Finding]:
+def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.6.1: each rule of Table 5.1 fires in more than 80 % of the tests."""
     for rule in CLAIMED:
-        yield f"{rule.name} {fired_share(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
+        yield f"{rule.name} {format_rule_rate(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
 
 
-def _levels(sheet: DataSheet) -> Iterator[Finding]:
-    past = _past_noise(sheet, "p_A", "d3")
+def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.6.2: at each level of leak d3 of p_A falls beyond the noise in at least 80 % of the tests."""
+    exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
-        tests = past[[row.level == level for row in APPENDIX_C]]
-        yield f"{level} {counted_share(tests)}", [bool(tests.mean() >= 0.8)]
+        level_exceeds = exceeds[[row.level == level for row in APPENDIX_C]]
+        yield f"{level} {format_rate(level_exceeds)}", [bool(level_exceeds.mean() >= 0.8)]
 
 
-def _smallest(rules: tuple[Rule, ...]) -> SheetTest:
-    """Build the test of the rules on the test with the smallest mean leak."""
+def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
+    """Build the function that checks whether each rule fires in the test with the smallest mean leak."""
 
-    def test(sheet: DataSheet) -> Iterator[Finding]:
+    def test_smallest(sheet: DataSheet) -> Iterator[Finding]:
+        """Test each rule in the row with the smallest mean leak."""
         row = int(np.argmin(mean_leaks()))
         for rule in rules:
-            change = ", ".join(f"{in_percent(sheet.log_change(c, name)[row]):+.1f} %" for c, name in rule.details)
-            yield f"{rule.name}: {change}", [bool(rule.fires(sheet)[row])]
+            changes = (log_change_to_percent(sheet.log_change(c, name)[row]) for c, name in rule.details)
+            text = ", ".join(f"{change:+.1f} %" for change in changes)
+            yield f"{rule.name}: {text}", [bool(rule.fires(sheet)[row])]
 
-    return test
-
-
-def _abstract_85(sheet: DataSheet) -> Iterator[Finding]:
-    yield from _smallest((_A_BOTH,))(sheet)
-    fires = _A_BOTH.fires(sheet)
-    small = fires[mean_leaks() <= 0.0050]
-    yield f"up to 0.0050 L/min {counted_share(small)}; all leaks {counted_share(fires)}", [bool(small.mean() >= 0.85)]
+    return test_smallest
 
 
-def _passes_both(sheet: DataSheet) -> Iterator[Finding]:
-    fires, leak = _TOGETHER.fires(sheet), mean_leaks()
-    least = float(leak[fires].min()) if fires.any() else math.nan
-    yield f"{least:.4f} L/min", [abs(least - 0.0048) < 5e-5]
-    yield f"both pass in {counted_share(fires)}", [bool(fires.mean() > 0.8)]
+def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim a.2: d3d4 of p_A falls at the smallest leak, and in at least 85 % of leaks up to 0.0050 L/min."""
+    yield from _smallest_leak_test((_A_D3D4,))(sheet)
+    fires = _A_D3D4.fires(sheet)
+    fires_small = fires[mean_leaks() <= 0.0050]
+    text = f"up to 0.0050 L/min {format_rate(fires_small)}; all leaks {format_rate(fires)}"
+    yield text, [bool(fires_small.mean() >= 0.85)]
 
 
-def _identified(sheet: DataSheet) -> Iterator[Finding]:
+def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 6.1.1: d3d4 moves in both chambers from 0.0048 L/min on, and in more than 80 % of the tests."""
+    fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
+    min_leak = float(leak[fires].min()) if fires.any() else math.nan
+    yield f"{min_leak:.4f} L/min", [abs(min_leak - 0.0048) < _ROUNDING_LPM]
+    yield f"both pass in {format_rate(fires)}", [bool(fires.mean() > 0.8)]
+
+
+def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim a.1: in each chamber the best detail exceeds the noise in at least 80 % of the tests."""
     for chamber in CHAMBERS:
-        best = max(SENSITIVE, key=lambda name: int(_past_noise(sheet, chamber, name).sum()))
-        past = _past_noise(sheet, chamber, best)
-        yield f"{chamber}: {best} beyond noise in {counted_share(past)}", [bool(past.mean() >= 0.8)]
+        best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
+        exceeds = _exceeds_noise(sheet, chamber, best)
+        yield f"{chamber}: {best} beyond noise in {format_rate(exceeds)}", [bool(exceeds.mean() >= 0.8)]
 
 
-def _without_baseline(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
+def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
+    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline`."""
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
     for name in groups:
         try:
-            text = "{:.2f} (AUC {:.3f})".format(*ev.separation_by_levels(sheet, name))
+            texts[f"{name}s"] = "{:.2f} (AUC {:.3f})".format(*classify_without_baseline(sheet, name))
         except MissingExtra:
-            text = "? (needs scikit-learn)"
-        texts[f"{name}s"] = text
+            texts[f"{name}s"] = "? (needs scikit-learn)"
     return texts
 
 
-def _at_5_percent(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    finds = counted_share(_past_noise(sheet, "p_A", "d3"))
-    return {"controls": _controls(evidence, _A_D3), "finds": finds}
+def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
+    """Build the texts of claim 5.6.1: false alarms of the sign rule on d3 of p_A, and its rate beyond the noise."""
+    rate_beyond_noise = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
+    return {"controls": _format_controls(evidence, _A_D3), "finds": rate_beyond_noise}
 
 
-def _trend(chamber: str) -> SheetTest:
-    """Build the test of the changes of a chamber's details against the mean leak."""
-    leak, conditions, direction = mean_leaks(), ev.condition_columns(), DIRECTION[chamber]
+def _trend_test(chamber: str) -> SheetTest:
+    """Build the function that tests the correlation of a chamber's changes with the mean leak."""
+    leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
 
-    def test(sheet: DataSheet) -> Iterator[Finding]:
+    def test_correlations(sheet: DataSheet) -> Iterator[Finding]:
+        """Test whether raw and partial correlation of each detail have the claimed sign and are significant."""
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
-            raw, left = float(np.corrcoef(change, leak)[0, 1]), ev.partial_correlation(change, leak, conditions)
-            significant = correlated(raw, _N), correlated(left, _N, conditions.shape[1])
-            parts = [r * direction > 0 and passes for r, passes in zip((raw, left), significant, strict=True)]
-            yield f"{name}: {raw:+.2f}, at equal condition {left:+.2f}", parts
+            raw, partial = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, conditions)
+            is_raw_significant = is_correlated(raw, _N_TESTS)
+            is_partial_significant = is_correlated(partial, _N_TESTS, conditions.shape[1])
+            parts = [raw * direction > 0 and is_raw_significant, partial * direction > 0 and is_partial_significant]
+            yield f"{name}: {raw:+.2f}, at equal condition {partial:+.2f}", parts
 
-    return test
-
-
-def _predicted(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    columns = {"condition": ev.condition_columns(), "changes": ev.change_columns(sheet)}
-    return {name: ev.left_out_r2(design, mean_leaks()) for name, design in columns.items()}
+    return test_correlations
 
 
-def _sensitive(sheet: DataSheet) -> Iterator[Finding]:
-    p = corrected_p(sheet)
-    for rule in (*CLAIMED[:6], *UNCLAIMED):
+def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
+    """Compute the values of claims 5.5.3 and 5.5.4: cross-validated R^2 of the leak from condition and from changes."""
+    columns = {"condition": condition_design(), "changes": change_design(sheet)}
+    return {name: leave_one_out_r2(design, mean_leaks()) for name, design in columns.items()}
+
+
+def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.5.1: the details of Table 5.1 move significantly, and those it leaves out do not."""
+    p = holm_p_values(sheet)
+    for rule in (*_CELLS, *UNCLAIMED):
         ((chamber, name),) = rule.details
-        column = chamber, name
-        part = moves_beyond_chance(sheet, *column) if rule in CLAIMED else p[column] >= 0.05
-        yield f"{chamber} {name} {in_percent(sheet.log_change(*column)):+.1f} % (p = {p[column]:.2g})", [part]
+        column_p = p[chamber, name]
+        as_claimed = moves_beyond_chance(sheet, chamber, name) if rule in CLAIMED else column_p >= 0.05
+        change = log_change_to_percent(sheet.log_change(chamber, name))
+        yield f"{chamber} {name} {change:+.1f} % (p = {column_p:.2g})", [as_claimed]
 
 
-def _amplified(sheet: DataSheet) -> Iterator[Finding]:
+def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.5.2: the change of d3d4 is larger relative to its scatter than those of d3 and d4."""
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
-        sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
-        text = ", ".join(f"{name} {size:.2f}" for name, size in sizes.items())
-        yield f"{chamber}: {text}", [sizes["d3d4"] > max(sizes["d3"], sizes["d4"])]
+        effect_sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
+        text = ", ".join(f"{name} {size:.2f}" for name, size in effect_sizes.items())
+        yield f"{chamber}: {text}", [effect_sizes["d3d4"] > max(effect_sizes["d3"], effect_sizes["d4"])]
 
 
-def _inverse(sheet: DataSheet) -> Iterator[Finding]:
+def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.5.6: the changes of the two chambers are negatively correlated."""
     for name in SENSITIVE:
-        a, b = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
-        r = float(np.corrcoef(a, b)[0, 1])
-        text = f"{name}: correlation {r:+.2f}, opposite signs in {int(np.sum(a * b < 0))} of {a.size}"
-        yield text, [r < 0 and correlated(r, a.size)]
+        change_A, change_B = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
+        r = float(np.corrcoef(change_A, change_B)[0, 1])
+        n_opposite = int(np.sum(change_A * change_B < 0))
+        text = f"{name}: correlation {r:+.2f}, opposite signs in {n_opposite} of {change_A.size}"
+        yield text, [r < 0 and is_correlated(r, change_A.size)]
 
 
-def _upward(sheet: DataSheet) -> Iterator[Finding]:
-    p = corrected_p(sheet)
+def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.5.5: the details of p_B rise significantly."""
+    p = holm_p_values(sheet)
     for name in SENSITIVE:
-        up = int(np.sum(sheet.log_change("p_B", name) > 0))
-        yield f"{name} up in {up} (p = {p['p_B', name]:.2g})", [moves_beyond_chance(sheet, "p_B", name)]
+        n_up = int(np.sum(sheet.log_change("p_B", name) > 0))
+        yield f"{name} up in {n_up} (p = {p['p_B', name]:.2g})", [moves_beyond_chance(sheet, "p_B", name)]
 
 
-def _consistent(sheet: DataSheet) -> Iterator[Finding]:
+def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
+    """Test claim 5.3.1: in all tests of chapter 5 the details of p_A fall and those of p_B rise."""
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
-            moves = sheet.log_change(chamber, name)[_SHOWN_ROWS] * DIRECTION[chamber] > 0
+            moves = sheet.log_change(chamber, name)[_PRINTED_ROWS] * DIRECTION[chamber] > 0
             yield f"{name} of {chamber} {verb} in {int(moves.sum())}", [bool(np.all(moves))]
 
 
 #: Rows of the sheet that chapter 5 shows.
-_SHOWN_ROWS = sorted({test.condition.number - 1 for test in TESTS.values()})
+_PRINTED_ROWS = sorted({test.condition.number - 1 for test in TESTS.values()})
 _SMALLEST = f"the {mean_leaks().min():g} L/min test: "
 _CORRELATION = "correlation of the change with the mean leak: "
 _CLAIMS: dict[str, SheetClaim] = {
-    "5.3.1": SheetClaim(_consistent, f"of the {len(_SHOWN_ROWS)} rows: ", ", "),
-    "a.1": SheetClaim(_identified, values=_without_baseline),
-    "a.2": SheetClaim(_abstract_85, _SMALLEST),
-    "5.5.7": SheetClaim(_before_table, f"tests as the sentence says, of {_N}: ", ", "),
-    "5.6.1": SheetClaim(_over_80, values=_at_5_percent),
-    "5.6.2": SheetClaim(_levels, "d3 of P_A falls beyond noise: "),
-    "5.6.3": SheetClaim(_smallest(CLAIMED[:6]), _SMALLEST),
-    "6.1.1": SheetClaim(_passes_both, "smallest test that passes d3d4 on both chambers: "),
-    "5.5.1": SheetClaim(_sensitive, values=lambda evidence, sheet: {"d2": fired_share(sheet, UNCLAIMED[1])}),
-    "5.5.2": SheetClaim(_amplified, "mean over scatter of the log change, "),
-    "5.5.3": SheetClaim(_trend("p_A"), _CORRELATION, values=_predicted),
-    "5.5.4": SheetClaim(_trend("p_B"), _CORRELATION, values=_predicted),
-    "5.5.5": SheetClaim(_upward, f"of {_N}: ", ", "),
-    "5.5.6": SheetClaim(_inverse),
+    "5.3.1": SheetClaim(_test_printed_rows, f"of the {len(_PRINTED_ROWS)} rows: ", ", "),
+    "a.1": SheetClaim(_test_identified_leaks, values=_baseline_texts),
+    "a.2": SheetClaim(_test_abstract_rate, _SMALLEST),
+    "5.5.7": SheetClaim(_test_opposite_moves, f"tests as the sentence says, of {_N_TESTS}: ", ", "),
+    "5.6.1": SheetClaim(_test_rates_over_80, values=_noise_limit_texts),
+    "5.6.2": SheetClaim(_test_leak_levels, "d3 of P_A falls beyond noise: "),
+    "5.6.3": SheetClaim(_smallest_leak_test(_CELLS), _SMALLEST),
+    "6.1.1": SheetClaim(_test_both_chambers, "smallest test that passes d3d4 on both chambers: "),
+    "5.5.1": SheetClaim(
+        _test_sensitive_details, values=lambda evidence, sheet: {"d2": format_rule_rate(sheet, UNCLAIMED[1])}
+    ),
+    "5.5.2": SheetClaim(_test_product_detail, "mean over scatter of the log change, "),
+    "5.5.3": SheetClaim(_trend_test("p_A"), _CORRELATION, values=_prediction_values),
+    "5.5.4": SheetClaim(_trend_test("p_B"), _CORRELATION, values=_prediction_values),
+    "5.5.5": SheetClaim(_test_p_B_rises, f"of {_N_TESTS}: ", ", "),
+    "5.5.6": SheetClaim(_test_opposite_chambers),
 }
 
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on detection."""
     for number, rule in enumerate(CLAIMED, start=1):
-        where = "section 5.6" if rule is _TOGETHER else f"Fig. 5.{89 + number}"
-        yield _cell(rule, where).judge(evidence, f"5.4.{number}", "5.4")
+        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"
+        yield _rate_claim(rule, where).judge(evidence, f"5.4.{number}", "5.4")
     for id, claim in _CLAIMS.items():
         yield claim.judge(evidence, id)
 
 
-#: What is said of a chamber's curves: that they fall, or only that they change.
+#: The thesis's statement on a chamber's curves: they fall, or only change.
 Statement = Literal["fall", "change"]
 
 
-def levels() -> Iterator[Claim]:
-    """Judge claims 5.1.1 to 5.1.3."""
-    spans = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
-    texts = [
-        f"{level} {min(values):.4f} to {max(values):.4f}, mean {np.mean(values):.4f}" for level, values in spans.items()
-    ]
-    contains = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in spans.items()]
-    separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(spans.values())]
-    yield judge_claim("5.1.1", [*contains, *separate], levels="; ".join(texts))
+def leak_level_claims() -> Iterator[Claim]:
+    """Judge claims 5.1.1 to 5.1.3: nominal leaks of the levels, their ratios, and one leak in particular."""
+    leaks = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
+    texts = [f"{level} {min(lpm):.4f} to {max(lpm):.4f}, mean {np.mean(lpm):.4f}" for level, lpm in leaks.items()]
+    contains_nominal = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in leaks.items()]
+    is_separate = [min(upper) > max(lower) for upper, lower in itertools.pairwise(leaks.values())]
+    yield judge_claim("5.1.1", [*contains_nominal, *is_separate], levels="; ".join(texts))
+    real_lpm = {level: float(np.mean(values)) for level, values in leaks.items()}
     nominal, real = (
-        (values[1] / values[0], values[2] / values[1], values[3] / values[0])
-        for values in (list(NOMINAL_LPM.values()), [float(np.mean(values)) for values in spans.values()])
+        (lpm["medium"] / lpm["large"], lpm["small"] / lpm["medium"], lpm["extra-small"] / lpm["large"])
+        for lpm in (NOMINAL_LPM, real_lpm)
     )
-    tests = [abs(ratio / stated - 1.0) < 0.25 for ratio, stated in zip(nominal, (0.5, 0.5, 1.0 / 16.0), strict=True)]
-    ratio_texts = {
-        name: ", ".join(f"{ratio:.2f}" for ratio in ratios) for name, ratios in (("nominal", nominal), ("real", real))
-    }
-    yield judge_claim("5.1.2", tests, **ratio_texts)
+    tests = [abs(ratio / stated - 1.0) < 0.25 for ratio, stated in zip(nominal, _STATED_RATIOS, strict=True)]
+    nominal_text, real_text = (", ".join(f"{ratio:.2f}" for ratio in ratios) for ratios in (nominal, real))
+    yield judge_claim("5.1.2", tests, nominal=nominal_text, real=real_text)
     large_rows = [row for row in APPENDIX_C if row.level == "large" and row.command == "3 sin(4t)"]
     rows = ", ".join(f"row {row.number}: {row.mean_leak_lpm:g} L/min" for row in large_rows)
-    same_leaks = [f"{row.number} ({row.command}, {row.level})" for row in APPENDIX_C if row.mean_leak_lpm == 0.0087]
-    tests = [any(abs(row.mean_leak_lpm - 0.0087) < 5e-5 for row in large_rows)]
-    yield judge_claim("5.1.3", tests, rows=rows, same=", ".join(same_leaks))
+    same_leak = [row for row in APPENDIX_C if row.mean_leak_lpm == _STATED_LPM]
+    same_text = ", ".join(f"{row.number} ({row.command}, {row.level})" for row in same_leak)
+    tests = [any(abs(row.mean_leak_lpm - _STATED_LPM) < _ROUNDING_LPM for row in large_rows)]
+    yield judge_claim("5.1.3", tests, rows=rows, same=same_text)
 
 
-def _on_rows(
-    sheet: DataSheet, test: ShownTest, chamber: str, names: Sequence[str], statement: Statement
+def _test_rows(
+    sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test the changes of the named details in the row taken for the test, and count them over all possible rows."""
+    """Test whether the details `names` change beyond noise in the test's row, and count its candidate rows that do.
+
+    Returns a text, and the result for each detail.
+    """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
-    fires = {
-        name: -change > limit if statement == "fall" else np.abs(change) > limit for name, change in changes.items()
-    }
-    changed = ", ".join(f"{name} {in_percent(float(change[row])):+.1f} %" for name, change in changes.items())
-    reach = f"{in_percent(-limit):+.1f} %" + ("" if statement == "fall" else f" or {in_percent(limit):+.1f} %")
-    text = f"row {row + 1}: {changed}; noise reaches {reach}"
+    falls = statement == "fall"
+    exceeds = {name: (-change if falls else np.abs(change)) > limit for name, change in changes.items()}
+    row_changes = {name: log_change_to_percent(float(change[row])) for name, change in changes.items()}
+    changes_text = ", ".join(f"{name} {percent:+.1f} %" for name, percent in row_changes.items())
+    noise_text = f"{log_change_to_percent(-limit):+.1f} %"
+    if statement == "change":
+        noise_text += f" or {log_change_to_percent(limit):+.1f} %"
+    text = f"row {row + 1}: {changes_text}; noise reaches {noise_text}"
     rows = [candidate.number - 1 for candidate in test.candidates]
     if len(rows) > 1:
-        counts = ", ".join(f"{name} {np.sum(change[rows])}" for name, change in fires.items())
+        counts = ", ".join(f"{name} {np.sum(mask[rows])}" for name, mask in exceeds.items())
         text += f"; of the {len(rows)} rows it can be, beyond noise: {counts}"
-    return text, [bool(change[row]) for change in fires.values()]
+    return text, [bool(mask[row]) for mask in exceeds.values()]
 
 
-def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge a claim for each chamber of each test."""
-    for number, (section, chamber, names, statement) in enumerate(texts_of("cases.toml")["curves"], start=1):
-        test, rms = TESTS[section], evidence.shown[section].rms[chamber]
-        limits = (DIRECTION[chamber] * drift_threshold(evidence.drift, chamber, name) for name in names)
-        parts: list[bool] = []
-        text = NO_SHEET
-        if evidence.measured is not None:
-            text, parts = _on_rows(evidence.measured, test, chamber, names, statement)
-        beyond_names = [name for name, part in zip(names, parts, strict=False) if part]
-        sides = {"beyond": beyond_names, "within": [name for name in names if name not in beyond_names]}
-        first = test.first + test.inputs + 2 + (0 if chamber == "p_A" else 3)  # the details; their RMS two on
+def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
+    """Judge for each test of chapter 5 the claim that details of a chamber's pressure fall, or change.
+
+    They must change by more than the noise on the sheet of measurements. The simulated changes and the limits of drift
+    alone are stated for comparison.
+    """
+    for number, (section, chamber, names, statement) in enumerate(load_texts("cases.toml")["curves"], start=1):
+        test = TESTS[section]
+        rms_pairs = ((name, evidence.test_measures[section].rms[chamber][name]) for name in names)
+        simulated_changes = {name: 100 * (after / before - 1) for name, (before, after) in rms_pairs}
+        drift_limits = (DIRECTION[chamber] * drift_threshold(evidence.drift_sheet, chamber, name) for name in names)
+        is_beyond: list[bool] = []
+        sheet_text = NO_SHEET
+        if evidence.measured_sheet is not None:
+            sheet_text, is_beyond = _test_rows(evidence.measured_sheet, test, chamber, names, statement)
+        exceeding = [name for name, exceeds_noise in zip(names, is_beyond, strict=False) if exceeds_noise]
+        by_relation = {"beyond": exceeding, "within": [name for name in names if name not in exceeding]}
+        relations = [f"{_join_words(details)} {relation}" for relation, details in by_relation.items() if details]
+        # numbers of the figures: details, close-up, RMS of p_A, then of p_B; two figures before them show the leak
+        first = test.first_figure + test.n_input_figures + 2 + (0 if chamber == "p_A" else 3)
         yield judge_claim(
             f"5.2.{number}",
-            parts,
+            is_beyond,
             "5.2",
             section=f"{section[:3]} {section[3:]}",
             first=first,
@@ -308,15 +362,14 @@ def curves(evidence: ClaimEvidence) -> Iterator[Claim]:
             names=_join_words(names),
             chamber=chamber,
             does="falls" if statement == "fall" else "changes",
-            sheet=text,
-            simulated=", ".join(f"{name} {100 * (rms[name][1] / rms[name][0] - 1):+.1f} %" for name in names),
-            limits=", ".join(f"{in_percent(limit):+.1f} %" for limit in limits),
-            beyond_or_within=" and ".join(
-                f"{_join_words(details)} {side}" for side, details in sides.items() if details
-            ),
-            **({} if parts else {"why": NO_SHEET}),
+            sheet=sheet_text,
+            simulated=", ".join(f"{name} {percent:+.1f} %" for name, percent in simulated_changes.items()),
+            limits=", ".join(f"{log_change_to_percent(limit):+.1f} %" for limit in drift_limits),
+            beyond_or_within=" and ".join(relations),
+            **({} if is_beyond else {"why": NO_SHEET}),
         )
 
 
 def _join_words(names: Sequence[str]) -> str:
+    """Join words with commas and a final "and"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

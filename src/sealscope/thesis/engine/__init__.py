@@ -1,1 +1,1 @@
-"""The list of items to reproduce, and their making, storing and remaking."""
+"""The list of items to reproduce, and the code that makes and stores them and reuses stored results."""

@@ -1,4 +1,4 @@
-"""Inputs of a maker of figures and tables: simulated runs, the measured sheet, other items, a quick version."""
+"""The context in which an item is made: simulated runs, the measured sheet, and products of other items."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.folders import locked
+from sealscope.storage.folders import lock_file
 from sealscope.thesis.engine.products import Claim, Product, ThesisTable
 from sealscope.thesis.sheet import DataSheet
 
@@ -23,11 +23,11 @@ Products = tuple[Product | Claim, ...]
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """The result of a run.
+    """The result of a simulated run.
 
-    The recording, the true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`), the mean leak, and whether
-    halving the step moved no channel too far (None: not tested), by how much each moved (`proof`). `diverged` holds the
-    one-line reason of a run that failed; recording and outputs are then empty.
+    `recording`; `t`, `outputs`: true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`); `resolved`: whether
+    all channels changed little when the step was halved, None if not tested; `step_changes`: these changes;
+    `diverged`: one-line reason of a failed run, whose recording and outputs are empty.
     """
 
     recording: Recording | None
@@ -35,19 +35,19 @@ class SimulatedRun:
     outputs: Mapping[str, Array]
     mean_leak_lpm: float
     resolved: bool | None
-    proof: Mapping[str, float] = field(default_factory=dict)
+    step_changes: Mapping[str, float] = field(default_factory=dict)
     diverged: str = ""
 
     @property
     def recorded(self) -> Recording:
-        """The recording; raises SimulationFailed with the reason where there is none."""
+        """The recording; raises SimulationFailed if the run diverged."""
         if self.recording is None:
             raise SimulationFailed(self.diverged)
         return self.recording
 
 
-def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
-    """Simulate a run, and `prove` it at half the step; a diverged or unresolved run is marked so."""
+def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
+    """Simulate a run, and test it with half the step if `prove`; a diverged or unresolved run does not raise."""
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
@@ -60,10 +60,11 @@ def simulated_run(experiment: Experiment, prove: bool) -> SimulatedRun:
 
 @dataclass(frozen=True)
 class Context:
-    """The inputs handed to an item's maker.
+    """The inputs of an item's maker.
 
-    `sheet`: the measured sheet, None where it was not given or the item does not use it; `products`: those of the items
-    that it needs, by id, without those that failed; `runs`: folder of this call's runs, which its processes share.
+    `name`: id of the item; `needs`: ids of the items it needs, whose `products` are given by id, without failed items;
+    `quick`: whether to simulate less; `sheet`: measured sheet, None if not given or not used by the item; `runs`:
+    folder of simulated runs, shared by the processes of this call.
     """
 
     name: str
@@ -74,17 +75,20 @@ class Context:
     runs: Path
 
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
-        """Return the run of an experiment, simulated once while other processes that need it wait."""
+        """Simulate an experiment, or load its run if any process of this call has simulated it.
+
+        `prove`: whether to test the run with half the step. Other processes that ask for the run wait for it.
+        """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
-        with locked(path.with_suffix(".lock"), None):
+        with lock_file(path.with_suffix(".lock"), None):
             if not path.exists():
                 with atomic_write(path) as temporary:
-                    temporary.write_bytes(pickle.dumps(simulated_run(experiment, prove)))
+                    temporary.write_bytes(pickle.dumps(simulate_run(experiment, prove)))
             run: SimulatedRun = pickle.loads(path.read_bytes())
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of a needed item, () where it is left out."""
+        """Return the products of a needed item; () if it was left out. Raises InputError if it failed."""
         if name not in self.needs:
             raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
         if name not in self.products:
@@ -93,5 +97,5 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of an item."""
+    """Return the first table among a needed item's products."""
     return next(product for product in context.product(item) if isinstance(product, ThesisTable))

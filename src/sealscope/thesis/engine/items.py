@@ -1,4 +1,4 @@
-"""The list of cases, figures, tables and claims under the thesis's own numbers (`items.toml`), with their makers."""
+"""The list of cases, figures, tables and claims by the thesis's numbers (`items.toml`), with their makers."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from sealscope.calls import nearest
 from sealscope.errors import InputError
 from sealscope.thesis.engine.context import Context, Products
 from sealscope.thesis.engine.products import Cell, Figure, Number, Panel, ThesisTable
-from sealscope.thesis.engine.texts import texts_of
+from sealscope.thesis.engine.texts import load_texts
 
 
 @dataclass(frozen=True)
 class Item:
     """One case, figure, table or claim that can be reproduced.
 
-    `id`: the thesis's own number, such as "fig-4.22"; `make`: the function that makes its products; `inputs`: what the
-    maker reads, by name; `uses_sheet`: it shows the thesis's data sheet where that is given, `needs_sheet`: it cannot
-    be made without; `needs`: ids of the items whose products the maker asks for; `claims` that it bears on; `columns`
-    of its table.
+    `id`: the thesis's number, such as "fig-4.22"; `make`: function that makes its products; `inputs`: name -> input of
+    the maker; `uses_sheet`: it shows the thesis's data sheet if that is given; `needs_sheet`: it cannot be made without
+    the sheet; `needs`: ids of items whose products the maker uses; `claims`: ids of claims that it supports or refutes;
+    `columns`: columns of its table.
     """
 
     id: str
@@ -40,14 +40,14 @@ class Item:
     columns: tuple[str, ...] = ()
 
     @property
-    def of_sheet(self) -> bool:
-        """True for an item that uses the data sheet where it is given."""
+    def reads_sheet(self) -> bool:
+        """True if the item uses or needs the data sheet."""
         return self.uses_sheet or self.needs_sheet
 
     def figure(
         self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
     ) -> Figure:
-        """Make the item's figure of these panels."""
+        """Build the item's figure."""
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
     def table(
@@ -60,41 +60,40 @@ class Item:
         title: str = "",
         resolved: bool | None = None,
     ) -> ThesisTable:
-        """Make the item's table of these rows; `tail`, `title`, `columns` of a further one."""
+        """Build the item's table, or a further one with a `tail` of its id, a `title` and `columns`."""
         heads = tuple(columns) or self.columns
-        return ThesisTable(
-            self.id + tail, title or self.title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes
-        )
+        id, title = self.id + tail, title or self.title
+        return ThesisTable(id, title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes)
 
 
 _FIELDS = {declared.name for declared in fields(Item)}
 
 
 @cache
-def collect() -> tuple[Item, ...]:
+def load_items() -> tuple[Item, ...]:
     """Read the items of `items.toml`, in its order."""
     return tuple(
-        item for chapter, rows in texts_of("items.toml").items() for name, row in rows.items()
-        for item in _items(name, int(chapter), row)
+        item for chapter, rows in load_texts("items.toml").items() for name, row in rows.items()
+        for item in _iter_row_items(name, int(chapter), row)
     )  # fmt: skip
 
 
-def _items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the item of a row, or the items of the function named by `each` (id, title and inputs)."""
-    inputs_read: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in row.items()
-    }
-    fields_read: dict[str, Any] = {key: inputs_read.pop(key) for key in row if key in _FIELDS}
-    fields_read["make"] = _function(fields_read["make"])
-    fields_read["claims"] = tuple(f"claim-{claim}" for claim in fields_read.get("claims", ()))
-    variants = (
-        _function(inputs_read["each"])() if "each" in inputs_read else [(name, fields_read.pop("title"), inputs_read)]
-    )
+def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
+    """Yield the item of a row of `items.toml`; its entry `each` names a function that lists several items instead."""
+    row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
+    row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
+    row_fields["make"] = _import_function(row_fields["make"])
+    row_fields["claims"] = tuple(f"claim-{claim}" for claim in row_fields.get("claims", ()))
+    if "each" in row_inputs:
+        variants = _import_function(row_inputs["each"])()
+    else:
+        variants = [(name, row_fields.pop("title"), row_inputs)]
     for id, title, inputs in variants:
-        yield Item(**{"kind": "figure", "chapter": chapter, **fields_read, "id": id, "title": title, "inputs": inputs})
+        yield Item(**{"kind": "figure", "chapter": chapter, **row_fields, "id": id, "title": title, "inputs": inputs})
 
 
-def _function(name: str) -> Any:
+def _import_function(name: str) -> Any:
+    """Import a function by its dotted name below `sealscope.thesis`."""
     module, _, function = name.rpartition(".")
     return getattr(importlib.import_module(f"sealscope.thesis.{module}"), function)
 
@@ -102,10 +101,10 @@ def _function(name: str) -> Any:
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
     """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`), in the order of the list.
 
-    Raises InputError, with the closest ids, where a pattern matches nothing.
+    Raises InputError, with the closest ids, if a pattern matches nothing.
     """
     ids = [item.id for item in items]
-    chosen: set[str] = set()
+    selected: set[str] = set()
     for pattern in patterns or ("all",):
         folded = pattern.strip().casefold()
         if folded == "all":
@@ -121,13 +120,13 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
                 "an item must be an id of the list (sealscope reproduce --list), all, chapter-N or a wildcard such as "
                 f"fig-5.*, got {pattern!r}{hint}"
             )
-        chosen.update(matches)
-    return tuple(item for item in items if item.id in chosen)
+        selected.update(matches)
+    return tuple(item for item in items if item.id in selected)
 
 
-def with_needed(items: Sequence[Item], chosen: Iterable[Item]) -> tuple[Item, ...]:
-    """Add the items that the chosen ones need, in the order of the list."""
-    by_id, names = {item.id: item for item in items}, {item.id for item in chosen}
-    while more := {needed for name in names for needed in by_id[name].needs} - names:
-        names |= more
-    return tuple(item for item in items if item.id in names)
+def add_needed_items(items: Sequence[Item], selected: Iterable[Item]) -> tuple[Item, ...]:
+    """Add all items that the selected ones need, directly or indirectly, in the order of the list."""
+    by_id, ids = {item.id: item for item in items}, {item.id for item in selected}
+    while missing := {needed for name in ids for needed in by_id[name].needs} - ids:
+        ids |= missing
+    return tuple(item for item in items if item.id in ids)

@@ -11,10 +11,9 @@ from pydantic import PlainValidator
 
 from sealscope.recordings.recording import Array
 
-#: What a curve stands for. `thesis.pages.plot_style` gives each role a line, a grey and a colour, readable without
-#: the colour.
+#: Meaning of a curve. `thesis.pages.plot_style` gives each role a line style that is readable without colour.
 Role = Literal[
-    "command", "A", "B", "literal", "converged", "no leak", "leak", "measured", "simulated",
+    "command", "A", "B", "as_published", "converged", "no leak", "leak", "measured", "simulated",
     "25 %", "50 %", "75 %", "reference", "other",
 ]  # fmt: skip
 #: A value of a table; None: no value.
@@ -71,8 +70,8 @@ class Number:
 class Figure:
     """A figure under the thesis's own number.
 
-    `claims`: ids of the claims it bears on; `resolved`: whether every run in it passed the halving test (None:
-    nothing simulated); a figure that did not is marked on its face.
+    `claims`: ids of claims that it supports or refutes; `resolved`: whether all its runs passed the test with half the
+    step, None if nothing was simulated; an unresolved figure is marked.
     """
 
     id: str
@@ -98,7 +97,6 @@ class ThesisTable:
 
 
 Product = Figure | ThesisTable
-
 Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 
 
@@ -106,7 +104,8 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 class Claim:
     """One testable sentence of the thesis, in our words, and its verdict.
 
-    `where` it stands, what the data `sheet` says, what the `simulation` says, the verdict, and `why`.
+    `where`: place in the thesis; `sheet`, `simulation`: findings on the data sheet and in simulation; `why`: reason of
+    the verdict.
     """
 
     id: str
@@ -118,11 +117,11 @@ class Claim:
     why: str
 
 
-def verdict_of(tests: Iterable[bool | None]) -> Verdict:
+def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
     """Judge a claim by the tests of its parts.
 
-    `holds` where every test passed, `does not hold` where none did, `holds in part` between; tests that could not be
-    made (None) do not count, and without any other the claim `cannot be tested`.
+    It `holds` if all tests pass, `does not hold` if none does, and `holds in part` otherwise. None stands for a test
+    that cannot be made and is ignored; without any other test the claim `cannot be tested`.
     """
     results = {bool(test) for test in tests if test is not None}
     if len(results) == 1:
@@ -130,13 +129,13 @@ def verdict_of(tests: Iterable[bool | None]) -> Verdict:
     return "holds in part" if results else "cannot be tested"
 
 
-def thinned(x: Array, y: Array, most: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve to about `most` points: the least and the greatest of each stretch, so that peaks survive."""
-    if x.size <= most:
+def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
+    """Thin a curve to about `max_points` points: minimum and maximum of each block, so that peaks are preserved."""
+    if x.size <= max_points:
         return x, y
-    size = int(np.ceil(2 * x.size / most))
-    used = x.size // size * size
-    blocks = y[:used].reshape(-1, size)
-    start = np.arange(blocks.shape[0]) * size
-    picks = np.sort(np.concatenate([start + blocks.argmin(axis=1), start + blocks.argmax(axis=1)]))
-    return x[picks], y[picks]
+    block_size = int(np.ceil(2 * x.size / max_points))  # two points of each block
+    n_used = x.size // block_size * block_size
+    blocks = y[:n_used].reshape(-1, block_size)
+    first = np.arange(blocks.shape[0]) * block_size
+    indices = np.sort(np.concatenate([first + blocks.argmin(axis=1), first + blocks.argmax(axis=1)]))
+    return x[indices], y[indices]

@@ -1,4 +1,4 @@
-"""The thesis's texts with numbers put in: notes (`notes.toml`), claims and verdicts (`claims.toml`)."""
+"""Fill numbers into the reproduction's texts: notes (`notes.toml`) and claims with their findings (`claims.toml`)."""
 
 from __future__ import annotations
 
@@ -8,28 +8,33 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from sealscope.thesis.engine.products import Claim, verdict_of
+from sealscope.thesis.engine.products import Claim, claim_verdict
+
+#: Tests of a claim that neither the sheet nor a simulation can decide.
+NOT_TESTED: tuple[None, ...] = (None,)
 
 
 @cache
-def texts_of(name: str) -> dict[str, Any]:
-    """Read a TOML file of this package."""
+def load_texts(name: str) -> dict[str, Any]:
+    """Load a TOML file of the package `sealscope.thesis`."""
     return tomllib.loads(files("sealscope.thesis").joinpath(name).read_text(encoding="utf-8"))
 
 
-def note(name: str, **values: Any) -> str:
-    """Fill `values` into the note of a name."""
-    return str(texts_of("notes.toml")[name]).format(**values)
+def format_note(name: str, **values: Any) -> str:
+    """Return a note of `notes.toml` with `values` in its placeholders."""
+    return str(load_texts("notes.toml")[name]).format(**values)
 
 
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
-    """Judge the claim `claim-id` by the tests of its parts; its texts, filled with `values`, are those of `kind` or id.
+    """Judge the claim `id` by the tests of its parts, and fill `values` into its texts.
 
-    `sheet`, `simulation` and `why` among the values take the place of the texts of that name.
+    The texts are those of `id` in `claims.toml`, or of `kind` for claims that share them; values named `sheet`,
+    `simulation` and `why` replace the text of that name.
     """
-    texts = texts_of("claims.toml")
-    text = dict(texts[kind or id])
-    text.setdefault("sheet", next(words for prefix, words in texts["sheet"].items() if id.startswith(prefix)))
+    claims = load_texts("claims.toml")
+    templates = dict(claims[kind or id])
+    # a claim without a text on the sheet has the one of its chapter, by the prefix of its id
+    templates.setdefault("sheet", next(text for prefix, text in claims["sheet"].items() if id.startswith(prefix)))
     replaced = {name: values[name] for name in ("sheet", "simulation", "why") if name in values}
-    filled = {name: words.format(**values) for name, words in text.items() if name not in replaced}
-    return Claim(id=f"claim-{id}", verdict=verdict_of(tests), **filled, **replaced)
+    texts = {name: template.format(**values) for name, template in templates.items() if name not in replaced}
+    return Claim(id=f"claim-{id}", verdict=claim_verdict(tests), **texts, **replaced)

@@ -1,4 +1,4 @@
-"""The page of a reproduction: one HTML file with every figure, table and claim, an index and a search."""
+"""Write the page of a reproduction: one HTML file with all figures, tables and claims, an index and a search."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ CHAPTERS = {
     6: "Chapter 6: what follows",
 }
 _TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cannot be tested": "none"}
-#: A longer table is folded away until somebody opens it.
-_LONG_TABLE = 45
+#: A table with more rows is collapsed.
+_MAX_OPEN_ROWS = 45
 
 
 class PageProduct(NamedTuple):
-    """A figure or table as the page shows it."""
+    """A figure or table with what the page shows of it: picture (data URI), links to its files, and its claims."""
 
     id: str
     heading: str
@@ -43,32 +43,30 @@ class PageProduct(NamedTuple):
 def write_thesis_page(
     folder: Path, statuses: Sequence[ItemStatus], *, quick: bool = False, sheet: bool = False
 ) -> Path:
-    """Write `index.html` into `folder` from the status of every item; return its path.
+    """Write `index.html` into `folder` from the statuses of all items; return its path.
 
-    It refers to nothing outside it but the drawn files, which lie in the folder. `quick`: made with shorter runs;
-    `sheet`: the measured sheet was given. Raises InputError where the page cannot be written.
+    The page links to nothing but the files in the folder. `quick`: whether shorter runs were made; `sheet`: whether the
+    measured sheet was given. Raises InputError if the page cannot be written.
     """
-    entries: list[tuple[ItemStatus, Figure | ThesisTable, str]] = []
     claims: dict[str, Claim] = {}
-    for status in statuses:
-        for product in status.products:
-            if isinstance(product, Claim):
-                claims.setdefault(product.id, product)
-            elif isinstance(product, Figure):
-                entries.append((status, product, _picture(folder, product.id)))
-            elif status.item.id != "claims":  # the claims have a section of their own
-                entries.append((status, product, ""))
+    products = [(status, product) for status in statuses for product in status.products]
+    for _, product in products:
+        if isinstance(product, Claim):
+            claims.setdefault(product.id, product)
     chapters: dict[int, list[PageProduct]] = defaultdict(list)
-    bearing: dict[str, list[str]] = defaultdict(list)
-    for status, product, picture in entries:
-        chapters[status.item.chapter].append(_page_product(status, product, picture, claims))
+    products_by_claim: dict[str, list[str]] = defaultdict(list)
+    for status, product in products:
+        if isinstance(product, Claim) or (isinstance(product, ThesisTable) and status.item.id == "claims"):
+            continue  # claims and their table have a section of their own
+        chapters[status.item.chapter].append(_page_product(status, product, folder, claims))
         for name in product.claims:
-            bearing[name].append(product.id)
+            products_by_claim[name].append(product.id)
     absent: dict[str, list[ItemStatus]] = defaultdict(list)
     for status in statuses:
-        if status.state not in ("made", "kept"):
-            why = f"{status.state}: {status.reason}"
-            absent["not made yet, or from other sources" if status.state == "not made" else why].append(status)
+        if status.state == "not made":
+            absent["not made yet, or from other sources"].append(status)
+        elif status.state not in ("made", "kept"):
+            absent[f"{status.state}: {status.reason}"].append(status)
     claims_files = [name for status in statuses if status.item.id == "claims" for name in status.files]
     page = template.render(
         "thesis.html.j2",
@@ -80,7 +78,7 @@ def write_thesis_page(
             (number, CHAPTERS.get(number, f"Chapter {number}"), products) for number, products in chapters.items()
         ],
         claims=list(claims.values()),
-        bearing=bearing,
+        products_by_claim=products_by_claim,
         counts=[(verdict, sum(claim.verdict == verdict for claim in claims.values())) for verdict in VERDICTS],
         slug=lambda verdict: verdict.replace(" ", "-"),
         tone=_TONES,
@@ -91,38 +89,39 @@ def write_thesis_page(
         unresolved=UNRESOLVED,
         quick=quick,
         sheet=sheet,
-        cell=cell,
+        format_cell=format_cell,
         is_number=lambda value: isinstance(value, int | float) and not isinstance(value, bool),
-        long_table=_LONG_TABLE,
+        max_open_rows=_MAX_OPEN_ROWS,
     )
     return template.write(folder / "index.html", page)
 
 
 def _page_product(
-    status: ItemStatus, product: Figure | ThesisTable, picture: str, claims: dict[str, Claim]
+    status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
 ) -> PageProduct:
-    its_claims = [claims[name] for name in product.claims if name in claims]
+    """Build the entry of a figure or table from its files in `folder` and the claims it supports or refutes."""
+    picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
+    product_claims = [claims[name] for name in product.claims if name in claims]
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
     numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
-    text = " ".join(
-        [product.id, heading, product.notes, *numbers, *(f"{claim.id} {claim.claim}" for claim in its_claims)]
-    )
-    return PageProduct(product.id, heading, product, picture, links, its_claims, text.casefold())
+    claim_texts = [f"{claim.id} {claim.claim}" for claim in product_claims]
+    text = " ".join([product.id, heading, product.notes, *numbers, *claim_texts])
+    return PageProduct(product.id, heading, product, picture, links, product_claims, text.casefold())
 
 
-def _picture(folder: Path, name: str) -> str:
-    """Return the figure's picture as a data URI: SVG or PNG, whichever is smaller; empty where neither exists."""
-    kinds = (("svg+xml", folder / "figures" / f"{name}.svg"), ("png", folder / "figures" / f"{name}.png"))
-    pictures = [(path.read_bytes(), kind) for kind, path in kinds if path.is_file()]
+def _encode_picture(folder: Path, name: str) -> str:
+    """Encode a figure's SVG or PNG, whichever is smaller, as a data URI; return "" if neither exists."""
+    paths = {"svg+xml": folder / "figures" / f"{name}.svg", "png": folder / "figures" / f"{name}.png"}
+    pictures = {kind: path.read_bytes() for kind, path in paths.items() if path.is_file()}
     if not pictures:
         return ""
-    content, kind = min(pictures, key=lambda picture: len(picture[0]))
-    return f"data:image/{kind};base64,{b64encode(content).decode()}"
+    kind = min(pictures, key=lambda kind: len(pictures[kind]))
+    return f"data:image/{kind};base64,{b64encode(pictures[kind]).decode()}"
 
 
-def cell(value: Any) -> str:
-    """Format a table's value: numbers to five digits, a dash for none."""
+def format_cell(value: Any) -> str:
+    """Format a table's value: numbers with five significant digits, a dash for None and nan."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

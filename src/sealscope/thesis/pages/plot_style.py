@@ -1,4 +1,4 @@
-"""The look of thesis figures: a style for each role, and labels with the thesis's symbols."""
+"""The style of the thesis's figures: line styles by role, and labels with the thesis's symbols."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ class Style(NamedTuple):
 
 
 _TABLES = tomllib.loads(Path(__file__).with_name("styles.toml").read_text(encoding="utf-8"))
-STYLES: dict[Role, Style] = {
-    role: Style(**{**row, "dashes": tuple(row.get("dashes", ()))}) for role, row in _TABLES["roles"].items()
-}
-#: Line styles that tell curves of one role in one panel apart.
+_ROWS = {role: {**row, "dashes": tuple(row.get("dashes", ()))} for role, row in _TABLES["roles"].items()}
+STYLES: dict[Role, Style] = {role: Style(**row) for role, row in _ROWS.items()}
+#: Dashes of further curves with the same role in a panel.
 SAME_ROLE = tuple(map(tuple, _TABLES["again"]["dashes"]))
 #: matplotlib's settings.
 SETTINGS = Path(__file__).with_name("thesis.mplstyle")
@@ -32,18 +31,18 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 def caption(figure_id: str, title: str) -> str:
     """Format the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
-    kind, _, number = figure_id.partition("-")
+    kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
     title = title.rstrip(".")
-    if prefix is None or not number[:1].isdigit():
+    if prefix is None or not number_and_part[:1].isdigit():
         return title
-    number, _, part = number.partition("-")
-    letter = f" {part})" if len(part) == 1 else f" ({part})" if part else ""
-    return f"{prefix} {number}{letter}. {title}"
+    number, _, part = number_and_part.partition("-")
+    part_text = f" {part})" if len(part) == 1 else f" ({part})" if part else ""
+    return f"{prefix} {number}{part_text}. {title}"
 
 
 def typeset(label: str) -> str:
-    """Set the thesis's symbols in a label as symbols: p_A, d3, omega, m^3/s; all other words stay."""
+    """Convert the symbols in a label, such as p_A, d3, omega and m^3/s, to mathematical notation."""
     text = label.replace("$", r"\$")
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)

@@ -1,4 +1,4 @@
-"""Figures as pictures: thesis products drawn for print, readable without colour (matplotlib, without a display)."""
+"""Draw the thesis's figures for print, readable without colour (matplotlib, without a display)."""
 
 from __future__ import annotations
 
@@ -11,30 +11,42 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import MissingExtra
-from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, Role, thinned
+from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, Role, thin_curve
 from sealscope.thesis.pages.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure as MplFigure
     from matplotlib.legend import Legend
 
 UNRESOLVED = "not resolved: halving the step moves it"
-#: Most bytes of an SVG with its curves as curves; a larger one gets them as pixels.
-MOST_SVG_BYTES = 380_000
+#: Limit of an SVG with curves as paths [bytes]; in a larger one long curves are rasterised.
+MAX_SVG_BYTES = 380_000
 DPI = 200
+#: Width of a figure, and heights of its parts [inch].
 _WIDTH = 7.2
-_POINTS = 2400
-#: A line with more points than this is noise to the eye: drawn thin and without dashes.
-_DENSE = 1500
-#: ... and with more than this it becomes pixels in an SVG that is too large otherwise.
-_LONG = 300
+_TOP_MARGIN, _WARNING_HEIGHT, _LEGEND_HEIGHT = 0.03, 0.34, 0.24
+_LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
+#: Number of rows of panels -> height of a row [inch].
+_ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
+#: Characters of a caption's line.
+_CAPTION_CHARACTERS = 122
+#: Width of a label's line and margin in a legend, and of all labels that fit above a figure or its panel [characters].
+_LABEL_MARGIN, _MAX_SHARED_CHARACTERS, _MAX_LEGEND_CHARACTERS = 6, 100, 92
+#: Points to which a line is thinned.
+_MAX_POINTS = 2400
+#: A line with more points is drawn thin and without dashes, as it looks like noise.
+_DENSE_POINTS = 1500
+#: A line with more points is rasterised in an SVG that is too large otherwise.
+_RASTER_POINTS = 300
+#: Estimated size of a point in an SVG [bytes].
 _POINT_BYTES = 15
+_Range = tuple[float, float]
 
 
 def require_drawing() -> None:
-    """Raise MissingExtra where the drawing library is not installed."""
+    """Raise MissingExtra if the drawing library is not installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError:
@@ -42,123 +54,125 @@ def require_drawing() -> None:
 
 
 def draw(figure: Figure) -> tuple[bytes, bytes]:
-    """Draw the figure: an SVG whose text stays text, and a PNG with a palette at 200 dpi.
+    """Draw a figure; return it as an SVG with searchable text, and as a PNG with a palette and `DPI`.
 
-    Raises MissingExtra where matplotlib is not installed.
+    Raises MissingExtra if matplotlib is not installed.
     """
     require_drawing()
     import matplotlib
 
     with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # not the settings in the working folder, which may be hostile and run TeX
+        matplotlib.rcdefaults()  # ignore settings in the working folder, which may be hostile and run TeX
         matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
         matplotlib.rcParams["svg.hashsalt"] = figure.id
-        canvas = _canvas(figure)
-        long = [line for ax in canvas.axes for line in ax.lines if np.size(line.get_xdata()) > _LONG]
-        large = sum(np.size(line.get_xdata()) for line in long) * _POINT_BYTES > MOST_SVG_BYTES
-        svg = b"" if large else _svg(canvas, figure)
-        if large or len(svg) > MOST_SVG_BYTES:
-            for line in long:
+        mpl_figure = _draw_figure(figure)
+        long_lines = [line for ax in mpl_figure.axes for line in ax.lines if np.size(line.get_xdata()) > _RASTER_POINTS]
+        is_large = sum(np.size(line.get_xdata()) for line in long_lines) * _POINT_BYTES > MAX_SVG_BYTES
+        svg = b"" if is_large else _render_svg(mpl_figure, figure)
+        if is_large or len(svg) > MAX_SVG_BYTES:
+            for line in long_lines:
                 line.set_rasterized(True)
-            svg = _svg(canvas, figure)
-        return svg, _png(canvas, greys=any(panel.image is not None for panel in figure.panels))
+            svg = _render_svg(mpl_figure, figure)
+        return svg, _render_png(mpl_figure, has_image=any(panel.image is not None for panel in figure.panels))
 
 
-def _svg(canvas: Canvas, figure: Figure) -> bytes:
+def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
+    """Render a figure as an SVG without a date, so that equal figures give equal bytes."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     out = io.StringIO()
-    canvas.set_dpi(DPI)  # of its pixels; printing leaves its own there
-    FigureCanvasSVG(canvas).print_svg(
-        out, metadata={"Title": caption(figure.id, figure.title), "Date": None, "Creator": None}
-    )
+    mpl_figure.set_dpi(DPI)  # for rasterised lines; an earlier rendering may have changed it
+    metadata = {"Title": caption(figure.id, figure.title), "Date": None, "Creator": None}
+    FigureCanvasSVG(mpl_figure).print_svg(out, metadata=metadata)
     return out.getvalue().encode()
 
 
-def _png(canvas: Canvas, *, greys: bool) -> bytes:
-    """Draw as PNG with few colours for a small file; a picture of greys keeps a whole palette."""
+def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
+    """Render a figure as a PNG with a palette of 256 colours, for a small file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Picture
 
-    canvas.set_dpi(DPI)
-    agg = FigureCanvasAgg(canvas)
+    mpl_figure.set_dpi(DPI)
+    agg = FigureCanvasAgg(mpl_figure)
     agg.draw()
     out = io.BytesIO()
     with Picture.fromarray(np.asarray(agg.buffer_rgba())[..., :3]) as picture:
-        method = Picture.Quantize.MEDIANCUT if greys else Picture.Quantize.FASTOCTREE
-        few = picture.quantize(256, method=method, dither=Picture.Dither.NONE)
-        few.save(out, format="PNG", compress_level=7, dpi=(DPI, DPI))
+        # the median cut spreads the palette evenly over the greys of an image
+        method = Picture.Quantize.MEDIANCUT if has_image else Picture.Quantize.FASTOCTREE
+        palette_picture = picture.quantize(256, method=method, dither=Picture.Dither.NONE)
+        palette_picture.save(out, format="PNG", compress_level=7, dpi=(DPI, DPI))
     return out.getvalue()
 
 
-def grid_of(panels: int) -> tuple[int, int]:
+def choose_grid(n_panels: int) -> tuple[int, int]:
     """Choose rows and columns of a figure's panels: one column up to five panels, two up to twelve, then three."""
-    columns = 1 if panels <= 5 else 2 if panels <= 12 else 3
-    return -(-panels // columns), columns
+    columns = 1 if n_panels <= 5 else 2 if n_panels <= 12 else 3
+    return -(-n_panels // columns), columns  # rows rounded up
 
 
-def _canvas(figure: Figure) -> Canvas:
-    """Lay the figure out.
+def _draw_figure(figure: Figure) -> MplFigure:
+    """Lay out and draw a figure.
 
-    From the top: the mark of an unresolved run, a legend that serves all panels, the panels, the caption.
+    From the top: warning of an unresolved run, legend if all panels share it, panels, caption.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure as MplFigure
 
-    rows, columns = grid_of(max(1, len(figure.panels)))
-    row_height = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}.get(rows, 1.35 if columns == 1 else 1.7)
-    shared = _shared_legend(figure.panels)
-    lines = textwrap.wrap(caption(figure.id, figure.title), 122)
-    mark = 0.34 if figure.resolved is False else 0.0
-    foot, head = 0.16 * len(lines) + 0.14, 0.03 + mark + (0.24 if shared else 0.0)
-    height = rows * row_height + foot + head
-    canvas = Canvas(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(canvas)
-    engine: Any = canvas.get_layout_engine()
-    engine.set(rect=(0, foot / height, 1, 1 - (foot + head) / height), h_pad=0.05, w_pad=0.06, hspace=0.03)
-    axes = canvas.subplots(rows, columns, squeeze=False)
-    same_marks = len({panel.marks for panel in figure.panels}) == 1
+    rows, columns = choose_grid(max(1, len(figure.panels)))
+    row_height = _ROW_HEIGHTS.get(rows, 1.35 if columns == 1 else 1.7)
+    has_shared_legend = _has_shared_legend(figure.panels)
+    lines = textwrap.wrap(caption(figure.id, figure.title), _CAPTION_CHARACTERS)
+    warning = _WARNING_HEIGHT if figure.resolved is False else 0.0
+    footer = _LINE_HEIGHT * len(lines) + _CAPTION_MARGIN
+    header = _TOP_MARGIN + warning + (_LEGEND_HEIGHT if has_shared_legend else 0.0)
+    height = rows * row_height + footer + header
+    mpl_figure = MplFigure(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(mpl_figure)
+    engine: Any = mpl_figure.get_layout_engine()
+    engine.set(rect=(0, footer / height, 1, 1 - (footer + header) / height), h_pad=0.05, w_pad=0.06, hspace=0.03)
+    axes = mpl_figure.subplots(rows, columns, squeeze=False)
+    have_same_marks = len({panel.marks for panel in figure.panels}) == 1
     for index, ax in enumerate(axes.flat):
         if index >= len(figure.panels):
             ax.set_axis_off()
             continue
         panel = figure.panels[index]
-        _panel(canvas, ax, panel, mark_words=index < columns or not same_marks)
-        if not shared:
-            _legend(ax, panel)
+        _draw_panel(mpl_figure, ax, panel, label_marks=index < columns or not have_same_marks)
+        if not has_shared_legend:
+            _add_legend(ax, panel)
     _hide_repeated_x_labels(axes, figure.panels)
-    if shared:
+    if has_shared_legend:
         handles, labels = axes.flat[0].get_legend_handles_labels()
-        anchor = (0.5, 1 - (0.03 + mark) / height)
-        _plain(canvas.legend(handles, labels, loc="upper center", bbox_to_anchor=anchor, ncols=len(labels)))
-    canvas.text(
-        0.012, 0.06 / height, "\n".join(map(typeset, lines)), va="bottom", ha="left", fontsize=8.2, linespacing=1.25
-    )
+        anchor = (0.5, 1 - (_TOP_MARGIN + warning) / height)
+        _thicken_lines(mpl_figure.legend(handles, labels, loc="upper center", bbox_to_anchor=anchor, ncols=len(labels)))
+    style: dict[str, Any] = {"va": "bottom", "ha": "left", "fontsize": 8.2, "linespacing": 1.25}
+    mpl_figure.text(0.012, 0.06 / height, "\n".join(map(typeset, lines)), **style)
     if figure.resolved is False:
         box = {"boxstyle": "square,pad=0.35", "facecolor": "#fff3c4", "edgecolor": "#8f1d14", "linewidth": 1.6}
-        canvas.text(
+        mpl_figure.text(
             0.988, 1 - 0.09 / height, UNRESOLVED.upper(), va="top", ha="right", fontsize=8.5, weight="bold",
             color="#5c0f08", bbox=box,
         )  # fmt: skip
-    canvas.draw_without_rendering()
-    canvas.set_layout_engine("none")
-    return canvas
+    mpl_figure.draw_without_rendering()
+    mpl_figure.set_layout_engine("none")
+    return mpl_figure
 
 
-def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
+def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: bool) -> None:
+    """Draw a panel's image, curves, marks and axes; `label_marks`: whether to write the texts of the marks."""
     if panel.image is not None:
         image = panel.image
         mesh = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
-        canvas.colorbar(mesh, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
+        mpl_figure.colorbar(mesh, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
         ax.grid(False)
     counts: dict[Role, int] = {}
     for curve in panel.curves:
-        again = counts.get(curve.role, 0)
-        counts[curve.role] = again + 1
-        _curve(ax, curve, again, panel.x_range, len(panel.curves) == 1)
+        n_before = counts.get(curve.role, 0)
+        counts[curve.role] = n_before + 1
+        _draw_curve(ax, curve, n_before, panel.x_range, is_only=len(panel.curves) == 1)
     for x, text in panel.marks:
         ax.axvline(x, color="#1b1f24", linewidth=0.8, dashes=(1.5, 1.5), zorder=4)
-        if text and mark_words:
+        if text and label_marks:
             ax.annotate(
                 typeset(text), (x, 0.98), xycoords=("data", "axes fraction"), xytext=(2.5, 0), rotation=90,
                 textcoords="offset points", va="top", ha="left", fontsize=6.8, color="#1b1f24", zorder=5,
@@ -166,10 +180,10 @@ def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
             )  # fmt: skip
     if panel.log_x:
         ax.set_xscale("log")
-        _plain_numbers(ax.xaxis)
+        _use_plain_numbers(ax.xaxis)
     if panel.log_y:
         ax.set_yscale("log")
-        _plain_numbers(ax.yaxis)
+        _use_plain_numbers(ax.yaxis)
     ax.set_xlabel(typeset(panel.x_label), labelpad=2)
     ax.set_ylabel(typeset(panel.y_label), labelpad=3)
     if panel.title:
@@ -181,8 +195,8 @@ def _panel(canvas: Canvas, ax: Axes, panel: Panel, *, mark_words: bool) -> None:
     ax.tick_params(width=0.6, length=3)
 
 
-def _plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis with numbers such as 0.2, 1, 50, with powers of ten over many decades."""
+def _use_plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis with numbers such as 0.2, 1, 50, or with powers of ten over four decades and more."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -192,26 +206,28 @@ def _plain_numbers(axis: Axis) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def visible(curve: FigureCurve, x_range: tuple[float, float] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points of a curve as drawn: in the range with a neighbour on each side, a long line thinned."""
+def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
+    """Select the points of a curve to draw: those in the range and one on each side, thinned for a long line."""
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
-    if x_range is not None and x.size > _POINTS and np.all(np.diff(x) >= 0):
-        first, last = np.searchsorted(x, sorted(x_range))
-        x, y = x[max(0, first - 1) : last + 1], y[max(0, first - 1) : last + 1]
-    return thinned(x, y, _POINTS) if curve.kind == "line" else (x, y)
+    if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
+        first, stop = np.searchsorted(x, sorted(x_range))
+        drawn = slice(max(0, first - 1), stop + 1)
+        x, y = x[drawn], y[drawn]
+    return thin_curve(x, y, _MAX_POINTS) if curve.kind == "line" else (x, y)
 
 
-def _curve(ax: Axes, curve: FigureCurve, again: int, x_range: tuple[float, float] | None, alone: bool) -> None:
-    style = STYLES["other" if alone and curve.role == "reference" else curve.role]
-    x, y = visible(curve, x_range)
-    dense = x.size > _DENSE
-    line: dict[str, Any] = {
-        "color": style.colour,
-        "linewidth": min(style.width, 0.6) if dense else style.width,
-        "label": typeset(curve.label),
-    }
-    dashes = style.dashes if again == 0 else SAME_ROLE[again % len(SAME_ROLE)]
-    if dashes and not dense:
+def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
+    """Draw a curve in the style of its role; `n_before`: number of earlier curves with this role in the panel.
+
+    `is_only`: whether it is the panel's only curve, which is drawn in colour even if it is a reference.
+    """
+    style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
+    x, y = drawn_points(curve, x_range)
+    is_dense = x.size > _DENSE_POINTS
+    width = min(style.width, 0.6) if is_dense else style.width
+    line: dict[str, Any] = {"color": style.colour, "linewidth": width, "label": typeset(curve.label)}
+    dashes = style.dashes if n_before == 0 else SAME_ROLE[n_before % len(SAME_ROLE)]
+    if dashes and not is_dense:
         line["dashes"] = dashes
     marker: dict[str, Any] = {"marker": style.marker, "markersize": 4.2, "color": style.colour}
     if style.marker != "x":
@@ -226,35 +242,35 @@ def _curve(ax: Axes, curve: FigureCurve, again: int, x_range: tuple[float, float
         ax.plot(x, y, **line)
 
 
-def _shared_legend(panels: Sequence[Panel]) -> bool:
-    """Return True if all panels show the same curves, so that one legend serves them."""
+def _has_shared_legend(panels: Sequence[Panel]) -> bool:
+    """Return True if all panels have the same curves and a common legend fits on one line."""
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
-    short = sum(map(len, labels)) + 6 * len(labels) <= 100
-    return len(panels) > 1 and len(keys) == 1 and len(labels) > 1 and short
+    is_short = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) <= _MAX_SHARED_CHARACTERS
+    return len(panels) > 1 and len(keys) == 1 and len(labels) > 1 and is_short
 
 
-def _legend(ax: Axes, panel: Panel) -> None:
-    """Place the legend above the axes where it fits in a line, else beside them; none for a single named curve."""
+def _add_legend(ax: Axes, panel: Panel) -> None:
+    """Place the legend above the axes if it fits on one line, else on their right; omit it for one named curve."""
     labels = [curve.label for curve in panel.curves if curve.label]
     if not labels or (len(panel.curves) == 1 and (not panel.title or labels[0] in panel.y_label)):
         return
-    wide = sum(map(len, labels)) + 6 * len(labels) + len(panel.title)
-    if wide <= 92 and len(labels) <= 5:
+    n_characters = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) + len(panel.title)
+    if n_characters <= _MAX_LEGEND_CHARACTERS and len(labels) <= 5:
         legend = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)
     else:
         legend = ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), borderaxespad=0.1)
-    _plain(legend)
+    _thicken_lines(legend)
 
 
-def _plain(legend: Legend) -> None:
-    """Draw the lines in a legend thick enough to see, however thin the curves are."""
+def _thicken_lines(legend: Legend) -> None:
+    """Set a minimum width for the lines in a legend, as dense curves are thin."""
     for line in legend.get_lines():
         line.set_linewidth(max(1.3, line.get_linewidth()))
 
 
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
-    """Label the x axis in the lowest panel of each column alone, where all panels share it."""
+    """Remove the labels of the x axis except in the lowest panel of each column, if all panels share the axis."""
     visible_axes = [ax for ax in axes.flat if ax.axison]
     x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}
     if len(x_axes) != 1 or any(panel.image is not None for panel in panels):

@@ -1,109 +1,126 @@
-"""Tests of steps that no balance shows: of the duty's size, of the noise of a sensor, of hum.
+"""Tests of steps of features that no balance contains: of the duty's amplitude, of sensor noise, of hum.
 
-Each is of a number a block, whose scatter from block to block is its noise. A leak moves none of them: the command is
-the operator's, the noise stands above the ringing, which a leak damps, and in p_A + p_B the ringing cancels.
+Each feature is one number in each block, tested against its scatter between blocks. A leak changes none of them: the
+operator gives the command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not
+ring.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import Information, StepTest, two_sided
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.onset import Information, StepTest, two_sided_step_test
+from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
-_PRIORS = priors("inference.changes")["features"]
-BLOCKS, ORDER = _PRIORS["blocks"], _PRIORS["order"]
-#: What commands the motion, and what moves, in the order of preference.
+_PRIORS = CHANGES.features
+BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
+#: Channels of the command and of the motion, in the order of preference.
 COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
-#: Bins of a spectrum beyond the main lobe of a line, by a Hann window.
-_BESIDE: list[float] = _PRIORS["beside"]
+#: Distances [bins] from a spectral line to bins outside of its main lobe with a Hann window.
+_NEIGHBOURS = _PRIORS.neighbours
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Return the tests of the size of command and motion, two where the channels show both; none where one stays.
+    """Test the amplitudes of command and motion for a step; no test if either is constant.
 
-    A duty of another size changes them alike; a leak one of them, in an open or in a closed loop.
+    A change of the duty changes both alike; a leak changes one of them, in open or closed loop.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
-        # whole cycles: without a position both are the drive's, which a leak moves within a cycle as well
-        samples = cycle * recording.rate
-        length = round(max(1, math.ceil(length / samples)) * samples)
-    sizes = []
-    for names in (COMMANDS, MOTIONS):
-        if name := next((channel for channel in names if channel in recording), None):
-            values = _blocks(recording, length)[name]
-            if not np.isfinite(values).any(axis=1).all():
-                return []
-            low, high = np.nanpercentile(values, [2.0, 98.0], axis=1)
-            sizes.append(np.log(high - low))
-    tests = [_test(recording, size, length) for size in sizes]
+        # whole cycles: without a position both are the drive's, which a leak changes within a cycle as well
+        cycle_samples = cycle * recording.rate
+        length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
+    time, blocks = _split_blocks(recording, length)
+    return amplitude_step_tests(time, dict(log_amplitudes(blocks)))
+
+
+def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
+    """Yield the log range (K,), from the 2 % to the 98 % quantile, of command and of motion in blocks (K, length).
+
+    NaN for a block without samples.
+    """
+    for kind, names in (("command", COMMANDS), ("motion", MOTIONS)):
+        if name := next((channel for channel in names if channel in blocks), None):
+            values = blocks[name]
+            low, high = (_row_statistic(partial(np.nanpercentile, q=percent), values) for percent in (2.0, 98.0))
+            yield kind, np.log(high - low)
+
+
+def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
+    """Test the log amplitudes of command and motion, (K,) at times (K,) [s], for a step; [] if either is constant."""
+    tests = [feature_step_test(time, values) for values in amplitudes.values()]
     return [test for test in tests if test is not None] if None not in tests else []
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Return the tests of what changes with a sensor alone, by what it is."""
+    """Test the features that change with a sensor alone for a step; return the tests with their names."""
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
-    length = len(recording) // BLOCKS
-    blocks = _blocks(recording, length)
-    if np.isnan(blocks["p_A"]).all(axis=1).any():  # not known in all blocks
+    time, blocks = _split_blocks(recording, len(recording) // BLOCKS)
+    if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples
         return []
-    features = _features(blocks, recording.rate)
-    return [(name, test) for name, sizes in features if (test := _test(recording, sizes, length)) is not None]
+    features = sensor_features(blocks, recording.rate)
+    return [(name, test) for name, values in features if (test := feature_step_test(time, values)) is not None]
 
 
-def _blocks(recording: Recording, length: int) -> dict[str, Array]:
-    """Return the channels in blocks (K, length), missing samples as NaN."""
+def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
+    """Return the middles (K,) [s] of blocks of `length` samples, and their channels (K, length), NaN if missing."""
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
-    if recording.bridged is None:
-        return blocks
-    missing = recording.bridged[: count * length].reshape(count, length)
-    return {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
+    if recording.bridged is not None:
+        missing = recording.bridged[: count * length].reshape(count, length)
+        blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
+    return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks
 
 
-def _features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield a number a block of each feature, by its name."""
+def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
+    """Yield the names and the values in blocks (K,) of features of the sensors: wiring, noise and hum."""
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if name := next((channel for channel in ("omega", "u", "theta", "x") if channel in blocks), None):
-        # whether p_A - p_B goes with the flow into A (1) or against it (-1): friction takes work
+        # 1 if p_A - p_B is in phase with the flow into A, as friction makes it, else -1: sensors exchanged or reversed
         flow = blocks[name] if name in ("omega", "u") else np.gradient(blocks[name], axis=1)
         difference = p_A - p_B - np.nanmean(p_A - p_B)
-        yield "sense of p_A - p_B", np.sign(_of_rows(np.nanmean, difference * flow))
-    # the median square, for a jump at a reversal is no noise
-    noise_A, noise_B = (np.log(_of_rows(np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B))
+        yield "sense of p_A - p_B", np.sign(_row_statistic(np.nanmean, difference * flow))
+    # median instead of mean: pressure jumps at reversals are outliers
+    noise_A, noise_B = (np.log(_row_statistic(np.nanmedian, np.diff(p, ORDER, axis=1) ** 2)) for p in (p_A, p_B))
     yield "noise of the pressures", noise_A + noise_B
     yield "noise of p_A beside that of p_B", noise_A - noise_B
-    length = p_A.shape[1] // 2
-    values = (p_A + p_B)[:, : 2 * length].reshape(-1, 2, length)
-    bins = np.array([0.0, *_BESIDE, *np.negative(_BESIDE)])
-    for hertz in _PRIORS["mains"]:
-        if hertz + _BESIDE[-1] * rate / length < _PRIORS["highest"] * rate:
-            turns = np.outer(np.arange(length), hertz / rate + bins / length)
-            window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * turns)
-            power = np.log((np.abs((values - values.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
-            # a line over what is beside it: ringing is wider
-            yield f"hum of {hertz:g} Hz", power[:, 0] - power[:, 1:].mean(axis=1)
+    for hertz in _PRIORS.mains:
+        if hertz + _NEIGHBOURS[-1] * rate / (p_A.shape[1] // 2) < _PRIORS.highest * rate:
+            yield f"hum of {hertz:g} Hz", _log_hum(p_A + p_B, hertz / rate)
 
 
-def _of_rows(statistic: Callable[..., Array], values: Array) -> Array:
-    """Compute a statistic of the known values of each row (K, n); NaN for a row without any."""
-    known = np.isfinite(values).any(axis=1)
+def _log_hum(blocks: Array, frequency: float) -> Array:
+    """Compute the log power (K,) of a line in blocks (K, n) relative to neighbouring bins, since ringing is wider.
+
+    Welch's estimate from both halves of each block; `frequency` over the sampling rate.
+    """
+    length = blocks.shape[1] // 2
+    halves = blocks[:, : 2 * length].reshape(-1, 2, length)
+    bins = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])
+    cycles = np.outer(np.arange(length), frequency + bins / length)
+    window = np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles)
+    power = np.log((np.abs((halves - halves.mean(axis=2, keepdims=True)) @ window) ** 2).mean(axis=1))
+    return np.asarray(power[:, 0] - power[:, 1:].mean(axis=1))
+
+
+def _row_statistic(statistic: Callable[..., Array], values: Array) -> Array:
+    """Compute a statistic of each row (K, n) without missing values; NaN for a row without any."""
+    has_values = np.isfinite(values).any(axis=1)
     results = np.full(len(values), np.nan)
-    results[known] = statistic(values[known], axis=1)
+    results[has_values] = statistic(values[has_values], axis=1)
     return results
 
 
-def _test(recording: Recording, values: Array, length: int) -> StepTest | None:
-    """Return the test of a number a block; None where it says nothing."""
+def feature_step_test(time: Array, values: Array) -> StepTest | None:
+    """Test a feature's values (K,) in blocks at times (K,) [s] for a step; None if they are constant or missing."""
     if not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
-    time = recording.t[0] + (np.arange(len(values)) + 0.5) * length / recording.rate
-    wander = priors("inference")["features"]["wander"]
-    return two_sided(Information(time, np.eye(len(values)), values, slope=wander, walk=wander))
+    unit_precision, drift = np.eye(len(values)), _PRIORS.wander
+    return two_sided_step_test(Information(time, unit_precision, values, slope=drift, walk=drift))

@@ -1,40 +1,42 @@
-"""What else the chamber pressures show: friction, load and sensors, by their levels in either direction of motion.
+"""Changes of friction, load and sensors, from the levels of the chamber pressures in either direction of motion.
 
-Of each block four numbers are taken, of what moves: the level of each chamber's pressure, and half of what it differs
-by between the directions. The force of the piston goes with speed, acceleration and position as well, throughout a
-recording alike,
+Four numbers are estimated in each block, during motion: the level of each chamber's pressure, and half its difference
+between the directions. The force of the piston also depends on speed, acceleration and position, in the same way
+throughout a recording,
 
     p_i = level_i + half_i sign(v) + b_i v + c_i dv/dt + d_i x,    i = A, B.
 
-A leak between the chambers moves none of them: the force that the piston needs sets their difference, the oil that is
-enclosed their mean. Another cause moves some of them together, at one instant and in a known pattern: each pattern, a
-subspace of the four, is a hypothesis. With S the covariance of neighbouring blocks' differences, which drifts and walks
-hardly enter, coordinates S^(-1/2) (..) are alike in noise: the steps in the orthonormal directions of a pattern add up,
-F the share by which each makes the residual smaller,
+A leak between the chambers changes none of them: the force that the piston needs determines their difference, the
+enclosed oil their mean. Another cause changes some of them at one instant in a known pattern: each pattern, a subspace
+of the four, is a hypothesis. With S the covariance of the differences of neighbouring blocks, which contain little of
+drifts and walks, the noise of the coordinates S^(-1/2) (..) is white: with F the relative decrease of the residual by
+the step in one direction of an orthonormal basis of m directions, over K = n blocks,
 
     rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log K,    F_j = exp(score_j / n) - 1,
 
-a coefficient more costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
+each further coefficient costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import RANK, Information, two_sided
+from sealscope.diagnosis.inference.onset import RANK_TOLERANCE, Information, two_sided_step_test
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
 
+_PRIORS = CHANGES.levels
 _TINY = float(np.finfo(float).tiny)
 A, B, HALF_A, HALF_B = np.eye(4)
-#: Oil that is lost lowers both levels; what raises them has many causes.
+#: Loss of oil lowers both levels; a rise has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
-#: Name, and rows that span it; where a simpler pattern lies within, once with it first for each.
+#: Name of each pattern, and bases of its subspace: one for each simpler pattern within it, which is the first vectors.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
     ("friction", [[A + B, HALF_A, HALF_B]]),
@@ -47,11 +49,18 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
 )
 
 
-class Level(NamedTuple):
-    """A pattern's test.
+class PressureLevels(NamedTuple):
+    """Estimates in K blocks: `time` (K,) [s] and `values` (K, 4) [Pa], level_A, level_B, half_A and half_B."""
 
-    `rank` among the patterns; twice the logarithm of the likelihood ratio, n log(1 + sum_j F_j), and its chance; the
-    onset and the length of a block [s].
+    time: Array
+    values: Array
+
+
+class LevelChange(NamedTuple):
+    """Test of a step of the pressure levels in one pattern.
+
+    `score`: twice the log likelihood ratio, n log(1 + sum_j F_j), and its `chance`; `rank`: the score less a penalty of
+    log n for each further coefficient, by which patterns are compared; `onset` and length of a `block` [s].
     """
 
     name: str
@@ -62,112 +71,156 @@ class Level(NamedTuple):
     block: float
 
 
-def _motion(recording: Recording) -> Array | None:
-    """Return speed, acceleration and, of a recorded position, position (n, 2 or 3); None where no channel shows them.
+def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
+    """Compute speed, acceleration and, if recorded, position (n, 2 or 3), NaN if missing; None without a channel.
 
-    Each in a unit of its own size, NaN where samples are missing.
+    Speed and acceleration are differences over a fixed time, the position is relative to its mean.
     """
-    name = next((name for name in ("x", "theta", "omega", "u") if name in recording), None)
+    name = next((name for name in ("x", "theta", "omega", "u") if name in channels), None)
     if name is None:
         return None
-    half = max(1, round(HALF_DIFFERENCE * recording.rate))
-    speed = _slope(recording[name], half) if name in ("x", "theta") else recording[name]
-    motion = [speed, _slope(speed, half)]
+    half_length = max(1, round(HALF_DIFFERENCE * rate))  # [samples]
+    speed = _central_difference(channels[name], half_length) if name in ("x", "theta") else channels[name]
+    motion = [speed, _central_difference(speed, half_length)]
     if name == "x":
-        motion.append(recording[name] - np.nanmean(recording[name]))
-    return np.column_stack([column / max(float(np.nanpercentile(np.abs(column), 99.0)), _TINY) for column in motion])
+        motion.append(channels[name] - np.nanmean(channels[name]))
+    return np.column_stack(motion)
 
 
-def _slope(values: Array, half: int) -> Array:
-    padded = np.pad(values, half, mode="edge")
-    return np.asarray(padded[2 * half :] - padded[: -2 * half])
+def motion_scales(motion: Array) -> Array:
+    """Compute the 99 % quantiles (m,) of the magnitudes of speed, acceleration and position of a motion (n, m)."""
+    return np.asarray(np.maximum(np.nanpercentile(np.abs(motion), 99.0, axis=0), _TINY))
 
 
-def levels(recording: Recording) -> tuple[Array, Array] | None:
-    """Return times (K,) and the four numbers (K, 4) of each block; None where the pressures or the motion are missing.
+def top_speed(motion: Array) -> float:
+    """Compute the 99 % quantile of the magnitude of the speed, the first column of a motion (n, m)."""
+    return float(motion_scales(motion[:, :1])[0])
 
-    Least squares of what moves: both numbers of either pressure are free in each block, b, c and d are the recording's.
-    Without a direction the numbers are the means and zero.
+
+def _central_difference(values: Array, half_length: int) -> Array:
+    """Compute the differences (n,) of values over 2 `half_length` samples, centred on each, shorter at the ends."""
+    padded = np.pad(values, half_length, mode="edge")
+    return np.asarray(padded[2 * half_length :] - padded[: -2 * half_length])
+
+
+def estimate_levels(recording: Recording) -> PressureLevels | None:
+    """Estimate in each block the mean of p_A and of p_B, and half their differences between the directions of motion.
+
+    Least squares over the moving samples: the four are free in each block, the slopes b, c and d are common to the
+    recording. Without a recorded motion the levels are means and the halves zero. Return None if a pressure is missing.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
-    pressures = np.column_stack([recording["p_A"], recording["p_B"]])
-    means, motion = pressures.mean(axis=0), _motion(recording)
-    believed = priors("inference.changes")["levels"]
-    if motion is None:
-        motion, moving = np.zeros((len(recording), 0)), np.ones(len(recording))
-        columns = np.column_stack([moving, pressures - means])
-    else:
-        whole = np.asarray(np.isfinite(motion).all(axis=1))
-        motion = np.where(whole[:, None], motion, 0.0)
-        moving = (whole & (np.abs(motion[:, 0]) > believed["slowest"])).astype(float)
-        columns = np.column_stack([np.ones(len(recording)), np.sign(motion[:, 0]), motion, pressures - means])
-    free, size = min(2, columns.shape[1] - 2), columns.shape[1]
-    lengths, cycle = [len(recording) // count for count in believed["blocks"]], find_cycle(recording)
+    means = np.array([recording["p_A"].mean(), recording["p_B"].mean()])
+    rows = pressure_level_rows(recording.channels, recording.rate, means)
+    # the first length of blocks [samples] that suffices, whole cycles if there are any
+    lengths, cycle = [len(recording) // count for count in _PRIORS.blocks], find_cycle(recording)
     if cycle is not None:
-        samples = cycle * recording.rate
-        lengths.insert(0, round(math.ceil(lengths[0] / samples) * samples))
+        cycle_samples = cycle * recording.rate
+        lengths.insert(0, round(math.ceil(lengths[0] / cycle_samples) * cycle_samples))
     for length in lengths:
         count = len(recording) // max(length, 1)
-        if length < 2 or count < believed["blocks"][-1]:
+        if length < 2 or count < _PRIORS.blocks[-1]:
             continue
-        rows = (columns * moving[:, None])[: count * length].reshape(count, length, size)
-        gram = rows.transpose(0, 2, 1) @ rows
-        if free == 2:
-            ways = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
-            if ways.min() < believed["least"] * length:
-                continue
-        solved = np.linalg.solve(gram[:, :free, :free], gram[:, :free, free:])
-        rest = (gram[:, free:, free:] - gram[:, free:, :free] @ solved).sum(axis=0)
-        shared = np.linalg.lstsq(rest[:-2, :-2], rest[:-2, -2:], rcond=None)[0]
-        fitted = solved[:, :, -2:] - solved[:, :, :-2] @ shared
-        values = np.zeros((count, 4))
-        values[:, : 2 * free] = fitted.reshape(count, 2 * free)
-        values[:, :2] += means
-        return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
+        blocks = rows[: count * length].reshape(count, length, rows.shape[1])
+        values = fit_pressure_levels(blocks.transpose(0, 2, 1) @ blocks, length, means)
+        if values is not None:
+            return PressureLevels(recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values)
     return None
 
 
-def level_tests(recording: Recording) -> tuple[Level, ...]:
-    """Return the tests of all patterns, the most likely first."""
-    estimated = levels(recording)
-    if estimated is None:
-        return ()
-    time, values = estimated
-    kept = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
-    change = np.diff(values[:, kept], axis=0)
+def pressure_level_rows(
+    channels: Mapping[str, Array], rate: float, means: Array, max_speed: float | None = None
+) -> Array:
+    """Build the regression rows (n, m) of the samples: 1, sign(v), motion, p_A, p_B; all zero at rest.
+
+    `means` (2,) are subtracted from the pressures. Samples faster than a fixed fraction of `max_speed` count as moving;
+    by default it is the `top_speed` of these samples.
+    """
+    motion = motion_columns(channels, rate)
+    pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
+    if motion is None:
+        return np.column_stack([np.ones(len(pressures)), pressures])
+    is_known = np.asarray(np.isfinite(motion).all(axis=1))
+    motion = np.where(is_known[:, None], motion, 0.0)
+    max_speed = top_speed(motion) if max_speed is None else max_speed
+    is_moving = is_known & (np.abs(motion[:, 0]) > _PRIORS.slowest * max_speed)
+    columns = np.column_stack([np.ones(len(motion)), np.sign(motion[:, 0]), motion, pressures])
+    return np.asarray(columns * is_moving[:, None])
+
+
+def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
+    """Fit level_A, level_B, half_A and half_B (K, 4) to blocks of `length` samples; None if one moves one way only.
+
+    `gram` (K, m, m): products of `pressure_level_rows`; `means` (2,) were subtracted from the pressures.
+    """
+    n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
+    if n_free == 2:
+        samples_each_way = 0.5 * (gram[:, 0, :1] + np.multiply.outer(gram[:, 0, 1], [1.0, -1.0]))
+        if samples_each_way.min() < _PRIORS.least * length:
+            return None
+    free = np.linalg.solve(gram[:, :n_free, :n_free], gram[:, :n_free, n_free:])
+    # eliminate the free coefficients of each block, then fit the motion's slopes to all blocks together
+    reduced = (gram[:, n_free:, n_free:] - gram[:, n_free:, :n_free] @ free).sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], _TINY))[:, None]
+    slopes = np.linalg.lstsq(reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale, rcond=None)[0] / scale
+    values = np.zeros((len(gram), 4))
+    values[:, : 2 * n_free] = (free[:, :, -2:] - free[:, :, :-2] @ slopes).reshape(len(gram), -1)
+    values[:, :2] += means
+    return values
+
+
+def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
+    """Test the pressure levels of a recording for a step of each pattern, the highest rank first."""
+    levels = estimate_levels(recording)
+    return () if levels is None else pattern_tests(*levels)
+
+
+def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
+    """Test `PressureLevels`, times (K,) [s] and values (K, 4), for a step of each pattern, the highest rank first."""
+    whitening = _whitening_matrix(values)
+    mean, sum_of_levels, changes = values.mean(axis=0), values[:, :2].sum(axis=1), list[LevelChange]()
+    # a step of a sensor's scale is proportional to its pressure's level and half difference
+    scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
+    for name, bases in (*PATTERNS, *scales):
+        tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
+        change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
+        if change is None:
+            continue
+        # only a fall of both levels can be a loss of oil
+        after = time > change.onset
+        is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
+        changes.append(change._replace(name=SUPPLY) if name == CHARGE and not is_falling else change)
+    return tuple(sorted(changes, key=lambda change: -change.rank))
+
+
+def _whitening_matrix(values: Array) -> Array:
+    """Compute S^(-1/2) (c, 4) of the module for values (K, 4), c of which vary between blocks."""
+    varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
+    change = np.diff(values[:, varying], axis=0)
     covariance = change.T @ change / len(change)
-    size = np.sqrt(np.diag(covariance))
-    eigen, basis = np.linalg.eigh(covariance / np.outer(size, size))
-    root = np.zeros((len(kept), 4))
-    root[:, kept] = (basis / np.sqrt(np.maximum(eigen, RANK))) @ basis.T / size
-    mean, both, tested = values.mean(axis=0), values[:, :2].sum(axis=1), []
-    scales = (("scale of p_A", A + HALF_A), ("scale of p_B", B + HALF_B))
-    patterns = [*PATTERNS, *((name, [[mean * rows]]) for name, rows in scales)]
-    for name, bases in patterns:
-        tests = [_test(name, np.array(rows) @ root.T, values @ root.T, time) for rows in bases]
-        least = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
-        if least is not None:
-            after = time > least.onset
-            falls = after.any() and not after.all() and both[after].mean() <= both[~after].mean()
-            tested.append(least._replace(name=SUPPLY) if name == CHARGE and not falls else least)
-    return tuple(sorted(tested, key=lambda test: -test.rank))
+    deviations = np.sqrt(np.diag(covariance))
+    eigen, basis = np.linalg.eigh(covariance / np.outer(deviations, deviations))
+    matrix = np.zeros((len(varying), 4))
+    matrix[:, varying] = (basis / np.sqrt(np.maximum(eigen, RANK_TOLERANCE))) @ basis.T / deviations
+    return matrix
 
 
-def _test(name: str, rows: Array, whitened: Array, time: Array) -> Level | None:
-    """Return the test of whitened blocks (K, c) by the steps of `rows` (m, c), the first of them as it is."""
-    basis, size = np.linalg.qr(rows.T)
-    basis = basis[:, np.abs(np.diag(size)) > RANK * np.abs(size).max()]
-    blocks = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
-    tests = [test for component in blocks if (test := two_sided(component)) is not None]
+def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> LevelChange | None:
+    """Test whitened blocks (K, c) for a step in the subspace of `rows` (m, c); None without information."""
+    basis, triangle = np.linalg.qr(rows.T)
+    basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
+    components = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]
+    tests = [test for component in components if (test := two_sided_step_test(component)) is not None]
     if not tests:
         return None
-    half, count = 0.5 * len(time), len(tests)
-    gains = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
-    shares = np.expm1(np.maximum(gains, 0.0) / half).sum(axis=0)
-    best = int(np.argmax(shares))
-    score = 2.0 * half * float(np.log1p(shares[best]))
-    chance = 2.0 * count * min(test.law.chance(score) for test in tests)
-    rank = score - (count - 1) * float(np.log(len(time)))
+    n_blocks, n_directions = len(time), len(tests)
+    # log likelihood ratio of a step in each direction at each onset, then log(1 + sum_j F_j) of the module
+    log_ratios = np.array([test.likelihood - test.likelihood.max() + 0.5 * test.score for test in tests])
+    gains = np.log1p(np.expm1(np.maximum(log_ratios, 0.0) / (0.5 * n_blocks)).sum(axis=0))
+    best = int(np.argmax(gains))
+    score = n_blocks * float(gains[best])
+    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests)
+    rank = score - (n_directions - 1) * float(np.log(n_blocks))
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return Level(name, rank, score, min(1.0, chance), onset, block)
+    return LevelChange(name, rank, score, min(1.0, chance), onset, block)

@@ -1,73 +1,97 @@
-"""Changes that no balance shows, as observables: duty, noise, hum, sense and levels of the pressures.
+"""Observables that no balance contains: duty, noise, hum, sense and levels of the pressures.
 
-A leak moves none of them. Called for each recording, whichever provider measures the leak.
+A leak changes none of them. Called for each recording, whichever provider measures the leak.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from sealscope.diagnosis.inference.changes.features import BLOCKS, ORDER, duty_tests, sensor_tests
-from sealscope.diagnosis.inference.changes.levels import level_tests
+from sealscope.diagnosis.inference.changes.levels import LevelChange, level_tests
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.priors import priors
-from sealscope.recordings.recording import Recording, remembered
+from sealscope.diagnosis.inference.onset import Interval, StepTest
+from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.recordings.recording import Recording, compute_once
 
 SIGNALS = "signals"
 
 
 def observe_signals(recording: Recording) -> Observed:
-    """Test what no balance shows for a step within the recording."""
-    return remembered(recording, (SIGNALS,), _observe)
+    """Test the signals of a recording for steps of quantities that no balance contains."""
+    return compute_once(recording, (SIGNALS,), _test_signals)
 
 
 @np.errstate(all="ignore")
-def _observe(recording: Recording) -> Observed:
-    shortest = priors("inference.changes")["features"]["shortest"]
+def _test_signals(recording: Recording) -> Observed:
+    """Run all tests of the signals."""
+    shortest = CHANGES.features.shortest
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return Observed(SIGNALS, lack="too short for changes of its signals")
+    observables = run_tests(
+        lambda: duty_observables(duty_tests(recording)),
+        lambda: sensor_observables(sensor_tests(recording)),
+        lambda: level_observables(level_tests(recording)),
+    )
+    return Observed(SIGNALS, observables)
+
+
+def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
+    """Collect the observables of tests, without those of a test that fails on values that overflow."""
     observables: list[Observable] = []
-    for test in (_duty, _sensors, _levels):
-        # numbers that cannot be computed with are no machine's
+    for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
-            observables += test(recording)
-    return Observed(SIGNALS, tuple(observables))
+            observables += test()
+    return tuple(observables)
 
 
-def _duty(recording: Recording) -> Iterator[Observable]:
-    """Yield the step of command and motion alike; a leak changes one of them alone."""
-    tests = duty_tests(recording)
-    steps = np.abs([test.fitted[0] for test in tests])
-    if tests and steps.min() > np.tan(np.pi / 8.0) * steps.max():
-        least = min(tests, key=lambda test: test.score)
-        rarest = max(tests, key=lambda test: test.chance)
+#: Minimum ratio of the smaller step to the larger one: 22.5 degrees, half way between one step alone and equal steps.
+_MIN_STEP_RATIO = math.tan(math.pi / 8.0)
+
+
+def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
+    """Yield the step of the duty, if command and motion change by similar ratios; a leak changes only one of them.
+
+    `tests`: of the log amplitudes of command and motion.
+    """
+    steps = np.abs([test.fitted.size for test in tests])
+    if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
+        weakest = min(tests, key=lambda test: test.score)
+        least_certain = max(tests, key=lambda test: test.chance)
         yield Observable(
             name="size of the duty",
             data="duty",
-            score=least.score,
-            chance=min(1.0, 2.0 * rarest.chance),
-            onset=least.onset(),
-            size=least.fitted[0],
+            score=weakest.score,
+            chance=min(1.0, 2.0 * least_certain.chance),
+            onset=weakest.onset(),
+            size=weakest.fitted.size,
         )
 
 
-def _sensors(recording: Recording) -> Iterator[Observable]:
-    for name, test in sensor_tests(recording):
+def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
+    """Convert the named tests of `sensor_tests` to observables; each test is one of a rise and a fall."""
+    for name, test in tests:
         data = name.split()[0]
-        yield Observable.of_test(name, data if data in ("noise", "hum") else "sense", test, looks=2.0)
+        yield Observable.from_test(name, data if data in ("noise", "hum") else "sense", test, n_tests=2.0)
 
 
-def _levels(recording: Recording) -> Iterator[Observable]:
-    """Yield the patterns of the levels; rivals of the likeliest one are rarer by twice what their rank lacks.
+#: Maximum argument of an exponential, whose value fits into a float.
+_MAX_EXPONENT = 700.0
 
-    Ranks hold half the price of a coefficient more, how rare it is to be needed the other half.
+
+def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
+    """Convert changes of the pressure levels, the highest rank first, to observables.
+
+    chance_k = min(1, chance_1 exp(rank_1 - rank_k)), rank = 2 log likelihood ratio - (coefficients - 1) log(blocks).
+    Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the other half, a
+    prior against descriptions that need further coefficients.
     """
-    levels = level_tests(recording)
-    for level in levels:
-        reach = Interval(level.onset, level.onset - level.block, level.onset + level.block)
-        chance = min(1.0, levels[0].chance * float(np.exp(min(levels[0].rank - level.rank, 700.0))))
-        yield Observable(name=level.name, data="levels", score=level.rank, chance=chance, onset=reach)
+    for change in changes:
+        onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
+        deficit = min(changes[0].rank - change.rank, _MAX_EXPONENT)
+        chance = min(1.0, changes[0].chance * float(np.exp(deficit)))
+        yield Observable(name=change.name, data="levels", score=change.rank, chance=chance, onset=onset)

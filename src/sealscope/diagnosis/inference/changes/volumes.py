@@ -1,40 +1,41 @@
 """Steps of the coefficients of a balance's terms, as observables: rival descriptions of the same residual.
 
-Each says that one coefficient stepped once, at an onset that nobody knows; they differ in their term alone, so that
-twice the logarithms of their likelihood ratios compare as they are.
+Each hypothesis is one step of one coefficient, at an unknown onset. They differ only in the term, so that twice their
+log likelihood ratios can be compared directly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
-    Columns,
-    cost_of_zero,
+    ColumnRoles,
+    estimate_offset,
     information,
+    offset_cost,
     solve,
-    total,
-    zero_of,
+    sum_blocks,
 )
-from sealscope.diagnosis.inference.differences import rarity_of_size
+from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
-from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, Equation, Term
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, SPEED_LOSS, Equation, Term
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
 #: Name of the data that these observables describe.
 VOLUMES = "volumes"
 #: A change of the scale of the left side: displacement, angle, speed, or the position behind a valve.
 SCALE = "scale"
-#: What is lost whatever the pressures are, where the flow has no other zero.
+#: A constant loss of flow, if the flow has no sensor offset.
 OUTSIDE = "loss to the outside"
-#: Coefficients that a worn part can only raise: those of leaks.
+#: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
 
@@ -42,108 +43,126 @@ def volume_observables(
     blocks: Blocks,
     plain: Blocks,
     balances: Sequence[Equation],
-    columns: Sequence[Columns],
-    lost: Mapping[str, StepTest],
+    columns: Sequence[ColumnRoles],
+    oil_loss: Mapping[str, StepTest],
+    volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
     """Test every term's coefficient for a step, up or down; leaks only grow.
 
-    Parameters
-    ----------
-    blocks : Blocks
-        About the zero of p_A - p_B that a change of the leak shows: leaks are tested on these.
-    plain : Blocks
-        About the zero as recorded: all other terms are tested on these.
-    balances, columns : sequence of Equation, of Columns
-    lost : mapping of str to StepTest
-        What the accumulator lost, by the name of the external leak's term.
-
-    Returns
-    -------
-    tuple of Observable
-        The largest score first.
+    `blocks`, with the offset of p_A - p_B removed, are for the tests of leaks, `plain` ones, with the pressures as
+    recorded, for all other terms; `oil_loss`: tests of the oil that the accumulator lost, by the name of the external
+    leak's term; `volume_ratio`: measured over assumed ratio of area to displacement. The result with the largest score
+    is the first.
     """
-    centred, recorded = (series.merged(priors("inference")["blocks"]["coarse"]) for series in (blocks, plain))
-    first = columns[0]
-    orifice = first.names.index(ORIFICE)
-    tests: list[tuple[str, Sequence[float], Information, Array | None]] = []
-    for index, term in enumerate(balances[0].terms):
-        if not _is_tested(term, index, first, bool(lost)):
-            continue
-        coarse = centred if term.name in (LEAK, PUMP) else recorded
-        both: Sequence[float] = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
-        tests.append((_name_of(term), both, information(coarse, columns, index), None))
-    leak = information(centred, columns, first.leak)
-    shapes = law_shapes(centred, columns).items()
-    tests += [(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape) for exponent, shape in shapes if exponent < 1.0]
-    scaled = information(_with_scale(recorded, columns, orifice), columns, orifice)
-    tests.append((SCALE, (1.0, -1.0), scaled, None))
-    cost = cost_of_zero(zero_of(blocks, columns))
+    centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
+    leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
     observables = []
-    for name, signs, values, shape in tests:
-        steps = step_tests(values, signs, shape)
+    for hypothesis in _step_hypotheses(centred, recorded, balances[0].terms, columns, has_accumulator=bool(oil_loss)):
+        name, signs, coefficient, shape = hypothesis
+        steps = step_tests(coefficient, signs, shape)
         if not steps:
             continue
         best = max(range(len(steps)), key=lambda k: steps[k].score)
         step = steps[best]
-        advantage = 0.0
         if name.startswith(LEAK) or name == PUMP:
-            advantage = -cost
-        elif name == SCALE:
-            advantage = -rarity_of_size("scale", step.fitted[0])
-        elif name == OUTSIDE:
-            advantage = -rarity_of_size("outside", step.fitted[0], above=True)
-        elif name.startswith("external leak"):
-            stored = lost.get(name.removesuffix(MADE_UP))
-            advantage = 0.0 if stored is None else _agreement(step, stored)
-            flow = step.fitted[0] * _mean_increment(recorded, first, name)
-            advantage -= rarity_of_size("outside", flow, above=True)
+            advantage = -leak_disadvantage
+        else:
+            advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0], volume_ratio)
+        if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
+            advantage += _accumulator_support(step, accumulator_test)
         observables.append(
-            Observable.of_test(name, VOLUMES, step, looks=len(steps), sign=signs[best], advantage=advantage)
+            Observable.from_test(name, VOLUMES, step, n_tests=len(steps), sign=signs[best], advantage=advantage)
         )
     return tuple(sorted(observables, key=lambda observable: -observable.score))
 
 
-def _is_tested(term: Term, index: int, columns: Columns, has_lost: bool) -> bool:
-    """Test whether a term's coefficient is to be tested by itself."""
-    if term.drift == "motion" and index in columns.motion and term.name.startswith("motion"):
+def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, volume_ratio: float) -> float:
+    """Compute -2 log of the prior of a step's size, relative to its maximum, for the term `name`; 0 without a prior."""
+    if name == SCALE:
+        return size_penalty(INFERENCE.scale, size)
+    if name == AIR:
+        return size_penalty(INFERENCE.free_air, size / volume_ratio, above=True)
+    if name == OUTSIDE:
+        return size_penalty(INFERENCE.outside, size, above=True)
+    if name.startswith("external leak"):
+        return size_penalty(INFERENCE.outside, size * _mean_increment(blocks, roles, name), above=True)
+    return 0.0
+
+
+class _Hypothesis(NamedTuple):
+    """A step of one coefficient, up or down by `signs`; `shape` (K,): its size in each block, None if constant."""
+
+    name: str
+    signs: Sequence[float]
+    coefficient: Information
+    shape: Array | None = None
+
+
+def _step_hypotheses(
+    centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
+) -> Iterator[_Hypothesis]:
+    """Yield the steps of each term, of leaks under other laws, and of the motion's scale."""
+    first = columns[0]
+    for index, term in enumerate(terms):
+        if _is_tested(term, first, has_accumulator):
+            blocks = centred if term.name in (LEAK, PUMP) else recorded
+            signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
+            yield _Hypothesis(_observable_name(term), signs, information(blocks, columns, index))
+    leak = information(centred, columns, first.leak)
+    for exponent, shape in law_shapes(centred, columns).items():
+        if exponent < 1.0:
+            yield _Hypothesis(f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape)
+    orifice = first.names.index(ORIFICE)
+    scaled = _with_scale(recorded, columns, orifice)
+    yield _Hypothesis(SCALE, (1.0, -1.0), information(scaled, columns, orifice))
+
+
+def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
+    """Test whether a term's coefficient has a step test of its own."""
+    if term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
-    if term.compared or term.name == ORIFICE:
-        return False  # zero within a recording; by its shape
-    if AIR in columns.names and term.cause == "air in the oil" and term.nuisance:
+    if term.name in (SPEED_LOSS, ORIFICE):
+        return False  # zero within a recording; the orifice is tested by its shape
+    if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
         return False  # free air changes them together
-    return not (has_lost and term.name == BIAS)  # an accumulator's pressure drives what leaves its circuit
+    return not (has_accumulator and term.name == BIAS)  # an accumulator's pressure drives what leaves its circuit
 
 
-def _name_of(term: Term) -> str:
+def _observable_name(term: Term) -> str:
+    """Return the name of the observable of a term: the flow offset is a loss if the flow has no sensor offset."""
     if term.name != BIAS:
         return term.name
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
 
 
-def _mean_increment(blocks: Blocks, columns: Columns, name: str) -> float:
+def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
     """Compute the root mean square of a term's increments over that of time: a mean pressure [Pa]."""
-    if columns.bias is None:
-        return float(np.mean(blocks.driving()))
+    if roles.bias is None:
+        return float(np.mean(blocks.mean_pressure()))
     energy = np.einsum("keii->i", blocks.gram)
-    return float(np.sqrt(energy[columns.names.index(name)] / energy[columns.bias]))
+    return float(np.sqrt(energy[roles.names.index(name)] / energy[roles.bias]))
 
 
-def _agreement(test: StepTest, stored: StepTest) -> float:
-    """Compute twice the log likelihood of what the accumulator lost with a step, over that of none."""
-    nearest = int(np.abs(stored.onsets - test.onsets[test.best]).argmin())
-    lost, expected = np.array([stored.size[nearest], test.fitted[0]]) / stored.deviation[nearest]
-    return float(lost**2 - (lost - expected) ** 2)
+def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
+    """Compute twice the log likelihood ratio of the accumulator's data with an external leak's step against without it.
+
+    `balance_test`: of the step by the balance; `accumulator_test`: by the oil that the accumulator lost.
+    """
+    nearest = int(np.abs(accumulator_test.onsets - balance_test.onsets[balance_test.best]).argmin())
+    sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])
+    measured, expected = sizes / accumulator_test.deviation[nearest]  # in standard errors
+    return float(measured**2 - (measured - expected) ** 2)
 
 
-def _with_scale(blocks: Blocks, columns: Sequence[Columns], index: int) -> Blocks:
-    """Replace one column by the fitted motion: its coefficient is then the motion's scale."""
+def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
+    """Replace the column `index` by the fitted volume of the motion, whose coefficient is the change of its scale."""
     gram = blocks.gram.copy()
-    for e, (column, sums) in enumerate(zip(columns, total(blocks, columns), strict=True)):
-        chosen, motion = list(column.nuisance), list(column.motion)
-        coefficients = np.zeros(len(sums))
-        coefficients[chosen] = solve(sums[np.ix_(chosen, chosen)], sums[chosen, column.left])
-        turn = np.eye(len(sums))
-        turn[:, index] = 0.0
-        turn[motion, index] = coefficients[motion]
-        gram[:, e] = turn.T @ gram[:, e] @ turn
+    for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
+        nuisance, motion = list(roles.nuisance), list(roles.motion)
+        coefficients = np.zeros(len(total))
+        coefficients[nuisance] = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
+        transform = np.eye(len(total))
+        transform[:, index] = 0.0
+        transform[motion, index] = coefficients[motion]
+        gram[:, e] = transform.T @ gram[:, e] @ transform
     return replace(blocks, gram=gram)

@@ -1,16 +1,17 @@
-"""Leakage while valves shut a cylinder from its pump: the two chambers balance each other.
+"""Leakage while valves shut a cylinder from its pump, from the balances of both chambers.
 
-The pump is cut off, so each chamber is a closed volume with leaks. From the begin of a hold on,
+With the pump cut off, each chamber is a closed volume with leaks. From the beginning of a hold on,
 
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
 with the piston's areas m_A and m_B in the unit of the pump's flow, the volumes V of oil, their bulk modulus K and free
-air alpha. I integrates a power of p_A - p_B - z over time, I_A and I_B the pressures. A leaking piston moves oil from A
-to B; a leaking rod seal takes oil from one side alone, and the piston then gives way: a check valve may fill the other
-side. All holds together are one linear regression, each side of a hold about its mean, with the priors of the oil
-(`priors.toml`, `held_oil`) as further readings. The onset of the leak and z, the zero of p_A - p_B, are the likeliest;
-a leak that has made the pressures equal shows z. The three leaks are hypotheses, each weighed by its probability.
+air alpha. I is the time integral of a power of p_A - p_B - z, I_A and I_B those of the pressures. A leaking piston
+moves oil from A to B; a leaking rod seal drains one side only, and the piston gives way while a check valve may fill
+the other side. All holds form one linear regression, each side of a hold about its mean, with the priors of the oil
+(`priors.toml`, `held_oil`) as additional readings. The onset of the leak and the offset z of p_A - p_B are those of
+the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with
+its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -25,30 +26,34 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import cost_of_zero
-from sealscope.diagnosis.priors import priors
-from sealscope.recordings.motion import runs_of
+from sealscope.diagnosis.inference.blocks import offset_cost
+from sealscope.diagnosis.inference.leak_law import mixture_flow
+from sealscope.diagnosis.inference.observable import Flow
+from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
 
-#: First reading of a hold after so many seconds, how much longer the next takes, and fewest readings.
-FIRST, GROWS, FEWEST_READINGS = 0.05, 1.2, 8
-#: Rate that is enough for pressures that valves shut in [Hz].
-FASTEST = 100.0
-#: Zeros that are tried, over what is believed of one [deviations], and how many between the best one's neighbours;
-#: onsets that are tried within a hold.
-CLOSER, ONSETS = 17, 4
-ZEROS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
-#: Signs of a leak's flow in the balances of sides A and B, past the piston and of either side to the outside.
-PISTON, OUTSIDE = (1.0, -1.0), {"A": (1.0, 0.0), "B": (0.0, 1.0)}
-#: Deviation of a leak that no reading tells of.
+#: Length of a hold's first reading [s], ratio of each length to the one before, minimum number of readings.
+FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
+#: Maximum sampling rate [Hz]; enough for pressures in shut chambers.
+MAX_RATE = 100.0
+#: First grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the second.
+OFFSET_GRID = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
+N_REFINED = 17
+#: Number of evenly spaced onsets within a hold.
+N_ONSETS = 4
+#: Standard deviation of a leak without information.
 UNKNOWN = 1e30
-#: Turns of a fit and the change of its variance that ends them; what is added to a matrix.
-TURNS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
+#: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a diagonal.
+MAX_ITERATIONS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
+#: Probability outside of the interval of an onset.
+TAIL = 0.05
 
 
 class CylinderSides(NamedTuple):
-    """A cylinder in the unit of a balance: areas of both sides with the sign of x, and the ends of the stroke [m]."""
+    """Areas of both sides in the unit of a balance's flow, with the sign of x, and the ends of the stroke [m]."""
 
     area_A: float
     area_B: float
@@ -57,7 +62,10 @@ class CylinderSides(NamedTuple):
 
 
 class LockedHold(NamedTuple):
-    """Samples of one hold: time [s], absolute pressures [Pa] and position [m], (n,) each; `edges` of its readings."""
+    """Samples of one hold: time [s], absolute pressures [Pa] and position [m], (n,) each.
+
+    `edges` (k + 1,): indices between which the samples are averaged to k readings.
+    """
 
     t: Array
     p_A: Array
@@ -70,35 +78,85 @@ class LockedHold(NamedTuple):
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
+    def steepest_time(self) -> float:
+        """Return the time [s] from which p_A - p_B changes most while a large leak would equalise the pressures."""
+        n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
+        difference = self.p_A - self.p_B
+        return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
+
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
-    """Find the holds of a recording: rests of the pump (n - 1,), from when valves have shut.
+    """Find the holds of a recording: rests of the pump, from when the valves have shut until before they open.
 
-    `channels`: time, absolute pressures of A and B, and position, (n,) each. A hold that is short, or has missing
-    samples, is left out.
+    `channels`: time, absolute pressures of A and B, and position, (n,) each; `rests` (n - 1,). Holds that are too short
+    for `MIN_READINGS`, or have missing samples, are omitted.
     """
-    believed, holds = priors("inference")["held_oil"], list[LockedHold]()
-    for first, length in runs_of(rests).tolist():
-        begin, end = first + max(1, round(believed["settles"] * rate)), first + length + 1
-        if end - begin < believed["shortest"] * rate:
+    prior, holds = INFERENCE.held_oil, list[LockedHold]()
+    decimation = max(1, int(rate / MAX_RATE))  # samples that are averaged to one
+    # samples to omit at the beginning and at the end, where rests are blurred by their averaging time
+    settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
+    for first, length in find_runs(rests).tolist():
+        begin, end = first + settling, first + length + 1 - opening
+        if length + 1 < prior.shortest * rate:
             continue
-        every = max(1, int(rate / FASTEST))
-        count = (end - begin) // every
+        n_samples = (end - begin) // decimation
         t, p_A, p_B, x = (
-            values[begin : begin + count * every].reshape(count, every).mean(axis=1) for values in channels
+            values[begin : begin + n_samples * decimation].reshape(n_samples, decimation).mean(axis=1)
+            for values in channels
         )
-        edges, width = [0], FIRST * rate / every
-        while edges[-1] + max(round(width), 1) < count:
-            edges.append(edges[-1] + max(round(width), 1))
-            width *= GROWS
-        edges[-1] = count
-        if len(edges) > FEWEST_READINGS and np.isfinite([p_A, p_B, x]).all():
-            holds.append(LockedHold(t, p_A, p_B, x, np.array(edges)))
+        edges = _reading_edges(n_samples, FIRST_READING * rate / decimation)
+        if len(edges) > MIN_READINGS and np.isfinite([p_A, p_B, x]).all():
+            holds.append(LockedHold(t, p_A, p_B, x, edges))
     return holds
 
 
+def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
+    """Return the indices (k + 1,) between k readings that lengthen geometrically from `width` samples."""
+    edges = [0]
+    while edges[-1] + max(round(width), 1) < n_samples:
+        edges.append(edges[-1] + max(round(width), 1))
+        width *= GROWTH
+    return np.array([*edges[:-1], n_samples])  # the last reading takes the rest
+
+
+class UnitLeak(NamedTuple):
+    """A leak of unit coefficient: its `flows` in the samples (n,) of each hold, and their signs in the balances.
+
+    `signs`: of sides A and B; `is_refilled`: at the charge pressure check valves replace the displaced oil.
+    """
+
+    flows: Sequence[Array]
+    signs: tuple[float, float]
+    is_refilled: bool = False
+
+
+class _OilRegression(NamedTuple):
+    """Regression of displaced volumes on the oil's coefficients over r readings.
+
+    `left` (r,): volume displaced by the piston, less the compression expected from the priors; `oil` (r, 4): columns of
+    the coefficients' deviations from their priors, of the compressibility, of the dead volumes of A and B, and of free
+    air; `deviations` (4,): standard deviations of the priors; `inflation`: readings over independent ones;
+    `min_variance` of a reading, as the model describes the compressed volume to within a fraction.
+    """
+
+    left: Array
+    oil: Array
+    deviations: Array
+    inflation: float
+    min_variance: float
+
+
+class _LeakRegression(NamedTuple):
+    """Coefficients (c,) of leaks, their covariances (c, c) by noise and by the oil, and the variance of a reading."""
+
+    coefficients: Array
+    by_noise: Array
+    by_oil: Array
+    variance: float
+
+
 class HeldLeaks(NamedTuple):
-    """Leaks of a recording's holds, past the `piston` and to the outside of A and B, each with its deviation."""
+    """Mean leaks during holds, past the `piston` and from A and B to the outside, each with its standard deviation."""
 
     piston: float
     deviation: float
@@ -108,8 +166,15 @@ class HeldLeaks(NamedTuple):
     deviation_B: float
 
 
-class HeldLevel(NamedTuple):
-    """A leak's coefficient with its deviations, by noise and by the priors of the oil, and its log likelihood."""
+class PistonFit(NamedTuple):
+    """Likeliest `onset` of a leak past the piston [s] and `offset` of p_A - p_B [Pa]."""
+
+    onset: float
+    offset: float
+
+
+class LeakFit(NamedTuple):
+    """Coefficient of a leak: value, standard deviations by noise and by the oil's priors, and log likelihood."""
 
     value: float
     deviation: float
@@ -117,18 +182,20 @@ class HeldLevel(NamedTuple):
     likelihood: float
 
 
+class LeakHypothesis(NamedTuple):
+    """A possible leak: its `probability`, the fraction of the recording after its onset, and its fit."""
+
+    probability: float
+    fraction_after: float
+    fit: LeakFit
+
+
 @dataclass(frozen=True, eq=False)
 class HeldChambers:
     """The chambers of a cylinder in the holds of a recording.
 
-    Parameters
-    ----------
-    holds : sequence of LockedHold
-    sides : CylinderSides
-    begin, end : float
-        Of the recording [s].
-    charge : float
-        Absolute pressure that check valves keep at least [Pa].
+    `begin`, `end`: times of the first and the last sample of the recording [s]; `charge`: absolute pressure that check
+    valves maintain [Pa].
     """
 
     holds: Sequence[LockedHold]
@@ -137,187 +204,254 @@ class HeldChambers:
     end: float
     charge: float
 
+    @property
+    def n_readings(self) -> float:
+        """Effective number of independent readings."""
+        independent: float = INFERENCE.held_oil.independent
+        return independent * 2.0 * len(self.holds)  # on both sides of each hold
+
     @cached_property
-    def readings(self) -> float:
-        """Number of independent readings."""
-        independent: float = priors("inference")["held_oil"]["independent"]
-        return independent * 2.0 * len(self.holds)
+    def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
+        """Regressions without check valves, and with check valves that refill a chamber at the charge pressure."""
+        return self._build_regression(False), self._build_regression(True)
 
-    def _regression(self, feeds: bool) -> tuple[Array, Array, Array]:
-        """Return the left side (r,) of the readings, the columns (r, 4) of the oil, and the widths of its priors.
+    def _build_regression(self, is_refilled: bool) -> _OilRegression:
+        """Build the regression of displaced volumes on the oil's coefficients (`_OilRegression`).
 
-        The left side is the volume displaced by the piston, less the compression expected by the priors. The columns
-        are deviations from these: of the compressibility, of the dead volumes of A and B, and of free air. The rows
-        are the readings of each hold, side A before side B, about their means. `feeds`: at the charge pressure check
-        valves replace the displaced oil.
+        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold.
         """
-        believed, stroke = priors("inference")["held_oil"], self.sides.high - self.sides.low
-        give, dead, air = believed["compressibility"], believed["dead"], believed["air"]
-        targets, columns = [], []
+        prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
+        volumes, columns = [], []
         for hold in self.holds:
-            for side, area, p in ((0, self.sides.area_A, hold.p_A), (1, -self.sides.area_B, hold.p_B)):
-                end = self.sides.low if area > 0.0 else self.sides.high
-                unused = abs(area) * dead * stroke
-                volume = abs(area) * abs(float(hold.x.mean()) - end) + unused
-                oil = np.zeros((len(hold.edges) - 1, 4))
-                oil[:, 0], oil[:, 1 + side] = volume * hold.mean(p), unused * hold.mean(p)
+            for index, area, p in ((0, self.sides.area_A, hold.p_A), (1, -self.sides.area_B, hold.p_B)):
+                stroke_end = self.sides.low if area > 0.0 else self.sides.high  # where the chamber is smallest
+                dead_volume = abs(area) * prior.dead * stroke
+                volume = abs(area) * abs(float(hold.x.mean()) - stroke_end) + dead_volume
+                oil = np.zeros((len(hold.edges) - 1, 4))  # compressibility, dead volumes of A and B, free air
+                oil[:, 0], oil[:, 1 + index] = volume * hold.mean(p), dead_volume * hold.mean(p)
                 oil[:, 3] = -volume * P_ATM * hold.mean(1.0 / p)
                 columns.append(oil - oil.mean(axis=0))
-                steps = -area * np.diff(hold.x, prepend=hold.x[0])
-                targets.append(_centred(hold.mean(np.cumsum(steps * self._closed(p) if feeds else steps))))
-        oil, wide = np.vstack(columns), give * believed["dead_deviation"] / dead
-        width = np.array([give * believed["deviation"], wide, wide, air])
-        return np.concatenate(targets) - oil @ [give, 0.0, 0.0, air], oil, width
+                increments = -area * np.diff(hold.x, prepend=hold.x[0])
+                displaced = hold.mean(np.cumsum(increments * self._is_closed(p) if is_refilled else increments))
+                volumes.append(displaced - displaced.mean())
+        oil, dead_deviation = np.vstack(columns), prior.compressibility * prior.dead_deviation / prior.dead
+        compressed = oil @ [prior.compressibility, 0.0, 0.0, prior.air]
+        min_variance = prior.misfit**2 * float(compressed @ compressed) / len(oil)
+        return _OilRegression(
+            left=np.concatenate(volumes) - compressed,
+            oil=oil,
+            deviations=np.array([prior.compressibility * prior.deviation, dead_deviation, dead_deviation, prior.air]),
+            inflation=max(len(oil) / self.n_readings, 1.0),
+            min_variance=max(min_variance, float(np.finfo(float).tiny)),
+        )
 
-    def _closed(self, p: Array) -> NDArray[np.bool_]:
-        """Flag the samples (n,) of a chamber's pressure above that of the charge: no check valve feeds it."""
-        return np.asarray(p > self.charge * (1.0 + priors("inference")["held_oil"]["charge"]))
+    def _is_closed(self, p: Array) -> NDArray[np.bool_]:
+        """Flag the samples (n,) with a pressure above the charge pressure, where no check valve feeds the chamber."""
+        return np.asarray(p > self.charge * (1.0 + INFERENCE.held_oil.charge))
 
-    def _piston_flows(self, zero: float, exponent: float = 1.0) -> list[Array]:
-        """Return the flow of a leak of one past the piston in the samples (n,) of each hold."""
-        differences = [hold.p_A - hold.p_B - zero for hold in self.holds]
-        return [np.sign(difference) * np.abs(difference) ** exponent for difference in differences]
+    def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
+        """Compute a unit leak past the piston, whose flow is a power of p_A - p_B minus its offset [Pa]."""
+        differences = [hold.p_A - hold.p_B - offset for hold in self.holds]
+        return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
 
-    def _outside_flows(self, side: str) -> list[Array]:
-        """Return the flow of a leak of one from a side to the outside in the samples (n,) of each hold."""
-        pressures = [hold.p_A if side == "A" else hold.p_B for hold in self.holds]
-        return [np.maximum(p - P_ATM, 0.0) * self._closed(p) for p in pressures]
+    def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
+        """Compute a unit leak from A (`is_A`), else from B, to the outside; none while a check valve refills it."""
+        pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
+        flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(p) for p in pressures]
+        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
-    def _fit(self, columns: Sequence[Array], feeds: bool = False) -> tuple[Array, Array, Array, float]:
-        """Fit columns (r,) beside the oil: coefficients, covariances by noise and by the oil, and the variance."""
-        target, oil, width = self._regression(feeds)
-        design, count = np.column_stack([*columns, oil]), len(columns)
+    def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
+        """Fit the coefficients of leak columns (r, c) together with those of the oil.
+
+        The variance of a reading, which weights the oil's priors against the readings, is found by iteration.
+        """
+        left, oil, deviations, inflation, min_variance = self._regressions[is_refilled]
+        design, n_leaks = np.column_stack([columns, oil]), columns.shape[1]
         scale = np.sqrt((design**2).sum(axis=0))
         scale[~(scale > 0.0)] = 1.0
-        inflation = max(len(target) / self.readings, 1.0)
-        free = max(self.readings - count, 1.0)
-        least = self._least(oil)
-        variance = max(float(target @ target) / len(target), least)
-        for _ in range(TURNS):
-            prior = np.concatenate([np.zeros(count), variance * inflation / width**2])
+        degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
+        variance = max(float(left @ left) / len(left), min_variance)
+        for _ in range(MAX_ITERATIONS):
+            prior = np.concatenate([np.zeros(n_leaks), variance * inflation / deviations**2])
             matrix = (design.T @ design + np.diag(prior)) / np.outer(scale, scale)
             matrix.flat[:: len(scale) + 1] += RIDGE
             inverse = np.linalg.inv(matrix) / np.outer(scale, scale)
-            solved = inverse @ (design.T @ target)
-            left = target - design @ solved
-            cost = float(left @ left) + float(prior @ solved**2)
-            before, variance = variance, max(cost / len(target) * self.readings / free, least)
-            if abs(variance - before) <= TOLERANCE * before:
+            solution = inverse @ (design.T @ left)
+            residual = left - design @ solution
+            cost = float(residual @ residual) + float(prior @ solution**2)
+            previous, variance = variance, max(cost / len(left) * self.n_readings / degrees_of_freedom, min_variance)
+            if abs(variance - previous) <= TOLERANCE * previous:
                 break
         covariance = variance * inflation * inverse
-        gain = covariance[:count, count:] @ np.linalg.pinv(covariance[count:, count:])
-        by_oil = gain @ covariance[count:, :count]
-        return solved[:count], covariance[:count, :count] - by_oil, by_oil, variance
+        # part of the leaks' covariance that known coefficients of the oil would remove
+        gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
+        by_oil = gain @ covariance[n_leaks:, :n_leaks]
+        return _LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
 
-    def _least(self, oil: Array) -> float:
-        """Return the least variance of a reading: the terms describe the compressed volume to within a share."""
-        believed = priors("inference")["held_oil"]
-        compressed = oil @ [believed["compressibility"], 0.0, 0.0, believed["air"]]
-        share: float = believed["misfit"]
-        return max(share**2 * float(compressed @ compressed) / len(oil), float(np.finfo(float).tiny))
+    def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
+        """Fit a leak past the piston from `onset` [s] on, by a power of p_A - p_B minus its offset [Pa]."""
+        fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
+        return fit._replace(likelihood=fit.likelihood - 0.5 * offset_cost(offset))
 
-    def level(self, onset: float, zero: float, exponent: float = 1.0) -> HeldLevel:
-        """Fit a leak past the piston from `onset` [s] on, by a power of p_A - p_B about its zero [Pa]."""
-        flows = self._piston_flows(zero, exponent)
-        return self._level(self._leak_columns(flows, PISTON, np.array([onset])), cost_of_zero(zero))
+    def leaks_since(self, onset: float) -> Array | None:
+        """Return `leaks`, (6,), with the piston's leak after an onset [s], not its mean; None if no hold follows it."""
+        fits = self._fits_over_offsets(onset)
+        if not fits:
+            return None
+        leak = _average_fits(fits)
+        return np.array(self.leaks._replace(piston=leak.value, deviation=leak.deviation))
 
-    def outside(self, side: str, onset: float) -> HeldLevel:
-        """Fit a leak of one side to the outside from `onset` [s] on."""
-        flows = self._outside_flows(side)
-        return self._level(self._leak_columns(flows, OUTSIDE[side], np.array([onset])), 0.0, feeds=True)
+    def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
+        """Fit a leak past the piston from `onset` [s] on for each offset of a grid, without fits that have no flow.
 
-    def _level(self, column: Array, cost: float, feeds: bool = False) -> HeldLevel:
-        values, noise, oil, variance = self._fit([*column.T] if column.any() else [], feeds)
+        Under a small pressure difference, or where a leak has equalised the pressures, the offset is undetermined.
+        """
+        fits = [self.fit_piston_leak(onset, float(offset)) for offset in (*self._offset_grid, self.piston_fit.offset)]
+        return [fit for fit in fits if fit.deviation < UNKNOWN]
+
+    def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
+        """Fit a leak from `onset` [s] on, with a coefficient >= 0; its deviation is `UNKNOWN` if nothing would flow."""
+        column = self._leak_columns(leak, np.array([onset]))
+        has_flow = column.any()
+        fit = self._fit(column if has_flow else column[:, :0], leak.is_refilled)
         value, deviation, by_oil = 0.0, UNKNOWN, 0.0
-        if len(values):
-            value, deviation, by_oil = float(values[0]), float(noise[0, 0]) ** 0.5, float(max(oil[0, 0], 0.0)) ** 0.5
-        if value < 0.0:  # nothing flows in, and a leak past the piston goes with the pressure
-            value, variance = 0.0, self._fit([], feeds)[3]
-        return HeldLevel(value, deviation, by_oil, -0.5 * self.readings * float(np.log(variance)) - 0.5 * cost)
+        if has_flow:
+            value, deviation = float(fit.coefficients[0]), float(fit.by_noise[0, 0]) ** 0.5
+            by_oil = float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
+        if value < 0.0:  # a leak flows from the higher to the lower pressure only
+            value, fit = 0.0, self._fit(column[:, :0], leak.is_refilled)
+        return LeakFit(value, deviation, by_oil, -0.5 * self.n_readings * float(np.log(fit.variance)))
 
     @cached_property
     def onsets(self) -> Array:
-        """Onsets that are tried [s]: the begin of the recording, between the holds, and within each."""
+        """Possible onsets [s]: the beginning of the recording, between the holds, and within each.
+
+        A large leak equalises the pressures at once, so that one of them is where p_A - p_B changes most.
+        """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
             onsets += [0.5 * (self.holds[k - 1].t[-1] + hold.t[0])] if k else []
-            onsets += list(np.linspace(hold.t[0], hold.t[-1], ONSETS + 2)[1:-1])
+            evenly_spaced = np.linspace(hold.t[0], hold.t[-1], N_ONSETS + 2)[1:-1]
+            onsets += [*np.sort(np.append(evenly_spaced, hold.steepest_time()))]
         return np.array(onsets)
 
     @cached_property
-    def _priors(self) -> Array:
-        """Logarithm of the prior of each onset: half of all leaks are there from the start."""
-        return np.asarray(np.log(np.append(0.5, np.full(len(self.onsets) - 1, 0.5 / max(len(self.onsets) - 1, 1)))))
+    def _onset_log_priors(self) -> Array:
+        """Log prior of each onset: half of all leaks are there from the start."""
+        n_later = len(self.onsets) - 1
+        return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
 
-    def _leak_columns(self, flows: Sequence[Array], signs: tuple[float, float], onsets: Array) -> Array:
-        """Return the columns (r, o) of a leak since each of the onsets (o,), by its flow in the samples of each hold.
-
-        `signs`: those of its flow in the balances of sides A and B.
-        """
-        parts = []
-        for hold, flow in zip(self.holds, flows, strict=True):
-            steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
-            integral = np.concatenate([[0.0], np.cumsum(steps)])
-            before = np.interp(onsets, hold.t, integral)
-            readings = hold.mean((hold.t >= onsets[:, None]) * (integral - before[:, None])).T
+    def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
+        """Build the regression's columns (r, o): the readings of the volume that has leaked since each onset (o,)."""
+        columns = []
+        for hold, flow in zip(self.holds, leak.flows, strict=True):
+            increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
+            volume = np.concatenate([[0.0], np.cumsum(increments)])
+            volume_before = np.interp(onsets, hold.t, volume)
+            readings = hold.mean((hold.t >= onsets[:, None]) * (volume - volume_before[:, None])).T
             readings -= readings.mean(axis=0)
-            parts += [sign * readings for sign in signs]
-        return np.vstack(parts)
+            columns += [sign * readings for sign in leak.signs]
+        return np.vstack(columns)
 
-    def _scan(self, columns: Array, feeds: bool = False) -> Array:
-        """Return the log-likelihood (o,) of a leak of each column (r, o), at least zero, beside the oil."""
-        target, oil, width = self._regression(feeds)
-        variance = self._fit([], feeds)[3]
-        inflation = max(len(target) / self.readings, 1.0)
-        believed = np.diag(np.sqrt(variance * inflation) / width)
-        basis = np.linalg.qr(np.vstack([oil, believed]) / np.linalg.norm(np.vstack([oil, believed]), axis=0))[0]
-        zeros = np.zeros((len(width), 1 + columns.shape[1]))
-        rest = np.vstack([np.column_stack([target, columns]), zeros])
-        rest -= basis @ (basis.T @ rest)
-        left, rest = rest[:, 0], rest[:, 1:]
-        square, lead = (rest**2).sum(axis=0), np.maximum(left @ rest, 0.0)
-        known = square > RIDGE * max(float(square.max()), np.finfo(float).tiny)
-        gain = np.where(known, lead**2 / np.where(known, square, 1.0), 0.0)
-        least = self._least(oil) * len(target)
-        return np.asarray(-0.5 * self.readings * np.log(np.maximum(float(left @ left) - gain, least)))
+    def _onset_posteriors(self, leak: UnitLeak) -> Array:
+        """Compute the log posterior of each of the `onsets` (o,) of a leak, at least zero, with the oil eliminated.
+
+        It is log prior - N/2 log residual sum of squares, for N independent readings.
+        """
+        left, oil, deviations, inflation, min_variance = self._regressions[leak.is_refilled]
+        design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
+        variance = self._fit(design[:, :0], leak.is_refilled).variance
+        precision = oil.T @ oil + np.diag(variance * inflation / deviations**2)
+        scale = np.sqrt(np.diag(precision))
+        coupling = (oil / scale).T @ design
+        # of the left side (first) and the leak for each onset, without the oil (Schur complement)
+        gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
+        total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
+        is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
+        gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
+        residual_squares = np.maximum(total - gain, min_variance * len(left))
+        return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(residual_squares))
 
     @cached_property
-    def piston(self) -> tuple[float, float]:
-        """Likeliest onset [s] of a leak past the piston, and zero of p_A - p_B [Pa]."""
-        tried = np.unique(np.concatenate([-ZEROS, ZEROS])) * priors("inference")["zero"]["pressure"]
-        best = self._likeliest_zero(tried)
-        between = np.linspace(tried[max(best[1] - 1, 0)], tried[min(best[1] + 1, len(tried) - 1)], CLOSER)
-        onset, place, _ = self._likeliest_zero(between)
-        return float(self.onsets[onset]), float(between[place])
+    def _offset_grid(self) -> Array:
+        """First grid of offsets of p_A - p_B [Pa], with the difference at the end of each hold: a leak equalises it."""
+        ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
+        return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
-    def _likeliest_zero(self, zeros: Array) -> tuple[int, int, float]:
-        """Return the likeliest onset and zero, as indices, with the likelihood."""
-        found = []
-        for place, zero in enumerate(zeros):
-            columns = self._leak_columns(self._piston_flows(float(zero)), PISTON, self.onsets)
-            likelihoods = self._scan(columns) + self._priors - 0.5 * cost_of_zero(float(zero))
-            onset = int(likelihoods.argmax())
-            found.append((onset, place, float(likelihoods[onset])))
-        return max(found, key=lambda candidate: candidate[2])
+    @cached_property
+    def piston_fit(self) -> PistonFit:
+        """Onset of a leak past the piston and offset of p_A - p_B, by a grid search that is refined once."""
+        grid = self._offset_grid
+        best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
+        refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
+        fits = [(*self._find_onset(float(offset)), float(offset)) for offset in (*refined, grid[best])]
+        onset, _, offset = max(fits, key=lambda fit: fit[1])  # of the highest posterior
+        return PistonFit(float(self.onsets[onset]), offset)
+
+    def _find_onset(self, offset: float) -> tuple[int, float]:
+        """Return the index of the likeliest onset of a leak past the piston for an offset, and the log posterior."""
+        posteriors = self._onset_posteriors(self._unit_piston_leak(offset))
+        onset = int(posteriors.argmax())
+        return onset, float(posteriors[onset]) - 0.5 * offset_cost(offset)
+
+    @cached_property
+    def _leak_hypotheses(self) -> list[LeakHypothesis]:
+        """Leaks past the piston, and to the outside from A and from B, each with its probability."""
+        piston_onset, offset = self.piston_fit
+        # each fit with the index of its onset
+        fits = [(self.fit_piston_leak(piston_onset, offset), int(np.abs(self.onsets - piston_onset).argmin()))]
+        for leak in (self._unit_outside_leak(is_A=True), self._unit_outside_leak(is_A=False)):
+            onset = int(self._onset_posteriors(leak).argmax())
+            fits.append((self._fit_leak(leak, float(self.onsets[onset])), onset))
+        log_posteriors = np.array([fit.likelihood + self._onset_log_priors[onset] for fit, onset in fits])
+        probabilities = np.exp(log_posteriors - log_posteriors.max())
+        probabilities /= probabilities.sum()
+        fractions_after = (self.end - self.onsets) / max(self.end - self.begin, np.finfo(float).tiny)
+        return [
+            LeakHypothesis(float(probability), float(fractions_after[onset]), fit)
+            for probability, (fit, onset) in zip(probabilities, fits, strict=True)
+        ]
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Mean leaks past the piston and to the outside, each by the probability that it is the one."""
-        begin, zero = self.piston
-        found = [(self.level(begin, zero), int(np.abs(self.onsets - begin).argmin()))]
-        for side, signs in OUTSIDE.items():
-            columns = self._leak_columns(self._outside_flows(side), signs, self.onsets)
-            onset = int((self._scan(columns, feeds=True) + self._priors).argmax())
-            found.append((self.outside(side, float(self.onsets[onset])), onset))
-        logarithms = np.array([level.likelihood + self._priors[onset] for level, onset in found])
-        shares = np.exp(logarithms - logarithms.max())
-        shares /= shares.sum()
-        numbers = []
-        for share, (level, onset) in zip(shares, found, strict=True):
-            lasts = (self.end - self.onsets[onset]) / max(self.end - self.begin, np.finfo(float).tiny)
-            numbers += [float(share * lasts) * level.value, float(lasts) * level.deviation]
-        return HeldLeaks(*numbers)
+        """Leaks past the piston and to the outside, means over the recording, each weighted by its probability."""
+        values_and_deviations = []
+        for leak in self._leak_hypotheses:
+            mean = leak.fraction_after * leak.fit.value
+            values_and_deviations += [leak.probability * mean, leak.fraction_after * leak.fit.deviation]
+        # the piston's standard deviation includes that by the offset of p_A - p_B
+        fits = [fit._replace(by_oil=0.0) for fit in self._fits_over_offsets(self.piston_fit.onset)]
+        deviation = _average_fits(fits).deviation if fits else UNKNOWN
+        return HeldLeaks(*values_and_deviations)._replace(deviation=self.piston_leak.fraction_after * deviation)
+
+    @property
+    def piston_leak(self) -> LeakHypothesis:
+        """Hypothesis of a leak past the piston."""
+        return self._leak_hypotheses[0]
+
+    @property
+    def probability_after_holds(self) -> float:
+        """Prior probability that a leak begins after the last hold."""
+        after = self.end - float(self.holds[-1].t[-1])
+        # half of all leaks begin within the recording
+        return 0.5 * after / max(self.end - self.begin, np.finfo(float).tiny)
+
+    @cached_property
+    def piston_onset(self) -> Interval | None:
+        """Onset of the leak past the piston [s], with its 95 % interval; None if it may have begun before the holds.
+
+        The interval extends to the neighbouring possible onsets.
+        """
+        posteriors = self._onset_posteriors(self._unit_piston_leak(self.piston_fit.offset))
+        weights = np.exp(posteriors - posteriors.max())
+        first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
+        if first < 2:  # the recording's beginning or the first onset within a hold
+            return None
+        ends = np.append(self.onsets, self.end)
+        return Interval(float(self.onsets[best]), float(ends[first - 1]), float(ends[last + 1]))
 
 
-def _centred(values: Array) -> Array:
-    return np.asarray(values - values.mean())
+def _average_fits(fits: Sequence[LeakFit]) -> Flow:
+    """Average the coefficients of fits by their likelihoods."""
+    values, deviations, by_oil, likelihoods = np.array(fits).T
+    return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))

@@ -1,16 +1,17 @@
 """Balances without position or without flow: over whole cycles of the duty, or while the piston is held.
 
-Test functions that annihilate what repeats take the displacement out of the balance. A box of one cycle, convolved with
-itself, has a double zero at every harmonic of the duty: over it a piston that a loop brings back displaces nothing,
+Test functions that are orthogonal to whatever repeats remove the displacement from the balance. A box of one cycle,
+convolved with itself, has a double zero at every harmonic of the duty: over it a piston that a control loop returns
+displaces nothing,
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 
-so that what the pump delivers is what leaks. While a loop holds the piston at standstill any test function will do.
-Rows that touch a missing sample weigh nothing, nor do rows of a single rod that touch a change of the side that
-carries: the circuit exchanges oil there. Of the mean pressure difference only what zeros of the sensors cannot make
-counts, d - z^2/d beyond z (Breiman's garrote). A loop makes good what leaks; where the pump delivers less than any pump
-loses, none does, and the balance says nothing. Where nothing gives a flow, shut valves hold the piston, and what the
-loaded side loses shows by how it gives way; while a command moves the valve may feed what is lost, and nothing counts.
+so that the pump delivers the leakage, unless it delivers less than any pump leaks: then no loop replaces it, and the
+balance contains no information. While a loop holds the piston at standstill any test function will do. Rows with
+a missing sample have no weight, nor have rows of a single rod in which the loaded side changes: the circuit exchanges
+oil there. Of the mean pressure difference d only the part that sensor offsets up to z cannot cause counts, d - z^2/d
+beyond z (Breiman's garrote). If no channel gives a flow, shut valves hold the piston, and the leakage of the loaded
+side moves it slowly; while a command moves the valve may replace the lost oil, and nothing counts.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -23,163 +24,161 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.balance import LONGEST, commanded, whole_samples
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, Weighting
-from sealscope.diagnosis.inference.circuit.store import cycle_length, lost_oil
-from sealscope.diagnosis.inference.onset import FEWEST, WITHIN_95, StepTest
-from sealscope.diagnosis.inference.rows.distribution import distribution
-from sealscope.diagnosis.inference.terms import (
-    LEAK,
-    LOCKED,
-    ORIFICE,
-    Equation,
-    Signals,
-    circulation,
-    locked,
-)
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.balance import MAX_BLOCK_TIME, READ, derive_drive_signals, samples_without_holes
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
+from sealscope.diagnosis.inference.circuit.store import cycle_length, oil_loss_tests
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, WITHIN_95, StepTest
+from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
+from sealscope.diagnosis.inference.rows.weak_form import Rows
+from sealscope.diagnosis.inference.terms import LEAK, LOCKED, ORIFICE, Equation, Signals, circulation, locked
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_PRIORS = priors("inference")["held"]
-HELD: float = _PRIORS["half"]
-_READ = ("u", "omega", "theta", "q_pump", "x", "p_A", "p_B")
-
-
-class _WideRows(NamedTuple):
-    """Rows of a regression: `time` (r,), `values` (r, c), and whether each counts, `whole` (r,)."""
-
-    time: Array
-    values: Array
-    whole: NDArray[np.bool_]
+_PRIORS = INFERENCE.held
+#: Half-width of the test functions over holds [s].
+HOLD_HALF_WIDTH: float = _PRIORS.half
+_READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
 
 class CycleBalance(NamedTuple):
     """A balance without a position, or without flow, over a recording.
 
-    `lost`: tests of a step of the external leak of either side by the accumulator's own balance, by the term's name.
+    `oil_loss`: step tests of the external leak of either side by the accumulator, by term name.
     """
 
     blocks: Blocks
     equation: Equation
-    columns: Columns
-    lost: Mapping[str, StepTest]
+    columns: ColumnRoles
+    oil_loss: Mapping[str, StepTest]
 
 
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
-    """Return the balances over cycles and over holds of a recording.
+    """Build the balances of a recording over whole cycles and over holds.
 
-    With a position and nothing that gives a flow, over holds by shut valves.
+    With a position but no channel for the flow, over holds by shut valves only. Empty if none is possible.
     """
-    channels = frozenset(recording.channels)
+    channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
     if equation is None:
         return []
-    shut, samples = equation.name == LOCKED, whole_samples(recording, _READ)
-    if not shut:
-        samples = commanded(samples, rig, recording.rate, loaded=True)
-    signals = Signals(samples, recording.rate, {})
-    speed, dp = equation.left(signals) * recording.rate, signals.pressure_difference
-    if not shut and float(np.nansum((dp - np.nanmean(dp)) * speed)) < 0.0:  # friction takes work: wired reversed
-        forward = equation.left
-        equation, speed = equation._replace(left=lambda s: -forward(s)), -speed
-    known = np.isfinite(speed + dp)
-    if not known.any() or not np.ptp(speed[known]) > 0.0:
+    is_locked, samples = equation.name == LOCKED, samples_without_holes(recording, _READ)
+    if not is_locked:
+        samples = derive_drive_signals(samples, rig, recording.rate, loaded=True)
+    signals = Signals(samples, recording.rate)
+    # rate of the left side: of the pump's volume, or of that which a locked piston displaces [m^3/s]
+    flow, dp = equation.left(signals) * recording.rate, signals.pressure_difference
+    # friction dissipates: a negative power means reversed wiring
+    if not is_locked and float(np.nansum((dp - np.nanmean(dp)) * flow)) < 0.0:
+        recorded_left = equation.left
+        equation, flow = equation._replace(left=lambda s: -recorded_left(s)), -flow
+    is_known = np.isfinite(flow + dp)
+    if not is_known.any() or not np.ptp(flow[is_known]) > 0.0:
         return []
-    area = max(rig.cylinder.A_A, rig.cylinder.A_B)
-    counts = known & (signals.step("u") == 0.0) if shut else known
-    still = _find_holds(np.where(counts, speed, np.inf), recording.rate, area if shut else 0.0)
-    begin, balances = float(recording.t[0]), list[CycleBalance]()
-    carries = rig.cylinder.single_rod
-    if shut:
-        blocks = _blocks(signals, equation, HELD, known & still, begin, carries)
-        return [] if blocks is None else [CycleBalance(blocks, equation, Columns(equation), {})]
-    cycle = cycle_length(np.where(known, speed, 0.0), recording.rate)
-    for half, counts in ((cycle, known), (HELD, known & still)):
-        blocks = None if half is None else _blocks(signals, equation, half, counts, begin, carries)
+    single_rod = rig.cylinder.single_rod
+    # a constant command means shut valves; else a control loop may hold the piston at any command
+    may_hold = is_known & (signals.step("u") == 0.0) if is_locked else is_known
+    max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
+    is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, max_creep)
+    cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)
+    balances = []
+    for half_width, is_used in ((cycle, is_known), (HOLD_HALF_WIDTH, is_held)):
+        if half_width is None:
+            continue
+        blocks = _build_blocks(signals, equation, half_width, is_used, begin, one_sided=single_rod)
         if blocks is not None:
-            lost = lost_oil(signals, rig, cycle, begin)
-            balances.append(CycleBalance(blocks, equation, Columns(equation), lost))
+            oil_loss = {} if is_locked else oil_loss_tests(signals, rig, cycle, begin)
+            balances.append(CycleBalance(blocks, equation, ColumnRoles(equation), oil_loss))
     return balances
 
 
-def _find_holds(speed: Array, rate: float, area: float = 0.0) -> NDArray[np.bool_]:
-    """Find the samples in which the piston is held, after it has settled; with an `area`, creep is a standstill."""
-    size, settles = max(1, round(_PRIORS["averaged"] * rate)), max(1, round(_PRIORS["settles"] * rate))
-    slow = np.abs(np.convolve(speed, np.full(size, 1.0 / size), "same"))
-    finite = np.isfinite(slow)
-    limit = max(_PRIORS["slow"] * slow[finite].max(initial=0.0), _PRIORS["creep"] * area)
-    moves = ~finite | (slow > limit)
-    return np.asarray(np.convolve(moves, np.ones(settles))[: speed.size] == 0)
+def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
+    """Flag the samples (n,) in which the piston is held and has settled, by a flow (n,) [m^3/s] that is 0 then.
+
+    The averaged flow must be below a fraction of its largest value, or below `min_limit`. A sample with an infinite
+    flow is not held.
+    """
+    window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
+    mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
+    is_finite = np.isfinite(mean_flow)
+    limit = max(_PRIORS.slow * mean_flow[is_finite].max(initial=0.0), min_limit)
+    is_moving = ~is_finite | (mean_flow > limit)
+    # held if nothing moved in the settling time before
+    return np.asarray(np.convolve(is_moving, np.ones(settling))[: flow.size] == 0)
 
 
-def _blocks(
-    signals: Signals,
-    equation: Equation,
-    half: float,
-    counts: NDArray[np.bool_],
-    begin: float,
-    carries: bool = False,
+def _build_blocks(
+    signals: Signals, equation: Equation, half_width: float, is_used: NDArray[np.bool_], begin: float, one_sided: bool
 ) -> Blocks | None:
-    """Return the blocks of test functions of a half-width [s]; None for fewer than `FEWEST`.
+    """Build the blocks of triangular test functions of a `half_width` [s]; None for fewer than `MIN_BLOCKS`.
 
-    `carries`: rows count where one side carries throughout.
+    `is_used` (n,): samples that may be part of a row; `begin`: time of the first sample [s]; `one_sided`: use only rows
+    in which the same side has the higher pressure throughout.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
-    increments = [*(term.increments(signals) for term in equation.terms), left]
-    rows = _rows(increments, counts, half, rate)
-    _less_the_zero(rows.values, [term.name for term in equation.terms])
-    if carries:
-        side = _rows([signals.carried_by_A[1:] / rate], counts, half, rate).values[:, 0]
-        one_side = np.minimum(side, 1.0 - side) < _PRIORS["elsewhere"]
-        rows = rows._replace(whole=rows.whole & one_side)
-    group = 2 if half > HELD else round(2.0 * LONGEST / half)
-    parts = [slice(k * group, (k + 1) * group) for k in range(len(rows.time) // group)]
-    if sum(bool(rows.whole[part].any()) for part in parts) < FEWEST:
+    rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
+    _shrink_offset(rows.values, [term.name for term in equation.terms])
+    if one_sided:
+        by_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
+        rows = rows._replace(whole=rows.whole & (np.minimum(by_A, 1.0 - by_A) < _PRIORS.elsewhere))
+    # rows of a block: those of one cycle, or of `MAX_BLOCK_TIME`
+    group = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
+    n_blocks = len(rows.time) // group
+    is_whole = rows.whole[: n_blocks * group]
+    n_rows = np.count_nonzero(is_whole.reshape(n_blocks, group), axis=1)
+    if np.count_nonzero(n_rows) < MIN_BLOCKS:
         return None
-    kept = np.array([np.count_nonzero(rows.whole[part]) for part in parts])
-    whole = rows.values[: len(parts) * group][rows.whole[: len(parts) * group]]
-    gram = Weighting((Columns(equation),)).close([whole], np.cumsum(kept))
-    ends = np.array([[rows.time[part][0], rows.time[part][-1]] for part in parts]) + np.array([-0.25, 0.25]) * half
-    measured = [_measured(dp[a:b], left[a:b], rate) for a, b in np.round(ends * rate).astype(int)]
-    flow, pressures = (np.array(values) for values in zip(*measured, strict=True))
+    whole_rows = rows.values[: n_blocks * group][is_whole]
+    gram = Weighting((ColumnRoles(equation),)).compute_gram_matrices([whole_rows], np.cumsum(n_rows))
+    # windows are half a width apart: each stands for a quarter of it on either side of its middle
+    ends = rows.time[: n_blocks * group].reshape(n_blocks, group)[:, [0, -1]] + np.array([-0.25, 0.25]) * half_width
+    samples = [slice(*pair) for pair in np.round(ends * rate).astype(int)]
+    flow = np.array([_mean_flow(left[block], rate) for block in samples])
+    pressures = np.array([sorted_part_means(dp[block], rate) for block in samples])
     start, end = begin + ends.T
-    return Blocks(start, end, gram, kept.astype(float), flow, pressures, np.zeros(len(parts))).merged()
+    return Blocks(start, end, gram, n_rows.astype(float), flow, pressures, np.zeros(n_blocks)).merge()
 
 
-def _rows(increments: list[Array], counts: NDArray[np.bool_], half: float, rate: float) -> _WideRows:
-    """Return the rows of increments, c times (n,), for triangles of a half-width [s], half of it apart.
+def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
+    """Average the increments of c columns, (n,) each, over triangular windows of a `half_width` [s], as mean rates.
 
-    The integral over a triangle is the second difference of the twice integrated increments.
+    Neighbouring windows are half of it apart; a row with samples that are not `is_used` is flagged as not whole. The
+    integral over a triangle is the second difference of the twice integrated increments.
     """
-    length, n = half * rate, len(counts)
-    centres = np.arange(length, n - length, 0.5 * length)
-    places = np.arange(n + 1)
+    half_length, n_samples = half_width * rate, len(is_used)
+    centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
+    indices = np.arange(n_samples + 1)
 
-    def over(values: Array) -> Array:
-        once = np.concatenate([[0.0], np.cumsum(values)])
-        twice = np.concatenate([[0.0], np.cumsum(0.5 * (once[1:] + once[:-1]))])
-        before, middle, after = (np.interp(centres + shift, places, twice) for shift in (-length, 0.0, length))
-        return np.asarray((before - 2.0 * middle + after) / length**2)
+    def integrate(values: Array) -> Array:
+        """Integrate values (n,) over the triangular window about each of the `centres`."""
+        integral = np.concatenate([[0.0], np.cumsum(values)])
+        double_integral = np.concatenate([[0.0], np.cumsum(0.5 * (integral[1:] + integral[:-1]))])
+        before, middle, after = (
+            np.interp(centres + shift, indices, double_integral) for shift in (-half_length, 0.0, half_length)
+        )
+        return np.asarray((before - 2.0 * middle + after) / half_length**2)
 
-    missing = np.concatenate([[0], np.cumsum(~counts)])
-    first, last = (np.clip(centres + shift, 0, n).astype(int) for shift in (-length, length + 1.0))
-    values = np.column_stack([over(np.where(counts, increment, 0.0)) * rate for increment in increments])
-    return _WideRows(centres / rate, values, missing[last] == missing[first])
+    n_unused = np.concatenate([[0], np.cumsum(~is_used)])
+    first, last = (np.clip(centres + shift, 0, n_samples).astype(int) for shift in (-half_length, half_length + 1.0))
+    values = np.column_stack([integrate(np.where(is_used, increment, 0.0)) * rate for increment in increments])
+    return Rows(centres / rate, values, n_unused[last] == n_unused[first])
 
 
-def _less_the_zero(values: Array, names: list[str]) -> None:
-    """Take from the mean pressure difference of each row what zeros of the sensors may have made."""
-    zero = WITHIN_95 * priors("inference")["zero"]["pressure"]
-    mean = values[:, names.index(LEAK)]
-    share = np.maximum(1.0 - (zero / np.maximum(np.abs(mean), zero)) ** 2, 0.0)
+def _shrink_offset(values: Array, names: list[str]) -> None:
+    """Shrink the leak columns of rows (r, c) in place by the part that sensor offsets may cause (Breiman's garrote).
+
+    `names` of the columns. The mean pressure difference d of a row becomes d - z^2/d, or 0 below the largest offset z.
+    """
+    max_offset = WITHIN_95 * INFERENCE.zero.pressure
+    mean_pressure = values[:, names.index(LEAK)]
+    fraction = np.maximum(1.0 - (max_offset / np.maximum(np.abs(mean_pressure), max_offset)) ** 2, 0.0)
     for name in (LEAK, ORIFICE):
-        values[:, names.index(name)] *= share
+        values[:, names.index(name)] *= fraction
 
 
-def _measured(dp: Array, left: Array, rate: float) -> tuple[float, Array]:
-    """Return `Blocks.flow` and `Blocks.pressures` of a block's samples."""
-    flow = left[np.isfinite(left)]
-    return float(np.abs(flow).mean()) * rate if flow.size else 0.0, distribution(dp, rate)
+def _mean_flow(increments: Array, rate: float) -> float:
+    """Compute the mean absolute flow [m^3/s] from the known increments of a volume; 0 if all are missing."""
+    known = increments[np.isfinite(increments)]
+    return float(np.abs(known).mean()) * rate if known.size else 0.0

@@ -1,18 +1,20 @@
-"""Leakage from both chamber pressures and the command, without a position: the whole response, as observables."""
+"""Leakage from both chamber pressures and the command: the parameters of the response, as observables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import step_tests
+from sealscope.diagnosis.inference.onset import Information, step_tests
 from sealscope.diagnosis.inference.pressures import response
-from sealscope.diagnosis.inference.pressures.evidence import PressureEvidence, unusable
 from sealscope.diagnosis.inference.pressures.leak import ResponseLeak
-from sealscope.diagnosis.learnt import Healthy, Lesson, lessons_of
+from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -25,46 +27,48 @@ RESPONSE = "response"
 class PressureResponse:
     """Leakage from both chamber pressures and the command, by how p_A - p_B responds to the command."""
 
-    name = "pressure response"
+    name = PRESSURE_RESPONSE
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None where the recording has what the response needs, else the reason why not."""
-        return unusable(recording, self.rig)
+        """Return None if the recording has what the response needs, else the reason why not."""
+        return find_unmet_requirement(recording, self.rig)
 
-    def reading(self, recording: Recording) -> PressureEvidence | None:
-        """Estimate the conductance in a recording; None where the recording says nothing of it."""
-        return response.evidence(recording, self.rig)
+    def reading(self, recording: Recording) -> ResponseLeak | None:
+        """Estimate the conductance in a recording; None if it has no information."""
+        return response.measure_leak(recording, self.rig)
 
-    def learn(self, recording: Recording) -> Lesson | None:
-        """Return the lesson of a healthy recording: the level of the conductance."""
-        reading = self.reading(recording)
-        return None if reading is None else {"level": reading.level[0]}
+    def learn(self, recording: Recording) -> Summary | None:
+        """Return the level of the conductance of a healthy recording; None if it has no information."""
+        leak = self.reading(recording)
+        return None if leak is None else {"level": leak.level[0]}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Return the steps of the response's parameters, and the leak against healthy recordings."""
-        reading = self.reading(recording)
-        if reading is None:
+        """Test the response's parameters for steps, and compare the leak with healthy recordings."""
+        leak = self.reading(recording)
+        if leak is None:
             return Observed(self.name, lack="no response to the command that a pump-driven piston would give")
-        levels = [lesson["level"] for lesson in lessons_of(self, baseline)]
-        share = 1.0 if recording.bridged is None else float(np.mean(~recording.bridged))
-        leak = ResponseLeak(self.name, reading, levels)
+        leak = replace(leak, healthy=[summary["level"] for summary in healthy_summaries(self, baseline)])
         if leak.step is None and leak.rise is None:
             return Observed(self.name, lack="too little moves: no leak would show")
-        return Observed(self.name, response_observables(reading), leak, share=share)
+        is_known = np.ones(len(recording), bool) if recording.bridged is None else ~recording.bridged
+        judged_until = (np.flatnonzero(is_known)[-1] + 1.0) / len(is_known) if is_known.any() else 0.0
+        observables = score_response_steps(leak.parameters)
+        return Observed(self.name, observables, leak, share=float(is_known.mean()), judged_until=float(judged_until))
 
 
-def response_observables(reading: PressureEvidence) -> tuple[Observable, ...]:
-    """Test the response's parameters for a step, up or down; the conductance only grows."""
-    if reading.test is None:
-        return ()
-    observables = [Observable.of_test("G", RESPONSE, reading.test)]
-    for name, information in reading.others.items():
-        steps = step_tests(information, (1.0, -1.0))
-        if steps:
-            best = max(range(len(steps)), key=lambda k: steps[k].score)
-            sign = (1.0, -1.0)[best]
-            observables.append(Observable.of_test(name, RESPONSE, steps[best], looks=2.0, sign=sign))
+def score_response_steps(information: Mapping[str, Information]) -> tuple[Observable, ...]:
+    """Test the response's parameters, by name, for a step up or down; the highest score comes first.
+
+    A step of the conductance G is tested upwards only, as leaks do not heal.
+    """
+    observables = []
+    for name, likelihood in information.items():
+        signs = (1.0,) if name == "G" else (1.0, -1.0)
+        tests = step_tests(likelihood, signs)
+        if tests:
+            test, sign = max(zip(tests, signs, strict=True), key=lambda pair: pair[0].score)
+            observables.append(Observable.from_test(name, RESPONSE, test, n_tests=float(len(signs)), sign=sign))
     return tuple(sorted(observables, key=lambda observable: -observable.score))

@@ -1,40 +1,44 @@
-"""Parameters that wander from block to block: Gauss-Newton steps to the likeliest, and all blocks together.
+"""Fit of parameters that wander from block to block: all blocks of a recording together.
 
-With y(theta) what a model gives and theta_k the parameters of block k, each block is linear about its own theta_k^0,
+With y(theta) the output of a model and theta_k the parameters of block k, each block is linear about its theta_k^0,
 
     y_k(theta_k) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
-and keeps sums only. What is left is Gaussian in all theta_k together (`Joint`), so that what the blocks say of one
-parameter, all others eliminated, is a block of its inverse. Units are shares of what is believed of the parameters.
+and stores sums only. Their likelihood is Gaussian in all theta_k together (`Joint`), so that the covariance of one
+parameter in all blocks, all others eliminated, is a block of its inverse. Units are fractions of the priors' widths.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.priors import priors as believed_of
+from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.recordings.recording import Array
 
-#: Differences as a share of what is believed; most steps of a fit, shares of one that are tried, and the gain of twice
-#: the log likelihood that is worth a run.
-_NUDGE, STEPS, _SHARES, _ENOUGH = 0.05, 12, np.array([1.0, *np.geomspace(0.5, 0.02, 4)]), 5.0
+#: Step of numerical differences over the width of a parameter's prior.
+_DIFFERENCE = 0.05
 
 
 class Normal(NamedTuple):
-    """Normal prior on the parameters: mean (p,) and precision (p, p) in units."""
+    """Normal prior on the parameters: `mean` (p,), and `precision` (p, p) in units of `unit` (p,)."""
 
     mean: Array
     precision: Array
+    unit: Array
+
+    def deviations(self, theta: Array) -> Array:
+        """Compute the differences of parameters (..., p) from the mean, in units."""
+        return (theta - self.mean) / self.unit
 
 
 class Priors(NamedTuple):
-    """Prior on the parameters (p,): centre and `width` of their mean, and how far they `wander` in 90 s."""
+    """Prior on parameters (p,): `centre` and `width` of their mean, deviation `wander` of a random walk in 90 s."""
 
     centre: Array
     width: Array
@@ -43,88 +47,48 @@ class Priors(NamedTuple):
     @property
     def unit(self) -> Array:
         """Units of the parameters, small enough for differences."""
-        return np.asarray(_NUDGE * np.minimum(self.width, self.wander))
+        return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
     def normal(self) -> Normal:
         """Prior on a machine before its first block."""
-        return Normal(self.centre, np.diag((self.unit / self.width) ** 2))
+        return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)
 
-    def spread(self, seconds: float) -> Array:
-        """Return the variances (p,), in units, that wandering adds in so many seconds."""
-        time = believed_of("inference.pressures")["blocks"]["wander"]
-        return np.asarray((self.wander / self.unit) ** 2 * (seconds / time))
+    @property
+    def variance(self) -> Array:
+        """Variances (p,) of the mean, in units."""
+        return np.asarray((self.width / self.unit) ** 2)
+
+    def wander_variance(self, seconds: float) -> Array:
+        """Return the variances (p,), in units, that the parameters' random walks add in a time [s]."""
+        return np.asarray((self.wander / self.unit) ** 2 * (seconds / PRESSURE.blocks.wander))
 
 
-class Look(NamedTuple):
-    """A model about parameters `theta` (p,): `gram` (1 + p, 1 + p) of its residual [Pa] and Jacobian [Pa per unit].
+class Linearisation(NamedTuple):
+    """Model about parameters `theta` (p,).
 
-    Of a simulation also these themselves, `rows` (1 + p, n), and the states at the end.
+    `rows` (1 + p, n): its residual [Pa] and Jacobian [Pa per unit], and `gram` (1 + p, 1 + p) of these; `ends`: states
+    at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter sets, that of `theta`
+    first.
     """
 
     theta: Array
     gram: Array
-    rows: Array = np.empty(0)
-    ends: Array = np.empty(0)
+    rows: Array
+    ends: Array
+    squares: Array
 
-    def cost(self, variance: float, prior: Normal, unit: Array) -> float:
-        """Return minus twice the logarithm of the posterior, beside a noise's variance [Pa^2]."""
-        off = (self.theta - prior.mean) / unit
-        return float(self.gram[0, 0] / variance + off @ prior.precision @ off)
-
-
-class Model(Protocol):
-    """Model to be fitted; `unit` (p,) of its parameters."""
-
-    @property
-    def unit(self) -> Array: ...  # noqa: D102
-
-    def look(self, paths: Array) -> tuple[Look, Array]:
-        """Return the look about the first of some sets (m, p), and the squares [Pa^2] that each leaves, (m,)."""
-        ...
-
-    def bounds(self, theta: Array) -> tuple[Array, Array]:
-        """Return between which parameters a step from `theta` may lead."""
-        ...
-
-    def spread(self, squares: float) -> float:
-        """Return the variance of the noise [Pa^2] where so much is left."""
-        ...
-
-
-def descend(model: Model, look: Look, prior: Normal, steps: int, variance: float | None = None) -> Look:
-    """Return the look about likelier parameters; their noise's variance [Pa^2] is fitted where it is not given.
-
-    A whole step is run with its Jacobian, beside shares of it; where none of them gains, it is damped. A step is not
-    made where it would gain less than is worth a run.
-    """
-    unit, damping = model.unit, 0.0
-    for _ in range(steps):
-        noise = variance or model.spread(float(look.gram[0, 0]))
-        H = look.gram[1:, 1:] / noise + prior.precision
-        rise = look.gram[0, 1:] / noise - prior.precision @ ((look.theta - prior.mean) / unit)
-        move = np.linalg.solve(H + damping * np.diag(np.diag(H)), rise)
-        if not float(rise @ move) >= _ENOUGH:
-            break
-        paths = np.clip(look.theta + _SHARES[:, None] * move * unit, *model.bounds(look.theta))
-        whole, squares = model.look(paths)
-        off = (paths - prior.mean) / unit
-        costs = squares / noise + np.sum(off @ prior.precision * off, axis=1)
-        gains = np.nan_to_num(look.cost(noise, prior, unit) - costs, nan=-np.inf)
-        best = int(np.argmax(gains))
-        if not gains[best] > 0.0:
-            damping = max(10.0 * damping, 0.1)
-            continue
-        damping = 0.1 * damping if damping > 1e-3 else 0.0
-        look = whole if best == 0 else model.look(paths[best : best + 1])[0]
-    return look
+    def cost(self, variance: float, prior: Normal) -> float:
+        """Compute -2 log posterior, for a noise variance [Pa^2]."""
+        deviations = prior.deviations(self.theta)
+        return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
 
 
 class Block(NamedTuple):
-    """A block's sums about its own parameters `theta` (p,).
+    """Sums of a block about its parameters `theta` (p,).
 
-    `gram` (1 + p, 1 + p) of residual and Jacobian over so many `samples`; `scores` (s, 1 + p): in each of s pieces the
-    products of the column of the parameter in question with them, which show how far the residual is from white.
+    `gram` (1 + p, 1 + p) of residual and Jacobian over `samples`; `scores` (s, 1 + p): products with the tested
+    parameter's column in each of s pieces, which contain the autocorrelation of the residual.
     """
 
     theta: Array
@@ -135,64 +99,74 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """All K blocks of a recording together: deviations' `mean` (K p,) and `covariance` (K p, K p) about `theta` (K, p).
+    """Joint fit of all K blocks of a recording.
 
-    In units, a block's after another's; `strain` (K p, K p): precision of what is believed of them; `variance` of the
-    residual [Pa^2].
+    Deviations from `theta` (K, p), in units, block after block: `mean` (K p,), `covariance` and `prior_precision` (K p,
+    K p); `variance` of the residual [Pa^2].
     """
 
     priors: Priors
     theta: Array
     mean: Array
     covariance: Array
-    strain: Array
+    prior_precision: Array
     variance: float
 
     @staticmethod
-    def fit(blocks: Sequence[Block], priors: Priors, seconds: float, parameter: int) -> Joint:
-        """Fit blocks of so many seconds jointly; the noise has its long-run variance in the score of `parameter`."""
+    def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
+        """Fit blocks of `block_s` [s] jointly; the scores of `parameter` give the long-run variance of the noise."""
         theta = np.array([block.theta for block in blocks])
-        strain = _strain(len(blocks), priors, seconds)
-        pull = strain @ ((theta - priors.centre) / priors.unit).ravel()
-        normal = block_diag(*(block.gram[1:, 1:] for block in blocks))
-        vector = np.concatenate([block.gram[0, 1:] for block in blocks])
-        white, inflation = _noise(blocks, np.zeros(theta.size), parameter)[0], 1.0
+        prior_precision = _prior_precision(len(blocks), priors, block_s)
+        prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
+        gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
+        gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
+        variance, inflation = _estimate_noise(blocks, np.zeros(theta.size), parameter)[0], 1.0  # white at first
         for _ in range(2):  # the noise's variance is one of the unknowns
-            factor = cho_factor(normal / (white * inflation) + strain, check_finite=False)
-            mean = cho_solve(factor, vector / (white * inflation) - pull, check_finite=False)
-            white, inflation = _noise(blocks, mean, parameter)
+            factor = cho_factor(gram / (variance * inflation) + prior_precision, check_finite=False)
+            mean = cho_solve(factor, gradient / (variance * inflation) - prior_gradient, check_finite=False)
+            variance, inflation = _estimate_noise(blocks, mean, parameter)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
-        return Joint(priors, theta, mean, covariance, strain, white)
+        return Joint(priors, theta, mean, covariance, prior_precision, variance)
 
-    def information(self, parameter: int, time: Array, reach: float) -> Information:
-        """Compute the likelihood of a parameter in the blocks at `time` (K,) [s], all others eliminated.
+    def information(self, parameter: int, time: Array, wander: float) -> Information:
+        """Compute the likelihood of a parameter in the blocks at `time` (K,) [s], with all others eliminated.
 
-        What is believed of the parameter itself, which guided the fit, is taken out; that it wanders evenly or as a
-        random walk, by `reach` over all blocks, is stated beside.
+        The fit's prior on this parameter is removed. In its place the result has the prior standard deviation `wander`
+        of a slope and of a random walk, each over all blocks.
         """
-        places = slice(parameter, None, self.theta.shape[1])
-        inverse = np.linalg.inv(self.covariance[places, places])
-        believed, unit = self.strain[places, places], self.priors.unit[parameter]
-        value, precision = self.theta[:, parameter] / unit, inverse - believed
-        off = value - self.priors.centre[parameter] / unit
-        vector = inverse @ self.mean[places] + believed @ off + precision @ value
+        indices = slice(parameter, None, self.theta.shape[1])
+        # precision with the prior, of deviations from theta
+        posterior = np.linalg.inv(self.covariance[indices, indices])
+        prior, unit = self.prior_precision[indices, indices], self.priors.unit[parameter]
+        # likelihood = posterior - prior, and from deviations to the parameter itself
+        value, precision = self.theta[:, parameter] / unit, posterior - prior
+        prior_gradient = prior @ (value - self.priors.centre[parameter] / unit)
+        vector = posterior @ self.mean[indices] + prior_gradient + precision @ value
         precision = 0.5 * (precision + precision.T) / unit**2
-        return Information(time, precision, vector / unit, slope=reach, walk=reach)
+        return Information(time, precision, vector / unit, slope=wander, walk=wander)
 
 
-def _strain(count: int, priors: Priors, seconds: float) -> Array:
-    """Return the precision (K p, K p), in units, of what is believed of the parameters of K blocks."""
-    steps = np.diff(np.eye(count), axis=0)
-    walk = np.kron(steps.T @ steps, np.diag(1.0 / priors.spread(seconds)))
-    return np.asarray(walk + np.kron(np.full((count, count), 1.0 / count**2), priors.normal.precision))
+def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
+    """Compute the prior precision (K p, K p), in units, of the parameters of K blocks of `block_s` [s].
+
+    Each parameter is a random walk from block to block, and its mean over the blocks has the prior of the machine.
+    """
+    steps = np.diff(np.eye(n_blocks), axis=0)
+    walks = np.kron(steps.T @ steps, np.diag(1.0 / priors.wander_variance(block_s)))
+    mean_weights = np.full((n_blocks, n_blocks), 1.0 / n_blocks**2)
+    return np.asarray(walks + np.kron(mean_weights, priors.normal.precision))
 
 
-def _noise(blocks: Sequence[Block], off: Array, parameter: int) -> tuple[float, float]:
-    """Return the variance [Pa^2] left at deviations (P,), and the long-run variance of the scores over it."""
-    moved = [np.append(1.0, -deviation) for deviation in off.reshape(len(blocks), -1)]
-    pairs = list(zip(blocks, moved, strict=True))
+def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
+    """Compute the residual variance [Pa^2] at `deviations` (K p,), and its inflation by correlation of the noise.
+
+    The inflation is the variance of the scores of one `parameter`, relative to that under white noise, at least 1.
+    """
+    # (1, -deviation) times residual and Jacobian is the residual at these deviations
+    directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]
+    pairs = list(zip(blocks, directions, strict=True))
     squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
     variance = max(squares, 1.0) / sum(block.samples for block in blocks)
     scores = np.concatenate([block.scores @ direction for block, direction in pairs])
-    expected = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
-    return variance, max(1.0, float(scores @ scores) / max(expected, np.finfo(float).tiny))
+    white_variance = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
+    return variance, max(1.0, float(scores @ scores) / max(white_variance, np.finfo(float).tiny))

@@ -1,133 +1,168 @@
-"""The leak as the response of the pressures measures it: changes of the conductance, whose level states no flow."""
+"""Leakage measured by the response of the pressures: changes of the conductance, whose level gives no flow."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.observable import Flow, Remark
-from sealscope.diagnosis.inference.onset import WITHIN_95, Interval, StepTest, course
-from sealscope.diagnosis.inference.pressures.evidence import PRIORS, PressureEvidence, flow_scale
-from sealscope.diagnosis.inference.scatter import Rise, student
-from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
+from sealscope.diagnosis.inference.onset import WITHIN_95, Information, Interval, StepTest, fit_history, step_test
+from sealscope.diagnosis.inference.scatter import Rise, student_rise
+from sealscope.diagnosis.priors.pressures import PRESSURE
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Mean flow of an orifice over that of a laminar leak of the same fitted conductance.
+ORIFICE_RATIO: float = PRESSURE.conductance.orifice
+
+
+def conductance_scale_error() -> float:
+    """Compute the relative standard deviation of the scale of all conductances.
+
+    The response determines G M/A^2, so that errors of the stated mass M and piston area A scale G.
+    """
+    return math.hypot(PRESSURE.scale.mass, 2.0 * PRESSURE.scale.area)
+
+
+def states_flow(rig: Rig) -> bool:
+    """Test whether a rig states the sizes to convert a conductance into L/min."""
+    return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseLeak:
     """The leakage of a recording by the response of its pressures (`observable.LeakMeasure`).
 
-    Parameters
-    ----------
-    provider : str
-        Name of the detector.
-    reading : PressureEvidence
-    levels : sequence of float
-        Conductance of healthy recordings of the machine [m^3/(s Pa)].
+    `parameters`: likelihood of each parameter of the response in K blocks, all others eliminated, "G" the conductance
+    past the piston [m^3/(s Pa)]; `pressure` (K,): mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean absolute flow of the
+    pump [m^3/s], also as that while it delivers; `stated`: the rig states the sizes that convert a conductance to
+    L/min; `healthy`: conductance of healthy recordings of the machine [m^3/(s Pa)].
     """
 
-    provider: str
-    reading: PressureEvidence
-    levels: Sequence[float] = ()
+    parameters: Mapping[str, Information]
+    pressure: Array
+    pump_flow: tuple[float, float]
+    stated: bool
+    healthy: Sequence[float] = ()
 
-    #: Without a position what leaves the circuit shows alike.
+    provider: str = PRESSURE_RESPONSE
+    #: Without a position, external leakage has the same effect.
     cause: Cause = "leak inside or outside"
+    size_deviation: float = conductance_scale_error()
+    flow_factors: tuple[float, float] = (1.0, 1.0)
     ratio: Interval | None = None
     remarks: Sequence[Remark] = ()
     excess: float | None = None
-    #: Levels of the conductance lean on the friction: they state no flow.
+    #: The level of the conductance depends on the assumed friction, so that it gives no flow.
     rise_flow: Flow | None = None
+    rise_onset: Interval | None = None
 
     @property
+    def information(self) -> Information:
+        """Likelihood of the conductance in the blocks."""
+        return self.parameters["G"]
+
+    @property
+    def level(self) -> tuple[float, float]:
+        """Mean conductance over the recording and its standard error [m^3/(s Pa)]."""
+        precision = max(float(self.information.precision.sum()), np.finfo(float).tiny)
+        return float(self.information.vector.sum()) / precision, precision**-0.5
+
+    @cached_property
     def step(self) -> StepTest | None:
         """Test of a step of the conductance."""
-        return self.reading.test
+        return step_test(self.information)
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of the step while it lasts, of a law between that of a worn seal and of an orifice."""
-        reading, test = self.reading, self.reading.test
-        if test is None:
+        """Mean flow of the step after its onset, midway between the laws of a worn seal and of an orifice."""
+        if self.step is None:
             return Flow(0.0, np.inf)
-        pressure, (size, deviation) = float(reading.pressure.mean()), test.fitted
-        middle, half = 0.5 * (reading.orifice + 1.0), 0.5 * (reading.orifice - 1.0)
-        by_law = half * abs(size) / WITHIN_95
-        return Flow(middle * size * pressure, float(np.hypot(middle * deviation, by_law)) * pressure)
+        size, deviation = self.step.fitted
+        mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
+        by_law = half_range * abs(size) / WITHIN_95  # the laws are the ends of a 95 % interval
+        unit = self.flow_per_conductance
+        return Flow(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, by_law)) * unit)
 
     @property
-    def step_driving(self) -> float:
+    def flow_per_conductance(self) -> float:
         """Mean flow [m^3/s] of a conductance of one, at the recording's pressures."""
-        return float(self.reading.pressure.mean())
+        return float(self.pressure.mean())
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the level of the conductance beyond the healthy recordings, None without any."""
-        levels, count = self.levels, len(self.levels)
+        """Rise of the mean conductance beyond the healthy recordings; None without any."""
+        healthy, count = self.healthy, len(self.healthy)
         if not count:
             return None
-        total = sum(levels)
-        differences = [level - (total - level) / (count - 1) for level in levels] if count > 1 else [0.0]
-        return student(self.reading.level[0] - total / count, differences, PRIORS["conductance"]["level"])
+        total = sum(healthy)
+        # of each healthy recording from the mean of the others: their scatter is that of a new recording
+        differences = [level - (total - level) / (count - 1) for level in healthy] if count > 1 else [0.0]
+        return student_rise(self.level[0] - total / count, differences, PRESSURE.conductance.level)
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the leak's mean flow [m^3/s]."""
+        """95 % upper bound of the mean flow [m^3/s] of a leak through an orifice: of its rise, else of a step."""
         test = self.step if self.rise is None else self.rise
         if test is None:
             return np.inf
-        unit = self.reading.orifice * float(self.reading.pressure.mean())
-        return test.bound() * unit * (1.0 + WITHIN_95 * flow_scale())
+        max_scale = 1.0 + WITHIN_95 * conductance_scale_error()
+        return test.bound() * ORIFICE_RATIO * self.flow_per_conductance * max_scale
 
     @property
-    def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s], twice."""
-        return self.reading.pump, self.reading.pump
+    def step_rise(self) -> LeakRise | None:
+        """Leak above that of the healthy recordings, with the log likelihood ratio of the part that the step explains.
 
-    @property
-    def share_after(self) -> float:
-        """Share of what the recording tells of its mean conductance that lies after the step's onset."""
-        if self.step is None:
-            return 0.0
-        information = self.reading.information
-        weights = information.precision.sum(axis=0)
-        after = information.time >= self.step.onset().value
+        None without healthy recordings.
+        """
+        if self.rise is None:
+            return None
+        step = self.step
+        mean_step = 0.0 if step is None else step.fitted.size * self._fraction_after(step)
+        return LeakRise(self.rise, self.rise.log_ratio(mean_step))
+
+    def _fraction_after(self, step: StepTest) -> float:
+        """Compute the fraction of the information on the mean conductance that lies after a step's onset."""
+        weights = self.information.precision.sum(axis=0)
+        after = self.information.time >= step.onset().value
         return float(np.clip(weights[after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
-    def litres(self) -> float | None:
-        """L/min of a flow of 1 m^3/s, None where the machine's size is not stated."""
-        return 1.0 / LITRE_PER_MINUTE if self.reading.stated else None
-
-    @property
-    def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's size."""
-        return flow_scale()
+    def lpm_per_flow(self) -> float | None:
+        """L/min of a flow of 1 m^3/s; None if the machine's size is not stated."""
+        return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
         """Return None: the pump's flow is not measured."""
         return None
 
-    def total(self, findable: float | None) -> TotalLeakage:
-        """Return the smallest step that would have been found; what passes in all is not known from pressures."""
-        pump, litres = self.reading.pump, self.litres
+    def total(self, detectable_flow: float | None) -> TotalLeakage:
+        """Return the smallest step that would be detected; the total leakage is unknown from pressures."""
+        pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
             interval_lpm=None,
-            pressure=float(self.reading.pressure.mean()),
-            findable_lpm=None if findable is None or litres is None else findable * litres,
-            findable_share=None if findable is None or not pump > 0.0 else findable / pump,
+            pressure=self.flow_per_conductance,
+            findable_lpm=None if detectable_flow is None or lpm_per_flow is None else detectable_flow * lpm_per_flow,
+            findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,
         )
 
-    def course(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leak since an onset; None without one."""
-        reading, test = self.reading, self.step
-        if onset_s is None or test is None or not reading.stated:
+    def history(self, onset_s: float | None) -> LeakCourse | None:
+        """Return the leakage [L/min] above that before an onset [s], with its 95 % interval; None without an onset."""
+        if onset_s is None or self.step is None or not self.stated:
             return None
-        time = reading.information.time
-        growth = course(reading.information, test, step=True).relative_to(time < onset_s)
-        unit = reading.pressure * 0.5 * (1.0 + reading.orifice) / LITRE_PER_MINUTE
-        value, half = growth.mean * unit, WITHIN_95 * np.sqrt(np.maximum(np.diag(growth.covariance), 0.0)) * unit
-        return LeakCourse(time, value, value - half, value + half)
+        time = self.information.time
+        growth = fit_history(self.information, self.step, with_step=True).relative_to(time < onset_s)
+        unit = self.pressure * 0.5 * (1.0 + ORIFICE_RATIO) / LITRE_PER_MINUTE  # midway between the leak laws
+        value = growth.mean * unit
+        half_width = WITHIN_95 * np.sqrt(np.maximum(np.diag(growth.covariance), 0.0)) * unit
+        return LeakCourse(time, value, value - half_width, value + half_width)

@@ -1,1 +1,1 @@
-"""Rows of the regression: the weak form, their weights, and the distribution of the pressure beside them."""
+"""Rows of the regression: the weak form, their weights, and the distribution of the pressure."""

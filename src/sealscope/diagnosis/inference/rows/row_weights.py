@@ -1,9 +1,9 @@
-"""Huber's weights of the rows of blocks, and the sums of their products: compiled laws on arrays that the caller gives.
+"""Huber's weights of the rows of blocks, and Gram matrices of the weighted rows: compiled laws on the caller's arrays.
 
-A block's rows are v = (fast, slow, left side). Coefficients of fast columns are free in each block, those of slow ones
-are the same in all blocks and believed as the sums `known` say. The weights are min(1, HUBER sigma / abs(residual)) at
-the fit that they give, sigma from the median of abs(residual). Nothing here allocates: a unit for other simulators
-(`fmu`) runs the same laws in C.
+A block's rows are v = (fast, slow, left side). Coefficients of fast columns are free in each block; those of slow
+columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
+min(1, HUBER sigma / abs(residual)) at the fit with these weights, sigma from the median of abs(residual), by
+iteration. No law allocates memory: a unit for other simulators (`fmu`) runs the same laws in C.
 
 Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 """
@@ -18,22 +18,21 @@ from numpy.typing import NDArray
 from sealscope.compiled import large_law, law
 from sealscope.recordings.recording import Array
 
-#: Blocks whose rows are weighted together at the beginning of a stream, and that stand for what is known later.
+#: Blocks whose rows are weighted together at the beginning of a stream; later the prior counts as so many blocks.
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
-#: What is added to a matrix, as a share of its diagonal.
+#: Relative increase of a matrix diagonal, against rounding.
 RIDGE = 1e-10
-#: Turns to a fixed point at most, and the relative change that ends them, the mean one of weights.
-MOST_TURNS, TOLERANCE = 50, 1e-2
-_SIGMA = 1.4826  # standard deviation of normal values over the median of their size
-
-
-_Places = NDArray[np.intp]
+#: Maximum number of iterations to a fixed point, and the mean relative change of the weights that ends them.
+MAX_ITERATIONS, TOLERANCE = 50, 1e-2
+#: Standard deviation of normal values over the median of their magnitudes.
+_SIGMA = 1.4826
+_Indices = NDArray[np.intp]
 
 
 class Workspace(NamedTuple):
-    """Arrays to work in, for r rows of K blocks and of c columns s slow ones.
+    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, s of them slow.
 
     `weights`, `residual`, `ordered` (r,); `reduced` (K, c, c); `fit` (K, c - 1); `normal` (s + 1, s + 1).
     """
@@ -48,16 +47,15 @@ class Workspace(NamedTuple):
 
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of a `Workspace`."""
-    by_row = (rows,), (rows,), (rows,)
-    return *by_row, (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
+    return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
 
 @large_law
 def eliminate(matrix: Any, count: int) -> None:
-    """Eliminate the first `count` unknowns of a symmetric matrix >= 0 with right sides beside it (Gauss and Jordan).
+    """Eliminate the first `count` unknowns of a positive semidefinite matrix with appended right sides, in place.
 
-    Their rows then hold their coefficients in terms of the other columns, the other rows what is left without them.
-    Directions that nothing is known of are left at zero.
+    Gauss-Jordan elimination: the first rows then contain the unknowns in terms of the other columns, the other rows the
+    reduced system. Unknowns without information become zero.
     """
     rows, columns = matrix.shape
     for i in range(count):
@@ -67,14 +65,14 @@ def eliminate(matrix: Any, count: int) -> None:
         for q in range(i, columns):
             matrix[i, q] *= scale
         for j in range(rows):
-            size = matrix[j, i] if j != i else 0.0
+            factor = matrix[j, i] if j != i else 0.0
             for q in range(i, columns):
-                matrix[j, q] -= size * matrix[i, q]
+                matrix[j, q] -= factor * matrix[i, q]
 
 
 @law
 def median(values: Any, n: int) -> float:
-    """Return the median of the first n values, whose order is lost (Hoare's selection)."""
+    """Return the median of the first n values, by quickselect, which reorders them."""
     k, low, high = (n - 1) // 2, 0, n - 1
     while low < high:
         pivot, i, j = values[k], low, high
@@ -100,7 +98,7 @@ def median(values: Any, n: int) -> float:
 
 @law
 def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
-    """Put the sums of weighted products of rows (r, m) into `gram` (m, m)."""
+    """Compute the Gram matrix (m, m) of the weighted rows `begin` to `end` of `values` (r, m), written to `gram`."""
     width = values.shape[1]
     for i in range(width):
         for j in range(width):
@@ -113,74 +111,91 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 
 @large_law
-def _reduce(gram: Any, place: Any, fast: int, reduced: Any) -> None:
-    """Put a block's sums into `reduced`, without the fast columns (`eliminate`)."""
-    for i in range(len(place)):
-        for j in range(len(place)):
-            reduced[i, j] = gram[place[i], place[j]]
-    eliminate(reduced, fast)
+def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
+    """Write a block's Gram matrix in `column_order` to `reduced`, with its first `n_fast` columns eliminated."""
+    for i in range(len(column_order)):
+        for j in range(len(column_order)):
+            reduced[i, j] = gram[column_order[i], column_order[j]]
+    eliminate(reduced, n_fast)
 
 
 @large_law
-def _reweigh(values: Any, ends: Any, place: Any, workspace: Any) -> bool:
-    """Put Huber's weights at a fit into the workspace; return whether they are those at which it was made."""
-    count, last, b = len(values), len(place) - 1, 0
+def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
+    """Compute Huber's weights from the residuals of the fit in the workspace; return True if they have converged."""
+    count, left, block = len(values), len(column_order) - 1, 0
     for r in range(count):
-        while r >= ends[b]:
-            b += 1
-        residual = values[r, place[last]]
-        for i in range(last):
-            residual -= workspace.fit[b, i] * values[r, place[i]]
+        while r >= ends[block]:
+            block += 1
+        residual = values[r, column_order[left]]
+        for i in range(left):
+            residual -= workspace.fit[block, i] * values[r, column_order[i]]
         workspace.residual[r] = workspace.ordered[r] = abs(residual)
-    size, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
+    limit, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
     for r in range(count):
-        weight = size / workspace.residual[r] if size > 0.0 and workspace.residual[r] > size else 1.0
+        weight = limit / workspace.residual[r] if limit > 0.0 and workspace.residual[r] > limit else 1.0
         change += abs(weight / workspace.weights[r] - 1.0)
         workspace.weights[r] = weight
-    return change < TOLERANCE * count or not size > 0.0
+    return change < TOLERANCE * count or not limit > 0.0
 
 
 @large_law
-def weigh(values: Any, ends: Any, place: Any, fast: int, known: Any, share: float, workspace: Any, gram: Any) -> None:
-    """Put the sums of weighted products of rows (r, m), of K blocks that end before the rows `ends`, into `gram`.
+def weigh_rows(
+    values: Any,
+    ends: Any,
+    column_order: Any,
+    n_fast: int,
+    earlier_sums: Any,
+    update_fraction: float,
+    workspace: Any,
+    gram: Any,
+) -> None:
+    """Weight the rows (r, m) of K blocks, compute their Gram matrices (K, m, m), and update the prior, in place.
 
-    `place`: columns, first those that are `fast`, the left side last. `known` (s + 1, s + 1): sums over the others that
-    count as `SUPPORT` blocks; it moves to those of these blocks by `share`. `gram` (K, m, m).
+    `ends`: index past the last row of each block. `column_order`: column indices, the `n_fast` fast ones first, the
+    left side last. `earlier_sums` (s + 1, s + 1): sums over earlier blocks for the slow columns, scaled to `SUPPORT`
+    blocks; they change by `update_fraction` of their difference from the sums of these blocks. `gram`: the result.
     """
-    count, last, blocks = len(values), len(place) - 1, len(ends)
-    slow, normal, reduced = last - fast, workspace.normal, workspace.reduced
-    for r in range(count):
+    n_rows, left, n_blocks = len(values), len(column_order) - 1, len(ends)
+    n_slow, normal, reduced = left - n_fast, workspace.normal, workspace.reduced
+    for r in range(n_rows):
         workspace.weights[r] = 1.0
-    converged = count == 0
-    for turn in range(MOST_TURNS + 1):
-        for b in range(blocks):
-            _sum_products(values, int(ends[b - 1]) if b else 0, int(ends[b]), workspace.weights, gram[b])
-            _reduce(gram[b], place, fast, reduced[b])
-        converged = converged or turn == MOST_TURNS
-        for i in range(slow + 1):
-            for j in range(slow + 1):
-                normal[i, j] = 0.0 if converged else known[i, j]
-                for b in range(blocks):
-                    normal[i, j] += reduced[b, fast + i, fast + j]
+    converged = n_rows == 0
+    for iteration in range(MAX_ITERATIONS + 1):
+        for block in range(n_blocks):
+            begin = int(ends[block - 1]) if block else 0
+            _sum_products(values, begin, int(ends[block]), workspace.weights, gram[block])
+            _eliminate_fast(gram[block], column_order, n_fast, reduced[block])
+        converged = converged or iteration == MAX_ITERATIONS
+        for i in range(n_slow + 1):  # once converged, the sums of these blocks alone
+            for j in range(n_slow + 1):
+                normal[i, j] = 0.0 if converged else earlier_sums[i, j]
+                for block in range(n_blocks):
+                    normal[i, j] += reduced[block, n_fast + i, n_fast + j]
         if converged:
             break
-        eliminate(normal, slow)
-        for b in range(blocks):
-            for i in range(last):
-                workspace.fit[b, i] = reduced[b, i, last] if i < fast else normal[i - fast, slow]
-            for i in range(fast):
-                for j in range(fast, last):
-                    workspace.fit[b, i] -= reduced[b, i, j] * workspace.fit[b, j]
-        converged = _reweigh(values, ends, place, workspace)
-    for i in range(slow + 1):
-        for j in range(slow + 1):
-            known[i, j] += share * (SUPPORT / blocks * normal[i, j] - known[i, j])
+        eliminate(normal, n_slow)  # gives the slow coefficients; then the fast ones of each block
+        for block in range(n_blocks):
+            for i in range(left):
+                workspace.fit[block, i] = reduced[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
+            for i in range(n_fast):
+                for j in range(n_fast, left):
+                    workspace.fit[block, i] -= reduced[block, i, j] * workspace.fit[block, j]
+        converged = _reweigh(values, ends, column_order, workspace)
+    for i in range(n_slow + 1):
+        for j in range(n_slow + 1):
+            earlier_sums[i, j] += update_fraction * (SUPPORT / n_blocks * normal[i, j] - earlier_sums[i, j])
 
 
-def weighted(values: Array, ends: _Places, fast: _Places, slow: _Places, known: Array, share: float) -> Array:
-    """Return the Gram matrices (K, m, m) of blocks, and learn from them (`weigh`)."""
-    place = np.concatenate([fast, slow])
-    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(place), len(slow) - 1)))
+def block_gram_matrices(
+    values: Array, ends: _Indices, fast: _Indices, slow: _Indices, earlier_sums: Array, update_fraction: float
+) -> Array:
+    """Compute the Gram matrix (K, m, m) of the weighted rows (r, m) of each block, and update `earlier_sums`.
+
+    `ends`: index past the last row of each block; `fast`, `slow`: indices of columns whose coefficients are free in
+    each block, and of those shared by all blocks; the last of `slow` is the left side. Weights are as in `weigh_rows`.
+    """
+    column_order = np.concatenate([fast, slow])
+    workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(column_order), len(slow) - 1)))
     gram = np.empty((len(ends), values.shape[1], values.shape[1]))
-    weigh(values, ends, place, len(fast), known, share, workspace, gram)
+    weigh_rows(values, ends, column_order, len(fast), earlier_sums, update_fraction, workspace, gram)
     return gram

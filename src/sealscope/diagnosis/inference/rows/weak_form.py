@@ -4,9 +4,9 @@ A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions of compact s
 
     integral of phi_i dl = sum_j c_j integral of phi_i f_j dg_j,    phi_i(t) = (1 - s^2)^4 / norm,  s = (t - t_i) / h,
 
-one row for each test function, over the increments of each sampling interval. That is summation by parts of the form in
-which every derivative stands on phi. phi and its first three derivatives vanish at its ends, so that noise and what a
-row cuts off do not matter. Rows are `STRIDE` apart and overlap; any rate serves, and ten seconds are a short recording.
+one row for each test function, over the increments of each sampling interval. This is summation by parts of the form in
+which phi carries every derivative. phi and its first three derivatives vanish at its ends, so that noise there and the
+truncation do not matter. Rows are `STRIDE` apart and overlap, at any sampling rate.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547 (modulating functions); H. A. Preisig and D. W. T. Rippin, Computers and
 Chemical Engineering 17 (1993) 1; D. A. Messenger and D. M. Bortz, Multiscale Model. Simul. 19 (2021) 1474 (weak form).
@@ -26,17 +26,19 @@ from sealscope.recordings.recording import Array
 #: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
 STRIDE = 0.125
 SPAN = 4
-#: A row of which holes leave less tells nothing.
-LEAST_WEIGHT = 0.1
-#: Sums of increments beyond it are no values of a sensor: their squares would overflow.
-LARGEST = 1e100
+#: Weight below which a row next to holes is omitted.
+MIN_WEIGHT = 0.1
+#: Maximum sum of increments that counts as a reading of a sensor: squares of larger ones would overflow.
+MAX_READING = 1e100
+#: Sampling rate at which the overlap of test functions is computed [Hz]; fine enough that the factor has converged.
+_FINE_RATE = 1e4
 
 
 class Rows(NamedTuple):
     """Rows of a regression.
 
-    `time` (r,) of each test function's middle [s]; `values` (r, c), one a column, over the test function's integral, so
-    that a row is a mean rate; `whole` (r,): no sample it rests on is missing.
+    `time` (r,): middle of each test function [s since the first sample]; `values` (r, c): integral of each column's
+    increments times the test function, a mean rate; `whole` (r,): flags of the rows without a missing sample.
     """
 
     time: Array
@@ -45,13 +47,13 @@ class Rows(NamedTuple):
 
 
 def stride_samples(rate: float) -> int:
-    """Return the samples between neighbouring test functions."""
+    """Return the number of samples between neighbouring test functions."""
     return max(1, round(STRIDE * rate))
 
 
 @lru_cache(maxsize=8)
 def test_function(rate: float) -> Array:
-    """Return phi at the middle of each sampling interval of its support [1/s], shape (SPAN, stride)."""
+    """Return the test function phi [1/s] at the middle of each interval of its support, shape (SPAN, stride)."""
     stride = stride_samples(rate)
     s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0
     phi = (1.0 - s * s) ** 4
@@ -59,70 +61,50 @@ def test_function(rate: float) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _weights(rate: float) -> Array:
-    """Return the transpose of `test_function` as BLAS reads it fastest, shape (stride, SPAN)."""
+def _transposed_test_function(rate: float) -> Array:
+    """Return the transpose of `test_function`, shape (stride, SPAN), in the memory order that BLAS reads fastest."""
     return np.ascontiguousarray(test_function(rate).T)
 
 
-def _overlap() -> float:
-    phi = test_function(1e4).ravel()
+def _variance_inflation() -> float:
+    """Compute the factor by which overlapping test functions raise the variance of a sum over rows of white noise.
+
+    It is the sum of the correlations of a test function with itself and with its neighbours on either side.
+    """
+    phi = test_function(_FINE_RATE).ravel()
     stride, energy = len(phi) // SPAN, float(phi @ phi)
     return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
 
 
-#: Long-run variance of white noise in the rows over their variance, for overlapping rows repeat each other: the sum of
-#: the test function's correlations with its neighbours.
-OVERLAP = _overlap()
+#: Factor by which sums over overlapping rows of white noise vary more than over independent rows.
+OVERLAP = _variance_inflation()
 
 
-def rows(increments: Sequence[Array], rate: float, start: float = 0.0) -> Rows:
-    """Return the rows of increments over sampling intervals.
+def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
+    """Integrate the increments of c columns, (n,) each, times each test function within the samples.
 
-    Parameters
-    ----------
-    increments : sequence of c arrays of float, shape (n,)
-        Increments of each column over each sampling interval; NaN where a sample is missing.
-    rate : float
-        Sampling rate [Hz].
-    start : float
-        Time of the first sample [s].
-
-    Returns
-    -------
-    Rows
-        Every test function whose support lies within the samples: n // stride - SPAN + 1 rows.
+    NaN is a missing sample. There are n // stride - SPAN + 1 rows.
     """
     stride = stride_samples(rate)
-    pieces = len(increments[0]) // stride
-    count = max(0, pieces - SPAN + 1)
-    samples = np.concatenate([increment[: pieces * stride] for increment in increments]).reshape(-1, stride)
-    parts: Array = (samples @ _weights(rate)).reshape(len(increments), pieces, SPAN)
-    small = np.abs(parts) < LARGEST
-    missing = np.zeros(pieces, dtype=bool) if small.all() else np.asarray(~small.all(axis=(0, 2)))
-    parts[:, missing] = 0.0
-    values: Array = np.zeros((count, len(increments)))
-    touched = np.zeros(count, dtype=bool)
-    for piece in range(SPAN):
-        values += parts[:, piece : piece + count, piece].T
-        touched |= missing[piece : piece + count]
-    time: Array = start + (np.arange(count, dtype=float) + 0.5 * SPAN) * stride / rate
-    return Rows(time, values, ~touched)
+    n_pieces = len(increments[0]) // stride
+    n_rows = max(0, n_pieces - SPAN + 1)
+    strides = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
+    integrals: Array = (strides @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
+    is_reading = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))
+    integrals[:, ~is_reading] = 0.0
+    values: Array = np.zeros((n_rows, len(increments)))
+    is_whole = np.ones(n_rows, dtype=bool)
+    for part in range(SPAN):  # part of a test function that lies over one stride of the samples
+        values += integrals[:, part : part + n_rows, part].T
+        is_whole &= is_reading[part : part + n_rows]
+    time = (np.arange(n_rows, dtype=float) + 0.5 * SPAN) * stride / rate
+    return Rows(time, values, is_whole)
 
 
-def weights_beside_holes(holes: Array, rate: float) -> Array:
-    """Compute the weight of each row beside bridged holes, the share of its test function that lies in none.
+def weights_near_holes(holes: Array, rate: float) -> Array:
+    """Compute the weight of each row next to bridged holes: the fraction of its test function outside of holes.
 
-    Parameters
-    ----------
-    holes : array of float, shape (n,)
-        1 for a sample in a hole, else 0.
-    rate : float
-        Sampling rate [Hz].
-
-    Returns
-    -------
-    array of float, shape (r,)
-        1 for a row that no hole touches, falling to 0 for one that holes leave less than `LEAST_WEIGHT` of.
+    `holes` (n,): 1 for a sample in a hole, else 0; result (r,): 0 below `MIN_WEIGHT`.
     """
-    weights = 1.0 - rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
-    return np.where(weights < LEAST_WEIGHT, 0.0, np.minimum(weights, 1.0))
+    weights = 1.0 - weak_form_rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
+    return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))

@@ -1,22 +1,52 @@
-"""The leak as a volume balance measures it: tests, mean flows, bounds and course, in the machine's size."""
+"""Leakage measured by a volume balance: tests, mean flows, bounds and history, scaled to the machine."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, mixed_flow, rise_flow, step_flow
-from sealscope.diagnosis.inference.observable import Flow, Remark
-from sealscope.diagnosis.inference.onset import BELOW_95, WITHIN_95, Interval, StepTest
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, compare_laws, conditions_beyond, held_rise, rise
+from sealscope.diagnosis.inference.leak_law import (
+    EXPONENTS,
+    LawWeight,
+    estimate_rise_flow,
+    estimate_step_flow,
+    law_priors,
+    mixture_flow,
+)
+from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
+from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Interval, StepTest
+from sealscope.diagnosis.inference.scatter import (
+    Mixture,
+    RecordingSums,
+    Rise,
+    compare_laws,
+    find_unusual_conditions,
+    held_rise,
+    rise,
+)
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
+from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
+
+
+class _HoldLaws(NamedTuple):
+    """Leak past the piston fitted to holds, under each of `EXPONENTS` (k,).
+
+    `weights`: likelihoods, normalised; `units`: mean flow of a unit coefficient; `flows` and their `deviations`
+    [m^3/s].
+    """
+
+    weights: Array
+    units: Array
+    flows: Array
+    deviations: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,18 +59,23 @@ class BalanceLeak:
         Name of the detector.
     balance : RecordedBalance
     healthy : sequence of RecordingSums
-        What healthy recordings of the machine with the same terms teach.
+        Sums of the healthy recordings of the machine with the same terms.
     """
 
     provider: str
     balance: RecordedBalance
     healthy: Sequence[RecordingSums] = ()
 
+    #: Flows are averaged over the laws of a leak.
+    flow_factors: tuple[float, float] = (1.0, 1.0)
+
     @property
     def cause(self) -> Cause:
-        """Cause of a leak: behind a servo valve, or where valves surely hold pressures, the pump has no part in it."""
-        is_piston = len(self.balance.columns) > 1 or self._held_rise is not None
-        return "piston leak" if is_piston else "piston or pump leak"
+        """Cause of a leak: the piston, if behind a servo valve or if holds show the rise; else piston or pump."""
+        hold_rise = self._hold_rise
+        in_holds = hold_rise is not None and (self.balance.shut or hold_rise.chance < INFERENCE.held_oil.rare)
+        has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
+        return "piston leak" if has_servo_valve or in_holds else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:
@@ -49,133 +84,213 @@ class BalanceLeak:
 
     @cached_property
     def step_flow(self) -> Flow:
-        """Mean flow of the step while it lasts, over laws, growths and onsets by their likelihoods."""
+        """Mean flow of the step after its onset, averaged over laws, growths and onsets."""
         balance, test = self.balance, self.balance.test
         if test is None:
             return Flow(0.0, np.inf)
-        return self._with_law(step_flow(balance.blocks, balance.columns, balance.leak, test))
+        return self._add_law_uncertainty(
+            estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
+        )
 
     @property
-    def step_driving(self) -> float:
+    def flow_per_conductance(self) -> float:
         """Mean flow [m^3/s] of a conductance of one, at the recording's pressures."""
         return self.balance.mean_pressure()
 
-    def _with_law(self, flow: Flow) -> Flow:
-        """Widen a flow by what its law and smoothed pressures leave open."""
-        law: float = priors("inference")["size"]["law"]
+    def _add_law_uncertainty(self, flow: Flow) -> Flow:
+        """Add the relative uncertainty of the leak law and of averaged pressures to a flow."""
+        law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the mean leakage beyond the healthy recordings, None without any; of holds alone where they tell."""
-        return self._swept_rise if self._held_rise is None else self._held_rise
+        """Rise of the mean leakage beyond the healthy recordings, from holds if possible; None without recordings."""
+        return self._motion_rise if self._hold_rise is None else self._hold_rise
 
     @cached_property
-    def _swept_rise(self) -> Rise | None:
+    def _motion_rise(self) -> Rise | None:
+        """Rise over the whole recording, by the balance in motion and at rest."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
 
     @cached_property
-    def _held_rise(self) -> Rise | None:
-        return held_rise(self.balance.recording_sums, self.healthy) if self.balance.shut else None
+    def _hold_rise(self) -> Rise | None:
+        """Rise during holds behind shut valves; None if it is too imprecise to replace the rise in motion."""
+        motion_rise = self._motion_rise
+        if not self.balance.locked or motion_rise is None:
+            return None
+        hold_rise = held_rise(self.balance.recording_sums, self.healthy)
+        if hold_rise is None:
+            return None
+        # more precise than the rise in motion, or precise enough to show that rise
+        is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
+        return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """The rise while it lasts, over laws and onsets, or without healthy recordings the leakage in all."""
+        """Mean flow of the rise after its onset; the total leakage if there are no healthy recordings."""
         balance = self.balance
         if self.rise is None:
-            value, low, high = (balance.mean_pressure() * end for end in balance.level)
-            return self._with_law(Flow(value, (high - low) / (2.0 * WITHIN_95)))
-        swept = self._swept_rise
-        assert swept is not None
-        low, high = swept.interval()
-        flow = rise_flow(
-            balance.blocks,
-            balance.columns,
+            value, low, high = (balance.mean_pressure() * end for end in balance.conductance)
+            return self._add_law_uncertainty(Flow(value, (high - low) / (2.0 * WITHIN_95)))
+        motion_rise = self._motion_rise
+        assert motion_rise is not None
+        low, high = motion_rise.interval()
+        flow = estimate_rise_flow(
             balance.leak,
             self.step,
-            (swept.value, (high - low) / (2.0 * WITHIN_95)),
+            motion_rise.value,
+            (high - low) / (2.0 * WITHIN_95),
             self._rise_laws(),
-            balance.moving,
+            balance.blocks.moving_flow,
         )
-        held, believed = self._held_rise, priors("inference")["held_oil"]
-        if held is not None and held.chance < believed["rare"]:  # two ways that need not agree: it lies between them
-            flows = flow, self._held_flow(held)
-            flow = mixed_flow(np.array([1.0 - believed["right"], believed["right"]]), *np.array(flows).T)
-        return self._with_law(flow)
+        hold_rise, prior = self._hold_rise, INFERENCE.held_oil
+        if hold_rise is not None and hold_rise.chance < prior.rare:  # holds may be wrong: mix both estimates
+            flows = flow, self._hold_flow(hold_rise)
+            flow = mixture_flow(np.array([1.0 - prior.right, prior.right]), *np.array(flows).T)
+        return self._add_law_uncertainty(flow)
 
-    def _held_flow(self, rise: Rise) -> Flow:
-        """Return the mean flow of what the holds show, over laws by their likelihoods."""
-        balance, held = self.balance, self.balance.chambers
-        assert held is not None
-        recording, (onset, zero) = balance.recording, held.piston
-        difference = np.abs(recording["p_A"] - recording["p_B"] - zero)[recording.t >= onset]
+    @property
+    def rise_onset(self) -> Interval | None:
+        """Onset of the rise within the recording, dated by holds; None if it may have been there from the start."""
+        hold_rise, chambers = self._hold_rise, self.balance.chambers
+        if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
+            return None
+        return chambers.piston_onset
+
+    def _hold_flow(self, rise: Rise) -> Flow:
+        """Estimate the mean flow of a rise during holds, averaged over leak laws by their likelihoods."""
+        laws, (low, high) = self._hold_laws(), rise.interval()
+        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
+        return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
+
+    def _hold_laws(self) -> _HoldLaws:
+        """Fit a leak past the piston under each of `EXPONENTS` to the holds."""
+        balance, chambers = self.balance, self.balance.chambers
+        assert chambers is not None
+        recording, (onset, offset) = balance.recording, chambers.piston_fit
+        difference = np.abs(recording["p_A"] - recording["p_B"] - offset)[recording.t >= onset]
         units = np.array([float(np.nanmean(difference**exponent)) for exponent in EXPONENTS])
-        levels = [held.level(onset, zero, exponent) for exponent in EXPONENTS]
-        values, deviations, by_oil, likelihoods = np.array(levels).T
-        low, high = rise.interval()
-        scatter = (high - low) / (2.0 * WITHIN_95) * units[0]
-        return mixed_flow(
-            np.exp(likelihoods - likelihoods.max()),
-            values * units,
-            np.hypot(scatter, np.hypot(deviations, by_oil) * units),
-        )
+        fits = [chambers.fit_piston_leak(onset, offset, exponent) for exponent in EXPONENTS]
+        values, noise_deviations, oil_deviations, likelihoods = np.array(fits).T
+        weights = np.exp(likelihoods - likelihoods.max())
+        deviations = np.hypot(noise_deviations, oil_deviations)
+        return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
 
-    def _rise_laws(self) -> list[tuple[float, float]]:
-        """Return the mean flow of a rise of one under each of `EXPONENTS`, and the logarithm of the law's weight."""
-        balance, pressure = self.balance, self.balance.mean_pressure()
-        law = compare_laws(balance.recording_sums, self.healthy, balance.columns)
-        if law is None:
-            return [(pressure, 0.0)] * len(EXPONENTS)
-        root = balance.mean_of_blocks(balance.blocks.driving(root=True)) / law.regression
-        readings: float = priors("inference")["size"]["readings"]
-        laminar: float = priors("inference")["size"]["laminar"]
-        believed = np.log([laminar, *[(1.0 - laminar) / (len(EXPONENTS) - 1)] * (len(EXPONENTS) - 1)])
+    def _rise_laws(self) -> list[LawWeight]:
+        """Compute mean flow of a unit rise of the leak coefficient and log weight of each leak law of `EXPONENTS`.
+
+        A law of exponent n is orifice flow by the fraction f = 2 (1 - n), flow laminar^(1 - f) orifice^f and log weight
+        log prior + f N (log likelihood ratio of one reading), N the number of independent readings of a recording.
+        """
+        balance = self.balance
+        laminar_flow = balance.mean_pressure()
+        fit = compare_laws(balance.recording_sums, self.healthy, balance.columns)
+        if fit is None:
+            return [LawWeight(laminar_flow, 0.0)] * len(EXPONENTS)
+        # the orifice coefficient that fits like a unit laminar rise is 1 / regression
+        orifice_flow = balance.mean_of_blocks(balance.blocks.mean_root()) / fit.regression
+        log_ratio = INFERENCE.size.readings * fit.log_ratio
         return [
-            (pressure ** (1.0 - share) * root**share, float(prior) + share * readings * law.log_ratio)
-            for share, prior in zip(2.0 * (1.0 - np.array(EXPONENTS)), believed, strict=True)
+            LawWeight(laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * log_ratio)
+            for f, log_prior in zip(2.0 * (1.0 - np.array(EXPONENTS)), np.log(law_priors()), strict=True)
         ]
 
     @property
     def excess(self) -> float | None:
-        """Leakage in all beyond a healthy machine's by the rig's file, in deviations; None where not stated."""
+        """Total leakage above the limit of the rig's file, in standard deviations; None if not stated."""
         balance = self.balance
         limit = healthy_leakage(balance.rig)
-        # a drive's droop with the load passes for a level of the leak
+        # without a measured flow, the drive's droop under load looks like leakage
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
         if not (limit > 0.0 and self.rise is None and balance.size.stated and is_measured):
             return None
-        level = balance.level
+        level = balance.conductance
         deviation = float(np.hypot((level.high - level.low) / (2 * WITHIN_95), level.value * balance.size.deviation))
         return (level.value - limit) / max(deviation, np.finfo(float).tiny)
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the mean flow of a leak that began, or came since the healthy recordings [m^3/s]."""
-        test = self.step if self.rise is None else self._swept_rise
+        """95 % upper bound of the leak's mean flow [m^3/s], infinite if nothing was tested.
+
+        With healthy recordings it bounds the rise over them, by holds, too, if there are any; else a step within the
+        recording. It covers the uncertainty of the machine's size and of the leak's law.
+        """
+        test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
             return np.inf
-        size = float(np.hypot(self.balance.size.deviation, priors("inference")["size"]["law"]))
-        return test.bound() * self.balance.mean_pressure() * (1.0 + BELOW_95 * size)
+        bound = test.bound() * self.balance.mean_pressure() if self._hold_rise is None else self._hold_bound()
+        return bound * (1.0 + UPPER_95 * float(np.hypot(self.balance.size.deviation, INFERENCE.size.law)))
+
+    def _hold_bound(self) -> float:
+        """Compute the 95 % upper bound of the mean flow of a rise, from a mixture of holds and the whole recording.
+
+        Three hypotheses are mixed: the holds say nothing on the leak (the rise is that in motion), they show a leak
+        past the piston, or their leak goes to the outside.
+        """
+        motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
+        assert motion_rise is not None and hold_rise is not None and chambers is not None
+        piston_probability, fraction_after, fit = chambers.piston_leak
+        mean_leak, pressure, laws = fraction_after * fit.value, self.balance.mean_pressure(), self._hold_laws()
+        relative_deviations = laws.deviations / max(float(laws.deviations[0]), np.finfo(float).tiny)
+        # mean flow per conductance of a leak past the piston, larger by the uncertainty of its law
+        unit = pressure * max(float(laws.weights @ relative_deviations), 1.0)
+        hold_probability = INFERENCE.held_oil.right * (1.0 - chambers.probability_after_holds)
+        # `hold_rise.value` contains the piston's leak times its probability
+        by_motion = _flow_mixture(motion_rise, motion_rise.value, unit=pressure, weight=1.0 - hold_probability)
+        past_piston = _flow_mixture(
+            hold_rise,
+            hold_rise.value + (1.0 - piston_probability) * mean_leak,
+            unit=unit,
+            weight=hold_probability * piston_probability,
+            oil_deviation=fraction_after * fit.by_oil,
+        )
+        to_outside = _flow_mixture(
+            hold_rise,
+            hold_rise.value - piston_probability * mean_leak,
+            unit=unit,
+            weight=hold_probability * (1.0 - piston_probability),
+        )
+        parts = by_motion, past_piston, to_outside
+        return Mixture(*(np.concatenate(values) for values in zip(*parts, strict=True))).quantile(0.95)
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s], and that while it flows."""
-        return self.balance.mean_flow, self.balance.moving
+        """Mean flow of the pump [m^3/s], over the recording and while it delivers."""
+        return self.balance.mean_flow, self.balance.blocks.moving_flow
 
     @cached_property
-    def share_after(self) -> float:
-        """Share of what the recording tells of its mean leakage that lies after the step's onset."""
-        if self.step is None:
-            return 0.0
-        after = self.balance.blocks.time >= self.step.onset().value
+    def step_rise(self) -> LeakRise | None:
+        """Rise over healthy recordings, with the log likelihood ratio of the step's contribution; None without any.
+
+        Holds after the step's onset show the whole step; without any, the whole recording shows a part of it.
+        """
+        step, rise, motion_rise = self.step, self.rise, self._motion_rise
+        if rise is None or motion_rise is None or step is None:
+            return None if rise is None else LeakRise(rise)
+        rise_after = self._hold_rise_since(step.onset().value)
+        if rise_after is None:
+            mean_rise = step.fitted.size * self._fraction_after(step)
+            return LeakRise(rise, motion_rise.log_ratio_within(mean_rise, INFERENCE.scatter.tail))
+        agrees: float = INFERENCE.held_oil.agrees
+        return LeakRise(rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
+
+    def _hold_rise_since(self, onset: float) -> Rise | None:
+        """Estimate the rise in the holds after an onset [s]; None without such holds, or healthy holds to compare."""
+        chambers = self.balance.chambers
+        leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(onset)
+        return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
+
+    def _fraction_after(self, step: StepTest) -> float:
+        """Compute the fraction of the information on the mean leakage that lies after a step's onset."""
+        after = self.balance.running_blocks.time >= step.onset().value
         weights = self.balance.leak.precision.sum(axis=0)
         return float(np.clip(weights[after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
-    def litres(self) -> float | None:
-        """L/min of a flow of 1 m^3/s, None where the machine's size is not stated."""
+    def lpm_per_flow(self) -> float | None:
+        """L/min of a flow of 1 m^3/s; None if the machine's size is not stated."""
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None
 
@@ -186,71 +301,76 @@ class BalanceLeak:
 
     @property
     def ratio(self) -> Interval | None:
-        """Displacement over area as measured, over the assumed one."""
+        """Measured displacement over area, relative to the assumed ratio."""
         return self.balance.size.ratio
 
     def relative(self, flow: Flow) -> RelativeLeak:
-        """Return a flow over the pump's mean flow, and over the piston's area."""
-        pump, area = self.balance.mean_flow, self.balance.size.area
-        half = WITHIN_95 * flow.deviation
-        ends = (flow.value - half, flow.value + half)
+        """Return a flow relative to the pump's mean flow, and as a creep speed of the piston."""
+        pump_flow, area = self.balance.mean_flow, self.balance.size.area
+        half_width = WITHIN_95 * flow.deviation
+        interval = (flow.value - half_width, flow.value + half_width)
         return RelativeLeak(
-            pump_share=flow.value / pump if pump > 0.0 else None,
-            pump_share_interval=_quotient(ends, pump),
+            pump_share=flow.value / pump_flow if pump_flow > 0.0 else None,
+            pump_share_interval=_divide_interval(interval, pump_flow),
             creep=None if area is None else flow.value / area,
-            creep_interval=_quotient(ends, area),
+            creep_interval=_divide_interval(interval, area),
         )
 
-    def total(self, findable: float | None) -> TotalLeakage:
-        """Return the total leakage of pump and piston; `findable`: the smallest step that would be found [m^3/s]."""
+    def total(self, detectable_flow: float | None) -> TotalLeakage:
+        """Return the total leakage of pump and piston; `detectable_flow`: smallest step that is detected [m^3/s]."""
         balance = self.balance
-        size, pressure, pump, level = balance.size, balance.mean_pressure(), balance.mean_flow, balance.level
-        limit, litres = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
-        is_single = len(balance.columns) == 1  # a valve's edges pass as well, by an amount that is not known
-        stated, wide = size.stated and is_single, 1.0 + WITHIN_95 * size.deviation
-        low, high = (
-            end * pressure * litres * (wide if (end > 0.0) == upper else 1.0 / wide)
-            for end, upper in zip(level[1:], (False, True), strict=True)
-        )
+        size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
+        value, low, high = balance.conductance
+        limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
+        is_single = len(balance.columns) == 1  # a valve's edges leak as well, by an unknown amount
+        is_stated, size_factor = size.stated and is_single, 1.0 + WITHIN_95 * size.deviation
+        # the uncertainty of the size widens the interval at both ends
+        low = low * pressure * lpm_per_flow * (1.0 / size_factor if low > 0.0 else size_factor)
+        high = high * pressure * lpm_per_flow * (size_factor if high > 0.0 else 1.0 / size_factor)
         return TotalLeakage(
-            lpm=level.value * pressure * litres if stated else None,
-            interval_lpm=(low, high) if stated else None,
+            lpm=value * pressure * lpm_per_flow if is_stated else None,
+            interval_lpm=(low, high) if is_stated else None,
             pressure=pressure,
-            findable_lpm=None if findable is None or not size.stated else findable * litres,
+            findable_lpm=None if detectable_flow is None or not size.stated else detectable_flow * lpm_per_flow,
             healthy_lpm=limit * pressure / LITRE_PER_MINUTE if limit > 0.0 else None,
-            pump_share=max(level.value, 0.0) * pressure / pump if pump > 0.0 and is_single else None,
-            findable_share=None if findable is None or not pump > 0.0 else findable / pump,
+            pump_share=max(value, 0.0) * pressure / pump_flow if pump_flow > 0.0 and is_single else None,
+            findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,
         )
 
-    def course(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over the recording: what came with the onset, or what passes in all without one."""
+    def history(self, onset_s: float | None) -> LeakCourse | None:
+        """Return the history of the leakage: its growth since the onset, or the total leakage without an onset."""
         balance = self.balance
         if not balance.size.stated:
             return None
-        time = balance.blocks.time
-        course = balance.total_course if onset_s is None else balance.course(step=True).relative_to(time < onset_s)
-        value, deviation = course.mean, np.sqrt(np.maximum(np.diag(course.covariance), 0.0))
-        unit = balance.blocks.driving(balance.zero) * balance.size.scale / LITRE_PER_MINUTE
-        half = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
-        low, high = (value - half) * unit, (value + half) * unit
-        return LeakCourse(time, value * unit, low, high, whole=onset_s is None)
+        if onset_s is None:
+            blocks, history = balance.blocks, balance.total_history
+        else:
+            blocks = balance.running_blocks
+            history = balance.leak_history(with_step=True).relative_to(blocks.time < onset_s)
+        value, deviation = history.mean, np.sqrt(np.maximum(np.diag(history.covariance), 0.0))
+        lpm = blocks.mean_pressure(balance.pressure_offset) * balance.size.scale / LITRE_PER_MINUTE  # per conductance
+        half_width = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
+        low, high = (value - half_width) * lpm, (value + half_width) * lpm
+        return LeakCourse(blocks.time, value * lpm, low, high, whole=onset_s is None)
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks of the balance on sizes, zeros, delays and conditions."""
+        """Remarks on contradicting sizes, sensor offsets, delays and unusual conditions."""
         balance = self.balance
-        size, zero, remarks = balance.size, balance.zero, list[Remark]()
+        size, offset, delay = balance.size, balance.pressure_offset, balance.position_delay
+        remarks = list[Remark]()
         if size.ratio is not None and size.disagrees:
             remarks.append(Remark("sizes disagree", {"ratio": size.ratio.value}))
-        if abs(zero) > 2.0 * WITHIN_95 * priors("inference")["zero"]["pressure"]:
-            remarks.append(Remark("zero too high" if zero > 0.0 else "zero too low", {"bar": abs(zero) / 1e5}))
-        if (late := balance.delay) is not None and abs(late[0]) > 1.0 / balance.recording.rate + WITHIN_95 * late[1]:
-            remarks.append(Remark("x late" if late[0] > 0.0 else "x early", {"ms": 1e3 * abs(late[0])}))
-        return [*remarks, *self._conditions()]
+        if abs(offset) > 2.0 * WITHIN_95 * INFERENCE.zero.pressure:  # twice the largest usual one
+            remarks.append(Remark("zero too high" if offset > 0.0 else "zero too low", {"bar": abs(offset) / 1e5}))
+        # a delay of one sample is usual
+        if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
+            remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
+        return [*remarks, *self._iter_condition_remarks()]
 
-    def _conditions(self) -> Iterator[Remark]:
-        """Yield the conditions that no healthy recording had."""
-        for condition in conditions_beyond(self.balance.recording_sums, self.healthy):
+    def _iter_condition_remarks(self) -> Iterator[Remark]:
+        """Yield a remark on each condition outside of the range of the healthy recordings."""
+        for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":
                 yield Remark("load beyond", {"value": value / 1e5, "low": low / 1e5, "high": high / 1e5})
@@ -260,5 +380,18 @@ class BalanceLeak:
                 yield Remark("oil beyond", {"value": value, "low": low, "high": high})
 
 
-def _quotient(interval: tuple[float, float], unit: float | None) -> tuple[float, float] | None:
-    return None if unit is None or not unit > 0.0 else (max(interval[0], 0.0) / unit, interval[1] / unit)
+def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
+    """Build the distribution of a rise's flow, centred on `value` but at least zero, with a `weight` in a mixture.
+
+    `unit`: flow of a unit coefficient; `oil_deviation`: standard deviation of the coefficient due to the oil.
+    """
+    # the true rise is `value` minus an error that is distributed as a healthy recording's rise
+    weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))
+    return Mixture(weight * weights, unit * np.hypot(deviations, oil_deviation), unit * (max(value, 0.0) - centres))
+
+
+def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
+    """Divide an interval, cut off at zero, by a divisor; None if the divisor is None or not positive."""
+    if divisor is None or not divisor > 0.0:
+        return None
+    return max(interval[0], 0.0) / divisor, interval[1] / divisor

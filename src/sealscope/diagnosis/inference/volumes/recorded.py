@@ -1,4 +1,4 @@
-"""A recording's balance with all that is asked of it, and what sizes its flows."""
+"""Volume balance of one recording: leak, observables, holds, and the scale of its flows."""
 
 from __future__ import annotations
 
@@ -9,15 +9,39 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import still_rate
-from sealscope.diagnosis.inference.blocks import Blocks, Columns, information, mean_of, solve, zero_of
+from sealscope.diagnosis.inference.balance import max_rest_rate
+from sealscope.diagnosis.inference.blocks import (
+    Blocks,
+    ColumnRoles,
+    estimate_offset,
+    estimate_weighted_mean,
+    information,
+    offset_cost,
+    solve,
+)
+from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
-from sealscope.diagnosis.inference.circuit.locked_holds import CylinderSides, HeldChambers, find_locked_holds
+from sealscope.diagnosis.inference.circuit.locked_holds import (
+    CylinderSides,
+    HeldChambers,
+    LockedHold,
+    find_locked_holds,
+)
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import WITHIN_95, Course, Information, Interval, StepTest, course, step_test
+from sealscope.diagnosis.inference.onset import (
+    MIN_BLOCKS,
+    WITHIN_95,
+    History,
+    Information,
+    Interval,
+    StepTest,
+    fit_history,
+    step_test,
+)
+from sealscope.diagnosis.inference.regimes import rest_log_odds
 from sealscope.diagnosis.inference.scatter import RecordingSums
-from sealscope.diagnosis.inference.terms import LAG, LEAST_ABSOLUTE, PUMP, Equation, Signals, find_rests
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.inference.terms import LAG, MIN_ABSOLUTE_PRESSURE, PUMP, Equation, Signals, find_rests
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
 from sealscope.recordings.channels import COUNTS, flow_source
@@ -29,43 +53,51 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Share of samples below which a pressure is that of the charge, and beyond which a position is an end of the stroke.
-CHARGED = 0.02
+#: Quantile of the lowest pressure that is the charge pressure, and of the position at an end of the stroke.
+END_QUANTILE = 0.02
+
+
+class Estimate(NamedTuple):
+    """An estimate and its standard deviation."""
+
+    value: float
+    deviation: float
 
 
 class Size(NamedTuple):
-    """Scale from a flow by the assumed displacement to that of the machine.
+    """Factor `scale` from a flow by the assumed displacement to the machine's, with its relative standard `deviation`.
 
-    `scale`, its relative `deviation`; `stated`: whether L/min can be stated at all; `ratio`: displacement over area as
-    measured, over the assumed one, with its interval, None where the position has no unit; `area` of the piston by the
-    assumed displacement [m^2].
+    `stated`: whether L/min can be stated; `ratio`: measured displacement over area relative to the assumed ratio, None
+    if the position has no unit; `area` of the piston by the assumed displacement [m^2]; `disagrees`: stated
+    displacement and area contradict each other.
     """
 
     scale: float
     deviation: float
     stated: bool
-    ratio: Interval | None
-    area: float | None
+    ratio: Interval | None = None
+    area: float | None = None
     disagrees: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedBalance:
-    """A recording's blocks with all that is asked of them.
+    """Volume balance of a recording.
 
-    `lost`: tests of a step of what leaves the circuit by the accumulator's own balance, by the term's name; `plain`:
-    the blocks with the zero of p_A - p_B as recorded, where they are others; `shut`: a valve cuts the pump off at rest,
-    so that the leak's coefficient is the piston's alone (`regimes`).
+    `oil_loss`: step tests of external leaks by the accumulator's balance, by term name; `plain`: the blocks without the
+    correction of the pressure offset, if they differ; `shut`: a valve cuts the pump off at rest, so that the leak is
+    the piston's alone (`regimes`); `locked`: holds behind shut valves measure the leaks.
     """
 
     blocks: Blocks
     equations: tuple[Equation, ...]
-    columns: tuple[Columns, ...]
+    columns: tuple[ColumnRoles, ...]
     rig: Rig
     recording: Recording
-    lost: Mapping[str, StepTest] = field(default_factory=dict)
+    oil_loss: Mapping[str, StepTest] = field(default_factory=dict)
     plain: Blocks | None = None
     shut: bool = False
+    locked: bool = False
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
@@ -73,9 +105,23 @@ class RecordedBalance:
         return frozenset(self.recording.units.items())
 
     @cached_property
+    def _first_motion(self) -> int:
+        """Index of the first block with motion; 0 if the blocks from there on are too few for a step."""
+        first = int(np.argmax(self.blocks.is_moving))
+        return first if len(self.blocks) - first >= MIN_BLOCKS else 0
+
+    @property
+    def running_blocks(self) -> Blocks:
+        """Blocks from the first motion on, in which steps are sought.
+
+        Before it a machine may be off, its valves shut; that the pump then begins to hold the load is no leak.
+        """
+        return self.blocks[self._first_motion :]
+
+    @cached_property
     def leak(self) -> Information:
-        """Likelihood of the leak's coefficient in the blocks."""
-        return information(self.blocks, self.columns, self.columns[0].leak)
+        """Likelihood of the leak's coefficient in the `running_blocks` blocks."""
+        return information(self.running_blocks, self.columns, self.columns[0].leak)
 
     @cached_property
     def test(self) -> StepTest | None:
@@ -85,158 +131,224 @@ class RecordedBalance:
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
         """Steps of all terms' coefficients, the most likely first."""
-        return volume_observables(self.blocks, self.plain or self.blocks, self.equations, self.columns, self.lost)
+        plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
+        return volume_observables(
+            self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio
+        )
+
+    @property
+    def volume_ratio(self) -> float:
+        """Measured over assumed ratio of area to displacement, by which the balance scales the cylinder's volumes."""
+        ratio = self.size.ratio
+        return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
         """Sums of the recording, for comparison with other recordings."""
-        dated, oil = start_seconds(self.recording), oil_temperature(self.recording)
-        sums = RecordingSums.from_blocks(self.blocks, self.columns, dated, oil)
-        return sums if self.chambers is None else sums._replace(held=np.array(self.chambers.leaks))
+        start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
+        sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
+        held = None if self.chambers is None else np.array(self.chambers.leaks)
+        return sums._replace(held=held, viscous_drop=estimate_viscous_drop(self.recording))
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
-        """The chambers while valves shut them from a resting pump; None where they do not, or too little is held."""
-        sides = self._sides() if self.shut and self.recording.units["p_A"] != COUNTS else None
+        """Chambers during holds, in which valves shut them off from the resting pump; None without such holds."""
+        sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
             return None
         recording, balance = self.recording, self.equations[0]
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
-        left = balance.left(Signals(dict(recording.channels), recording.rate, {}))
-        rests = find_rests(left, recording.rate, still_rate(left, recording.rate))
-        lowest = np.minimum(pressures["p_A"], pressures["p_B"])
-        least = float(np.nanquantile(lowest, CHARGED))
-        to_absolute = max(P_ATM, LEAST_ABSOLUTE - float(np.nanmin(lowest)))
+        pumped = balance.left(Signals(dict(recording.channels), recording.rate, {}))
+        rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
+        lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
+        charge = float(np.nanquantile(lower_pressure, END_QUANTILE))
+        # gauge to absolute pressure; more if sensor offsets would leave less than a small positive pressure
+        to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
-        holds = find_locked_holds(channels, rests, recording.rate)
-        ends = float(recording.t[0]), float(recording.t[-1])
-        return HeldChambers(holds, sides, *ends, least + to_absolute) if holds else None
+        holds = [
+            hold
+            for hold in find_locked_holds(channels, rests, recording.rate)
+            if self._is_pump_off(hold, pumped) and self._is_loaded(hold)
+        ]
+        begin, end = float(recording.t[0]), float(recording.t[-1])
+        return HeldChambers(holds, sides, begin, end, charge + to_absolute) if holds else None
 
-    def _sides(self) -> CylinderSides | None:
-        """Return the areas of both sides, with the sign of x, and the recorded stroke; None where motion shows none."""
-        column, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
-        chosen = list(column.nuisance)
-        found = dict(zip(chosen, solve(total[np.ix_(chosen, chosen)], total[chosen, column.left]), strict=True))
+    def _is_pump_off(self, hold: LockedHold, pumped: Array) -> bool:
+        """Test whether the pump rests in a hold, by the volumes (n - 1,) [m^3] that it delivers between samples.
+
+        The alternative is a pump that holds the load: it delivers what leaks, however little a noisy speed shows of it.
+        """
+        recording = self.recording
+        begin, end = np.searchsorted(recording.t, hold.t[[0, -1]])
+        flow = pumped[begin:end] * recording.rate
+        flow = flow[np.isfinite(flow)]
+        variance = float(flow.var()) / max(flow.size, 1)  # of the mean
+        holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
+        return rest_log_odds(abs(float(flow.mean())), variance, holding_flow, variance) > 0.0
+
+    def _is_loaded(self, hold: LockedHold) -> bool:
+        """Test whether p_A - p_B in a hold is surely a load, and not the sensors' offset under equal pressures.
+
+        A leak equalises the pressures that no load maintains, so that a hold of equal pressures shows none. Loads up to
+        twice the mean pressure difference of the recording are equally likely.
+        """
+        prior = INFERENCE.zero
+        pressure = float(np.abs(hold.mean(hold.p_A - hold.p_B)).max())
+        log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
+        log_load_density = -float(np.log(max(2.0 * self.mean_pressure(), np.finfo(float).tiny)))
+        return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
+
+    def locked_odds(self) -> float | None:
+        """Compute the log odds, by the leaks in holds, that valves shut the chambers; None without holds.
+
+        Without such valves the oil passes the resting pump as it passes the turning one.
+        """
+        if self.chambers is None:
+            return None
+        leaks, total_leak = self.chambers.leaks, self.conductance
+        values = np.array([leaks.piston, leaks.outside_A, leaks.outside_B])
+        deviations = np.array([leaks.deviation, leaks.deviation_A, leaks.deviation_B])
+        variance = float((deviations[values > 0.0] ** 2).sum()) if values.any() else leaks.deviation**2
+        total_variance = ((total_leak.high - total_leak.low) / (2.0 * WITHIN_95)) ** 2
+        max_odds: float = INFERENCE.rest.most
+        odds = rest_log_odds(float(values.sum()), variance, total_leak.value, variance + total_variance)
+        return float(np.clip(odds, -max_odds, max_odds))
+
+    def _cylinder_sides(self) -> CylinderSides | None:
+        """Estimate the piston areas and the ends of the stroke; None if they are undetermined."""
+        area_A, area_B = self._signed_areas()
+        x = self.recording["x"][np.isfinite(self.recording["x"])]
+        if not x.size:
+            return None
+        low, high = (float(end) for end in np.quantile(x, (END_QUANTILE, 1.0 - END_QUANTILE)))
+        max_area_ratio: float = INFERENCE.held_oil.unlike
+        if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
+            return None
+        return CylinderSides(area_A, area_B, low, high)
+
+    def _signed_areas(self) -> tuple[float, float]:
+        """Estimate the piston areas of A and B by the assumed displacement [m^2], negative if x is reversed.
+
+        The area of a side is the mean of its coefficients of motion, weighted by their energy. The side with less
+        energy takes the area of the other if it never carries the load. Both are zero if nothing moves.
+        """
+        roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
+        nuisance = list(roles.nuisance)
+        coefficients = dict(
+            zip(nuisance, solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left]), strict=True)
+        )
         areas, energies = [], []
         for side in "AB":
-            motion = [k for k in column.motion if column.names[k].endswith(f"{side} carries")]
+            motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
             energy = np.diag(total)[motion]
             energies.append(float(energy.sum()))
-            areas.append(float(energy @ [found[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
+            areas.append(float(energy @ [coefficients[k] for k in motion]) / max(energies[-1], np.finfo(float).tiny))
         main = int(np.argmax(energies))
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
+            # the stated areas, in the scale of the balance's flows
             sign = np.sign(areas[main])
             areas = [sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B)]
-        if areas[0] * areas[1] <= 0.0:  # the other side never carries
+        if areas[0] * areas[1] <= 0.0:
             areas[1 - main] = areas[main]
-        x = self.recording["x"][np.isfinite(self.recording["x"])]
-        low, high = (float(end) for end in np.quantile(x, (CHARGED, 1.0 - CHARGED))) if x.size else (0.0, 0.0)
-        unlike: float = priors("inference")["held_oil"]["unlike"]
-        if not (areas[main] and high > low and 1.0 / unlike < areas[0] / areas[1] < unlike):
-            return None
-        return CylinderSides(areas[0], areas[1], low, high)
+        return areas[0], areas[1]
 
     @cached_property
-    def zero(self) -> float:
-        """Zero of p_A - p_B [Pa], as a change of the leak shows it."""
-        return zero_of(self.blocks, self.columns)
+    def pressure_offset(self) -> float:
+        """Offset of p_A - p_B [Pa], estimated from a change of the leak."""
+        return estimate_offset(self.blocks, self.columns)
 
     @cached_property
-    def delay(self) -> tuple[float, float] | None:
-        """Delay of x behind the flow [s], by the share of its lag in the motion, with its deviation."""
-        column = self.columns[0]
-        motion = [k for k in column.motion if column.names[k].startswith("motion")]
-        if LAG not in column.names or not motion:
+    def position_delay(self) -> Estimate | None:
+        """Delay of x behind the flow [s]: coefficient of the lag over the area."""
+        roles = self.columns[0]
+        motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
+        if LAG not in roles.names or not motion:
             return None
-        area = _area(self, motion).measured
-        value, deviation = mean_of(self.blocks, column, {column.names.index(LAG): 1.0})
-        return (value / area, deviation / area) if area > 0.0 else None
+        area = _loaded_area(self, motion).measured
+        value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
+        return Estimate(value / area, deviation / area) if area > 0.0 else None
 
     def mean_pressure(self, since: float = -np.inf) -> float:
-        """Return the mean size of p_A - p_B about its zero [Pa], over the blocks whose middle is `since` or later."""
-        return self.mean_of_blocks(self.blocks.driving(self.zero), since)
+        """Compute the mean of abs(p_A - p_B), offset removed [Pa], over the blocks whose middle is `since` or later."""
+        return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean size of the pump's flow [m^3/s]."""
+        """Mean absolute flow of the pump [m^3/s]."""
         return self.mean_of_blocks(self.blocks.flow)
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Return the mean of a value of each block (K,), over the blocks whose middle is `since` or later."""
-        chosen = self.blocks.time >= since
-        if not chosen.any():
-            chosen[-1] = True
-        return float(np.average(values[chosen], weights=np.maximum(self.blocks.rows[chosen], 1e-9)))
-
-    @cached_property
-    def moving(self) -> float:
-        """Mean flow while it flows [m^3/s]: the mean weighted by itself, so that standstills do not count."""
-        flow = self.blocks.flow
-        return float(flow @ flow / max(float(flow.sum()), np.finfo(float).tiny))
+        """Average values of the blocks (K,), by number of rows, over those whose middle is `since` or later."""
+        is_after = self.blocks.time >= since
+        if not is_after.any():
+            is_after[-1] = True
+        return float(np.average(values[is_after], weights=np.maximum(self.blocks.rows[is_after], 1e-9)))
 
     @cached_property
     def size(self) -> Size:
         """Scale from a flow by the assumed displacement to that of the machine."""
-        return _size(self)
+        return _flow_scale(self)
 
     @cached_property
-    def level(self) -> Interval:
+    def conductance(self) -> Interval:
         """Total leakage of pump and piston over the recording, as a conductance with its interval.
 
-        The pressures at the pump's ports hardly differ from those of the chambers: the sum is known, its parts are not.
+        The pressures at the pump's ports hardly differ from those of the chambers, so that only the sum is determined.
         """
         weights = np.maximum(self.blocks.rows, 0.0)
-        return self.total_course.over(weights / weights.sum())
+        return self.total_history.average(weights / weights.sum())
 
     @cached_property
-    def total_course(self) -> Course:
-        """Total leakage of pump and piston over the blocks, as a conductance."""
-        column = self.columns[0]
-        pump = column.names.index(PUMP) if PUMP in column.names else None
-        both = information(self.blocks, self.columns, column.leak, pump)
-        test = step_test(both)
-        return course(both, test, step=test is not None and test.chance < RAREST)
+    def total_history(self) -> History:
+        """Total leakage of pump and piston in each block, as a conductance."""
+        roles = self.columns[0]
+        pump = roles.names.index(PUMP) if PUMP in roles.names else None
+        total = information(self.blocks, self.columns, roles.leak, pump)
+        test = step_test(total)
+        return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
-    def course(self, step: bool) -> Course:
-        """Return the leak's coefficient over the blocks."""
-        return course(self.leak, self.test, step)
+    def leak_history(self, *, with_step: bool) -> History:
+        """Estimate the leak's coefficient in each of the `running_blocks` blocks, with the best step or without one."""
+        return fit_history(self.leak, self.test, with_step=with_step)
 
 
-def _size(balance: RecordedBalance) -> Size:
-    """Weigh what is stated of displacement and area against each other.
+def _flow_scale(balance: RecordedBalance) -> Size:
+    """Determine the scale of flows and its uncertainty from what the rig states of displacement and area.
 
-    A flow meter sizes flows by itself. Else the balance measures their ratio: a stated displacement sizes every flow
-    directly, a stated area by that ratio; where both are stated and disagree the flow lies between what either says.
+    A flow meter needs no scale. Otherwise the balance measures the ratio of displacement and area: a stated
+    displacement scales every flow directly, a stated area through that ratio; if both are stated and disagree, the
+    difference is the uncertainty.
     """
-    column, rig, meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
-    believed = priors("inference")["size"]
+    roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
+    prior = INFERENCE.size
     source = flow_source(balance.recording.channels)  # a meter's unit follows from the area
-    with_unit = source == "q_pump" or (source, "count") not in balance.units
-    pressures = not {("p_A", "count"), ("p_B", "count")} & balance.units
-    states_displacement = rig.states("pump.q_b") and with_unit
+    has_flow_unit = source == "q_pump" or (source, COUNTS) not in balance.units
+    has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
+    states_displacement = rig.states("pump.q_b") and has_flow_unit
+    states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
     if len(balance.columns) > 1:  # behind a valve the area sizes the flow
-        return Size(1.0, believed["area"], rig.states("cylinder.A_A", "cylinder.A_B") and pressures, None, None)
-    motion = [k for k in column.motion if column.names[k].startswith("motion")]
-    area = _area(balance, motion) if motion and ("x", "m") in balance.units else None
-    if area is None or not area.measured > 0.0 or not with_unit:
-        known = believed["meter" if meter else "displacement"]
-        return Size(1.0, known, (meter or states_displacement) and pressures, None, None)
-    if meter:
-        return Size(1.0, believed["meter"], pressures, None, area.measured)
+        return Size(1.0, prior.area, stated=states_areas and has_pressure_unit)
+    motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
+    area = _loaded_area(balance, motion) if motion and ("x", "m") in balance.units else None
+    if area is None or not area.measured > 0.0 or not has_flow_unit:
+        deviation = prior.meter if is_meter else prior.displacement
+        return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
+    if is_meter:
+        return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured)
     ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
     disagreement = abs(1.0 / ratio.value - 1.0)
-    known = float(np.hypot(believed["displacement"], believed["area"]))
+    both_deviation = float(np.hypot(prior.displacement, prior.area))
     if states_displacement:
-        disagrees = rig.states("cylinder.A_A", "cylinder.A_B") and disagreement > WITHIN_95 * known
-        deviation = disagreement if disagrees else believed["displacement"]
-        return Size(1.0, deviation, pressures, ratio, area.measured, disagrees)
-    if rig.states("cylinder.A_A", "cylinder.A_B"):
-        return Size(ratio.value, believed["area"], pressures, ratio, area.measured)
-    return Size(1.0, known, False, ratio, area.measured)
+        disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
+        deviation = disagreement if disagrees else prior.displacement
+        return Size(1.0, deviation, has_pressure_unit, ratio, area=area.measured, disagrees=disagrees)
+    if states_areas:
+        return Size(ratio.value, prior.area, has_pressure_unit, ratio, area=area.measured)
+    return Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
 
 
 class _Area(NamedTuple):
-    """The area of the side that carries [m^2]: `measured` by the assumed displacement, with its interval; `assumed`."""
+    """Area of the side under load [m^2]: `measured` by the assumed displacement, with its interval, and `assumed`."""
 
     measured: float
     low: float
@@ -244,12 +356,12 @@ class _Area(NamedTuple):
     assumed: float
 
 
-def _area(balance: RecordedBalance, motion: list[int]) -> _Area:
-    """Return the area of the side that carries, the mean of both ways and sides in the proportion that they occur."""
-    column, cylinder = balance.columns[0], balance.rig.cylinder
+def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
+    """Estimate the area of the loaded side: the mean over directions and sides, weighted by their information."""
+    roles, cylinder = balance.columns[0], balance.rig.cylinder
     energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
-    shares = energy / max(float(energy.sum()), np.finfo(float).tiny)
-    value, deviation = mean_of(balance.blocks, column, dict(zip(motion, shares, strict=True)))
-    value, half = abs(value), WITHIN_95 * deviation
-    stated = [cylinder.A_A if column.names[k].endswith("A carries") else cylinder.A_B for k in motion]
-    return _Area(value, value - half, value + half, float(shares @ stated))
+    weights = energy / max(float(energy.sum()), np.finfo(float).tiny)
+    value, deviation = estimate_weighted_mean(balance.blocks, roles, dict(zip(motion, weights, strict=True)))
+    value, half_width = abs(value), WITHIN_95 * deviation
+    assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
+    return _Area(value, value - half_width, value + half_width, float(weights @ assumed))

@@ -1,8 +1,9 @@
-"""What else than a leak past piston or pump may have changed since the healthy recordings: rivals of its rise.
+"""Other causes than a leak past piston or pump of a change since the healthy recordings: rivals of the leak's rise.
 
-Each term whose coefficient a fault changes is fitted to what a recording's rows leave of the healthy coefficients, all
-others tied to theirs within what recordings of a machine differ by (`priors.toml`), the leak's as well. The scatter of
-the same number between the healthy recordings is its null (`differences`).
+The coefficient of each term that a fault changes is fitted to the residual of a recording under the healthy
+coefficients, with priors on the differences of all other coefficients, the leak's included (`priors.toml`). The
+scatter of this difference between the healthy recordings is its null (`differences`). A leak to the outside and one
+past the piston look nearly alike: the likelihood ratio of the two is stated with the observable.
 """
 
 from __future__ import annotations
@@ -12,76 +13,109 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Columns, solve
-from sealscope.diagnosis.inference.differences import difference, rarity_of_size
+from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
+from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
+from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.scatter import FEWEST_HELD, RISE, RecordingSums
+from sealscope.diagnosis.inference.scatter import MIN_WITH_HOLDS, RISE, RecordingSums, compare_with_leak, rise
 from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
-from sealscope.diagnosis.priors import priors
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
-#: Name of the data that what the turning pump loses is, where rests tell of the piston alone.
+#: `Observable.data` of the leakage of the turning pump, if rests show the piston alone.
 TURNING_DATA = "turning"
 
 
 def rival_rises(
-    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[Columns]
+    judged: RecordingSums,
+    healthy: Sequence[RecordingSums],
+    columns: Sequence[ColumnRoles],
+    volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Compare each rival's coefficient in a recording with the healthy recordings'."""
-    names, held = columns[0].names, held_rivals(judged, healthy)
-    turns = (TURNING,) if SPEED_LOSS in names else ()  # what a meter reads has left the pump
-    tested = [k for k, name in enumerate(names) if name in (AIR, *turns) or name.startswith("external leak")]
-    if held is not None:
+    """Compare the coefficients of other leaks, the turning pump's and air in a recording with the healthy ones.
+
+    `volume_ratio`: measured over assumed ratio of area to displacement.
+    """
+    names, hold_rivals = columns[0].names, held_rivals(judged, healthy)
+    turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
+    tested = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
+    if hold_rivals is not None:
         tested = [k for k in tested if not names[k].startswith("external leak")]
-    everything = np.sum([recording.sums for recording in healthy], axis=0)
-    observables = []
+    healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
+    observables = list[Observable]()
     for k in tested:
-        values = [
-            _shift(subject.sums, everything - subject.sums if subject is not judged else everything, columns, k)
-            for subject in (judged, *healthy)
-        ]
-        data = TURNING_DATA if names[k] == TURNING else RISE
-        observable = difference(names[k], data, values[0], values[1:], above=names[k] != AIR)
-        if observable is not None:
-            observables.append(_by_size(observable, judged) if names[k].startswith("external leak") else observable)
-    return (*observables, *(held or ()))
+        change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
+        # of each healthy recording from the others
+        changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
+        is_air = names[k] == AIR
+        observable = compare_with_healthy(
+            names[k],
+            TURNING_DATA if names[k] == TURNING else RISE,
+            change,
+            [healthy_change for healthy_change, _ in changes],
+            excess_error(error, [healthy_error for _, healthy_error in changes]),
+            above=not is_air,
+            prior_change=INFERENCE.free_air.size * volume_ratio if is_air else np.inf,
+        )
+        if observable is None:
+            continue
+        if names[k] == TURNING:
+            pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
+            # a rise that warmer oil explains, in logarithms, is none
+            observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
+        elif not is_air:
+            fit = compare_with_leak(judged, healthy, columns, names[k])
+            log_ratio_to_leak = None if fit is None else INFERENCE.size.readings * fit
+            observable = replace(_penalise_size(observable, judged), log_ratio_to_leak=log_ratio_to_leak)
+        observables.append(observable)
+    return (*observables, *(hold_rivals or ()))
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Compare what either side loses to the outside while valves shut the chambers; None where too few hold any."""
-    known = [recording.held for recording in healthy if recording.held is not None]
-    if judged.held is None or len(known) < FEWEST_HELD:
+    """Compare the leaks from A and from B to the outside during holds; None if too few recordings have holds."""
+    healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
+    if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
         return None
-    by_flow = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
-    least, observables = priors("inference")["scatter"]["finest"] * by_flow, list[Observable]()
-    for k, side in ((2, "A"), (4, "B")):
-        numbers = [float(held[k]) for held in known]
-        error = max(float(np.median([judged.held[k + 1], *(held[k + 1] for held in known)])), least)
-        observable = difference(f"external leak {side}", RISE, float(judged.held[k]), numbers, error, above=True)
-        observables += [] if observable is None else [_by_size(observable, judged)]
+    conductance_of_flow = judged.flow / judged.pressure if judged.pressure > 0.0 else 0.0
+    min_error, observables = INFERENCE.scatter.finest * conductance_of_flow, list[Observable]()
+    for side in "AB":
+        leak, deviation = (HeldLeaks._fields.index(f"{name}_{side}") for name in ("outside", "deviation"))
+        coefficients = [float(leaks[leak]) for leaks in healthy_leaks]
+        error = max(float(np.median([leaks[deviation] for leaks in (judged.held, *healthy_leaks)])), min_error)
+        observable = compare_with_healthy(
+            f"external leak {side}", RISE, float(judged.held[leak]), coefficients, error, above=True
+        )
+        observables += [] if observable is None else [_penalise_size(observable, judged)]
     return tuple(observables)
 
 
-def _by_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Return a leak to the outside with its size against it: a large one is seen."""
-    return replace(observable, advantage=-rarity_of_size("outside", observable.size * judged.pressure, above=True))
+def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
+    """Set the advantage of an external leak to minus the penalty of its flow, as a large leak would be noticed."""
+    return replace(
+        observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
+    )
 
 
-def _shift(sums: Array, reference: Array, columns: Sequence[Columns], test: int) -> float:
-    """Compute by how much a column's coefficient in one recording's sums (E, m, m) is beyond that of others."""
-    precision, vector = 0.0, 0.0
-    leak_width: float = priors("inference")["between"]["pump"]
-    for e, column in enumerate(columns):
-        width = column.between.copy()
-        width[column.names.index(LEAK)] = leak_width
-        chosen = [k for k in column.compared if k != test and np.isfinite(width[k])]
-        coefficients = solve(reference[e][np.ix_(chosen, chosen)], reference[e][chosen, column.left])
-        residual = sums[e][:, column.left] - sums[e][:, chosen] @ coefficients
+def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
+    """Estimate the change of the coefficient `tested` from healthy recordings to another, and its standard error.
+
+    `gram`, `reference`: Gram matrices (E, m, m) of the recording and of the healthy ones. The other coefficients differ
+    from the healthy ones by a normal prior and are eliminated (Schur complement): change = moment / precision, summed
+    over the equations. Without information the change is 0 and the error infinite.
+    """
+    precision, moment = 0.0, 0.0
+    leak_deviation: float = INFERENCE.between.pump
+    for e, roles in enumerate(columns):
+        deviations = roles.between_deviation.copy()
+        deviations[roles.names.index(LEAK)] = leak_deviation
+        free = [k for k in roles.compared if k != tested and np.isfinite(deviations[k])]
+        coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
+        residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
         with np.errstate(divide="ignore", over="ignore"):
-            prior = 1.0 / (np.abs(coefficients) * width[chosen]) ** 2
-        matrix, cross = sums[e][np.ix_(chosen, chosen)], sums[e][chosen, test]
-        tied = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
-        solved = solve(tied, np.column_stack([cross, residual[chosen]]))
-        precision += float(sums[e][test, test] - cross @ solved[:, 0])
-        vector += float(residual[test] - cross @ solved[:, 1])
-    return vector / precision if precision > 0.0 else 0.0
+            prior = 1.0 / (np.abs(coefficients) * deviations[free]) ** 2
+        matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
+        regularised = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
+        solved = solve(regularised, np.column_stack([cross, residual[free]]))
+        precision += float(gram[e][tested, tested] - cross @ solved[:, 0])
+        moment += float(residual[tested] - cross @ solved[:, 1])
+    return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

@@ -1,1 +1,1 @@
-"""What stands above the samples: names and units of columns, what they may mean, and remarks on the recording."""
+"""Headings: names and units of columns, their likely channels, and remarks on the recording."""

@@ -1,9 +1,10 @@
-"""What a file says of its recording beside the samples: operator, machine, oil temperature, remarks."""
+"""Remarks on a recording in the header of its file: operator, machine, oil temperature, sampling rate."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -12,11 +13,11 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, to_si
 
-#: Most entries that are kept, and the longest name and text of each.
-_MOST, _LONGEST_NAME, _LONGEST_TEXT = 40, 60, 200
+#: Most remarks that are read, and the longest name and text of each.
+_MAX_REMARKS, _MAX_NAME, _MAX_TEXT = 40, 60, 200
 _PAIR = re.compile(r"([^:=]{1,60}?)[ \t]{0,8}[:=](?!\\|//)[ \t]{0,8}(.{1,400})")
-#: What loggers call the sampling rate, and the time from one sample to the next.
-_STATED = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate", "interval")]
+#: Names of the sampling rate, and of the sampling interval.
+_STATED_NAMES = [re.compile(WORDS["stated"][kind], re.IGNORECASE) for kind in ("rate", "interval")]
 _ENDING = re.compile(r"(?P<name>.{1,60}?)[_ ](?P<unit>[kM]?Hz|[mun\u00b5\u03bc]?s)")
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
@@ -30,30 +31,29 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Find the sampling rate [Hz] in a file's entries, stated by a rate or an interval; None without."""
+    """Find the sampling rate [Hz] in a file's remarks, stated as a rate or an interval; None if there is none."""
     for name, text in remarks.items():
         label = Label.parse(name)
         if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
             label = Label(name, ending["name"], ending["unit"])
-        matches = [pattern.fullmatch(label.name) for pattern in _STATED]
-        cells = re.split(r"[;,\t]\s*", text.strip())  # one a channel, all the same
+        is_rate, is_interval = (pattern.fullmatch(label.name) is not None for pattern in _STATED_NAMES)
+        cells = re.split(r"[;,\t]\s*", text.strip())  # one for each channel, all equal
         quantity = _QUANTITY.fullmatch(cells[0] if len(set(cells)) == 1 else text.strip())
-        if quantity is None or not any(matches):
+        if quantity is None or not (is_rate or is_interval):
             continue
-        usual = "Hz" if matches[0] else "s"
-        unit = label.unit or quantity["unit"].strip("\"'[]();,") or usual
-        try:
-            per_second = parse_unit(unit).powers == parse_unit("Hz").powers
-            value = to_si(float(quantity["number"].replace(",", ".")), unit, "Hz" if per_second else "s")
-        except InputError:
-            value, per_second = float(quantity["number"].replace(",", ".")), bool(matches[0])
+        default_unit = "Hz" if is_rate else "s"
+        unit = label.unit or quantity["unit"].strip("\"'[]();,") or default_unit
+        value = float(quantity["number"].replace(",", "."))
+        with suppress(InputError):  # an unknown unit: take the default one
+            in_hertz = parse_unit(unit).powers == parse_unit("Hz").powers  # an interval may be stated as a rate
+            value, is_rate = to_si(value, unit, "Hz" if in_hertz else "s"), in_hertz
         if value > 0.0:
-            return float(f"{value if per_second else 1.0 / value:.12g}")
+            return float(f"{value if is_rate else 1.0 / value:.12g}")
     return None
 
 
-def exported_from(remarks: Mapping[str, str]) -> np.datetime64 | None:
-    """Find the stated start of a TwinCAT Scope export; None without."""
+def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
+    """Find the start time stated by a TwinCAT Scope export; None if there is none."""
     for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:
@@ -61,47 +61,48 @@ def exported_from(remarks: Mapping[str, str]) -> np.datetime64 | None:
     return None
 
 
-def entries(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Return name -> text of the pairs that have both, printable and cut to length; the first of a name stays."""
-    kept: dict[str, str] = {}
+def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
+    """Collect name -> text of pairs with both, printable and shortened; the first of a repeated name is used."""
+    remarks: dict[str, str] = {}
     for name, value in pairs:
-        key, text = _line(str(name), _LONGEST_NAME), _line(str(value), _LONGEST_TEXT)
-        if key and text and key not in kept:
-            kept[key] = text
-        if len(kept) == _MOST:
+        key, text = _clean_text(str(name), _MAX_NAME), _clean_text(str(value), _MAX_TEXT)
+        if key and text and key not in remarks:
+            remarks[key] = text
+        if len(remarks) == _MAX_REMARKS:
             break
-    return kept
+    return remarks
 
 
-def remarks_of(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the entries that a recording's provenance holds, whoever has written it."""
+def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
+    """Return the remarks in a recording's provenance, printable and shortened, as it may come from anywhere."""
     remarks = provenance.get("about")
-    return entries(remarks.items()) if isinstance(remarks, Mapping) else {}
+    return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 
 
-def of_lines(lines: Sequence[str], delimiter: str) -> dict[str, str]:
-    """Return the entries of the lines above a log's header: `Operator: N. N.`, `Oil = 40 degC`, `Date;2024-05-31`."""
+def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
+    """Parse remarks in the lines above a log's header: `Operator: N. N.`, `Oil = 40 degC`, `Date;2024-05-31`."""
     pairs: list[tuple[str, str]] = []
-    for line in lines[: 4 * _MOST]:
+    for line in lines[: 4 * _MAX_REMARKS]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]
-        if delimiter.strip() or delimiter == "\t":
-            name, sign, value = text.partition(delimiter)
-            if sign and name.strip() and value.strip(f" {delimiter}") and ":" not in name:
+        if delimiter.strip() or delimiter == "\t":  # a blank also separates words
+            name, separator, value = text.partition(delimiter)
+            if separator and name.strip() and value.strip(f" {delimiter}") and ":" not in name:
                 pairs.append((name, value.strip(f" {delimiter}")))
                 continue
         match = _PAIR.fullmatch(text)
         if match is not None:
             pairs.append((match[1], match[2].strip(f" {delimiter}")))
-    return entries(pairs)
+    return collect_remarks(pairs)
 
 
-def _line(text: str, longest: int) -> str:
-    return " ".join(printable(text[: 4 * longest], instead=" ").split()).strip("\"'")[:longest]
+def _clean_text(text: str, max_length: int) -> str:
+    """Make a text printable, on one line and at most `max_length` characters."""
+    return " ".join(printable(text[: 4 * max_length], instead=" ").split()).strip("\"'")[:max_length]
 
 
 def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
-    """Return the oil's temperature [deg C] by a recording's provenance, None where it does not state it."""
-    for name, text in remarks_of(provenance).items():
+    """Find the oil temperature [deg C] in the remarks of a recording's provenance; None if it is not stated."""
+    for name, text in clean_remarks(provenance).items():
         if not _OIL.search(name):
             continue
         unit_of_name = _UNIT_OF_NAME.search(name)
@@ -110,6 +111,6 @@ def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
             continue
         value, unit = float(match["value"].replace(",", ".")), match["unit"].upper().replace("℃", "C")[-1]
         celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
-        if -60.0 < celsius < 200.0:
+        if -60.0 < celsius < 200.0:  # otherwise no oil has this temperature
             return celsius
     return None

@@ -1,4 +1,4 @@
-"""Which channel a foreign column probably is, by the words of its name in several languages and by its unit."""
+"""Guess the channel of a foreign column from the words of its name, in several languages, and its unit."""
 
 from __future__ import annotations
 
@@ -15,26 +15,28 @@ from sealscope.units import is_familiar, same_dimension
 _MEASURED = {name: frozenset(words) for name, words in WORDS["measured"].items()}
 _SIDE = {name: frozenset(words) for name, words in WORDS["side"].items()}
 _KIND = {name: frozenset(words) for name, words in WORDS["kind"].items()}
-#: Words of a script that writes no blanks between words.
+#: Words of scripts without spaces between words (code points above U+2E7F, the beginning of CJK).
 _UNSPACED = frozenset(
     word for words in (*_MEASURED.values(), *_SIDE.values()) for word in words if ord(word[0]) > 0x2E7F
 )
-#: What a column measures -> the unit, and the channel, that it has; a pressure's channel follows from its side.
+#: Measured quantity -> unit, and -> channel; a pressure's channel depends on its side.
 _UNITS = {"oil": "K", "position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
 _CHANNELS = {
     "oil": "T_oil", "position": "x", "command": "u", "spool": "u", "speed": "omega", "angle": "theta", "leak": "q_leak",
     "time": "t"
 }  # fmt: skip
-_SHARES = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
+_FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
-#: The last word of `MainPaBar`; in `MainPa` it is the pressure A, and no pascal.
-_HUMPED = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
-_LONGEST_NAME = 80
+#: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are no unit, as `MainPa` is pressure A.
+_LAST_WORD = re.compile(r"(?<=[a-z\d])[A-Z]+[a-z]*$")
+#: The number that tells equal names of columns apart, as in `X_Value.1`.
+_COUNTED = re.compile(r"[. _]?\d{1,3}$")
+_MAX_NAME = 80
 
 
 class _Guess(NamedTuple):
-    """`kind`: what a column measures; `side`: "A", "B", "pump" or a number as text; `unit`: of its name's ending."""
+    """The guessed meaning of a column: `kind` of quantity; `side`: "A", "B", "pump" or a number; `unit` or None."""
 
     kind: str
     side: str
@@ -42,220 +44,237 @@ class _Guess(NamedTuple):
 
     @property
     def channel(self) -> str | None:
+        """The channel with this meaning; None if there is none."""
         if self.kind == "flow":
             return "q_pump" if self.side == "A" else None
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
 
 
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
-    """Return channel (or ``t``) -> column, as a map gives them, for the columns whose meaning their names tell.
+    """Propose a map, channel (or ``t``) -> column, for the columns whose names tell their meaning.
 
-    A column that bears a channel's own name is left out, and a channel that several columns could be. A unit at the end
-    of a name (``PA_bar``) becomes the column's unit.
+    Columns with a channel's own name are omitted, and channels that several columns could be. A unit at the end of a
+    name (``PA_bar``) becomes the column's unit.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    head = _side_of_head(labels)
+    head = _find_head_side(labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
-        guess = None if label.name.casefold() in channel_names else _guess(label, head)
-        if guess is not None and guess.channel is not None:
+        guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head)
+        if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is no position
+            continue
+        if guess.channel is not None:
             candidates.setdefault(guess.channel, []).append((label, guess))
     if "p_A" not in candidates and "p_B" not in candidates and not {"p_a", "p_b"} & channel_names:
-        for channel, pumped in (("p_A", "p_1"), ("p_B", "p_2")):  # pressures 1 and 2 alone are those of the chambers
-            if pumped in candidates:
-                candidates[channel] = candidates.pop(pumped)
-    driven = ({*candidates} | channel_names) & {"omega", "theta"}
-    if (
-        ("u" in candidates or "u" in channel_names)
-        and not driven
-        and not {"p_1", "p_2"} & ({*candidates} | channel_names)
-    ):
-        for channel, kind in (("p_1", "before"), ("p_2", "behind")):  # of a valve, whose command is recorded
+        # without others, pressures 1 and 2 are those of the chambers
+        for channel, pump_port in (("p_A", "p_1"), ("p_B", "p_2")):
+            if pump_port in candidates:
+                candidates[channel] = candidates.pop(pump_port)
+    known = {*candidates} | channel_names
+    if "u" in known and not known & {"omega", "theta", "p_1", "p_2"}:
+        # the command is that of a valve: find the pressures before and behind it
+        for channel, kind in (("p_1", "before"), ("p_2", "behind")):
             candidates[channel] = [(label, guess) for label in labels if (guess := _guess_at_valve(label, kind))]
     result = {}
     for channel in (*CHANNEL_UNITS, "t"):
         columns = candidates.get(channel, [])
-        if channel == "u" and any(guess.kind == "command" for _, guess in columns):  # the spool follows it
+        # prefer the command to the spool, which follows it
+        if channel == "u" and any(guess.kind == "command" for _, guess in columns):
             columns = [column for column in columns if column[1].kind == "command"]
-        if len(columns) > 1:  # what is made of another column gives way to it
-            columns = [column for column in columns if not _words_of(column[0].name) & _KIND["made"]]
+        if len(columns) > 1:  # prefer measured to computed columns
+            columns = [column for column in columns if not _split_words(column[0].name) & _KIND["made"]]
         if len(columns) == 1 and channel.casefold() not in channel_names:
             label, guess = columns[0]
             result[channel] = label.whole + (f"[{guess.unit}]" if guess.unit not in (None, label.unit) else "")
-    return {} if set(result) <= {"t"} else result
+    return {} if set(result) <= {"t"} else result  # the time alone is no recording
 
 
-def map_options(channel_map: Mapping[str, str]) -> str:
-    """Return a map in words."""
+def format_map(channel_map: Mapping[str, str]) -> str:
+    """Format a map as text."""
     return ", ".join(f"{channel}={column}" for channel, column in channel_map.items())
 
 
 def is_time(label: Label) -> bool:
-    """Test whether a column holds the time, by its name."""
-    guess = _guess(label)
-    return guess is not None and guess.kind == "time"
+    """Test whether a column's name means the time; a number may tell it from the times of other channels."""
+    guess = _guess_meaning(label)
+    return _is_named_time(label) or (guess is not None and guess.kind == "time")
+
+
+def _is_named_time(label: Label) -> bool:
+    """Test whether a column has one of the names that loggers give the time."""
+    return _COUNTED.sub("", label.name.casefold()) in WORDS["time"]
 
 
 def unit_of_time(label: Label) -> str | None:
-    """Return the unit that a time column states, in its heading or at the end of its name."""
-    guess = _guess(label)
+    """Return the unit of a time column, in its heading or at the end of its name; None if there is none."""
+    guess = _guess_meaning(label)
     return guess.unit if guess is not None and guess.kind == "time" else None
 
 
-def knows(text: str) -> bool:
-    """Test whether a text holds a known word of a script without blanks between words."""
+def has_known_word(text: str) -> bool:
+    """Test whether a text contains a known word of a script without spaces between words."""
     return any(word in text for word in _UNSPACED)
 
 
-def measures(text: str) -> bool:
-    """Test whether a heading names a measured quantity, in one of the languages known here."""
-    return _guess(Label.parse(text)) is not None
+def is_quantity(text: str) -> bool:
+    """Test whether a heading names a measured quantity in a known language."""
+    return _guess_meaning(Label.parse(text)) is not None
 
 
-#: Endings that are units behind words of their kind alone: a set point x_s, a demand p_d, a least pressure p_min.
-_AMBIGUOUS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "position"}
+#: Endings that are units only after a word for their quantity: x_s may be a set point, p_d a demand, p_min a minimum.
+_AMBIGUOUS_UNITS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "position"}
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) without a channel's unit."""
+    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if the unit fits no channel."""
     parts = name.replace(" ", "_").split("_")
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
-    humped = _HUMPED.search(name)
-    if humped and len(humped[0]) > 2:
-        endings.append((name[: humped.start()], humped[0]))
+    last_word = _LAST_WORD.search(name)
+    if last_word and len(last_word[0]) > 2:
+        endings.append((name[: last_word.start()], last_word[0]))
     for before, unit in endings:
-        if not before or not unit or unit in ("A", "B", "a", "b"):
+        if not before or not unit or unit in ("A", "B", "a", "b"):  # a chamber, no unit
             continue
-        kind = _AMBIGUOUS.get(unit)
-        if kind is not None and not _words_of(before) & _MEASURED[kind]:  # x_s may as well be a set point
+        quantity = _AMBIGUOUS_UNITS.get(unit)
+        if quantity is not None and not _split_words(before) & _MEASURED[quantity]:
             continue
-        known = (*CHANNEL_UNITS.values(), "s", "m/s")
-        if is_familiar(unit) and (is_scaled(unit) or any(same_dimension(unit, known_unit) for known_unit in known)):
+        channel_units = (*CHANNEL_UNITS.values(), "s", "m/s")
+        if is_familiar(unit) and (
+            is_current_or_fraction(unit) or any(same_dimension(unit, channel_unit) for channel_unit in channel_units)
+        ):
             return before, unit
     return name, None
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether a column's name ends in these words: `ch2` of `ADC1_Channel_2`, `Pa` of `Main_Pa`."""
-    tokens = ([token.casefold() for token in _TOKEN.findall(_plain(text))] for text in (name, words))
+    """Test whether a column's name ends in these words: `ADC1_Channel_2` in `ch2`, `Main_Pa` in `Pa`."""
+    tokens = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
+    # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
 def is_temperature(label: Label) -> bool:
-    """Test whether a column is in a unit of temperature."""
+    """Test whether a column has a unit of temperature."""
     unit = split_unit(label.name)[1] if label.unit is None else label.unit
     return unit is not None and same_dimension(unit, "K")
 
 
-def is_recorded(label: Label) -> bool:
-    """Test whether a column is a measured pressure, position or speed, by its name or its unit."""
-    if len(label.name) > _LONGEST_NAME:
+def is_measured(label: Label) -> bool:
+    """Test whether a column is a measured pressure, position, speed or flow, by its name or unit."""
+    if len(label.name) > _MAX_NAME:
         return False
-    name, ending = split_unit(label.name)
-    unit = ending if label.unit is None else label.unit
-    words = _words_of(name)
+    name, unit_of_name = split_unit(label.name)
+    unit = unit_of_name if label.unit is None else label.unit
+    words = _split_words(name)
     if words & (_KIND["wanted"] | _KIND["made"]):
         return False
     if unit is not None:
-        recorded = ("Pa", "m", "rad/s", "m/s", "m^3/s")
-        return unit in WORDS["turns"] or any(same_dimension(unit, recorded_unit) for recorded_unit in recorded)
+        measured_units = ("Pa", "m", "rad/s", "m/s", "m^3/s")
+        return unit in WORDS["rotation_units"] or any(
+            same_dimension(unit, measured_unit) for measured_unit in measured_units
+        )
     kinds = (*(_MEASURED[kind] for kind in ("pressure", "position", "speed")), _KIND["supply"], _KIND["velocity"])
     return len(name) > 1 and any(words & known for known in kinds)
 
 
-def _plain(text: str) -> str:
-    """Return a name without accents, the umlauts as two letters."""
+def _strip_accents(text: str) -> str:
+    """Replace umlauts by two letters and remove accents."""
     for umlaut, letters in zip("äöüßÄÖÜłŁ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "l", "L"), strict=True):
         text = text.replace(umlaut, letters)
-    return "".join(sign for sign in unicodedata.normalize("NFKD", text) if not unicodedata.combining(sign))
+    return "".join(
+        character for character in unicodedata.normalize("NFKD", text) if not unicodedata.combining(character)
+    )
 
 
-def _words_of(name: str) -> set[str]:
-    """Return the words of a name, the ends of compounds, and `p` and the side of `pa`."""
+def _split_words(name: str) -> set[str]:
+    """Split a name into words, with the ends of compounds, and `p` and the side of `pa`."""
     words = {word for word in _UNSPACED if word in name}
-    for token in (token.casefold() for token in _TOKEN.findall(_plain(name))):
+    for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
         words |= {token, "p", token[1:]} if token in ("pa", "pb") else {token}
         words |= {ending for ending in WORDS["endings"] if token.endswith(ending)}
     return words
 
 
-def _side_of_head(labels: Sequence[Label]) -> str:
-    """Return the chamber of the columns called head: A beside a rod, B beside a cap; empty where unknown."""
-    words = {word for label in labels if len(label.name) <= _LONGEST_NAME for word in _words_of(label.name)}
+def _find_head_side(labels: Sequence[Label]) -> str:
+    """Find the chamber that columns called head mean: A if others are called rod, B if cap; empty if unknown."""
+    words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
     return "A" if words & (_SIDE["B"] - {"b"}) else "B" if words & (_SIDE["A"] - {"a"}) else ""
 
 
-def _guess(label: Label, head: str = "") -> _Guess | None:
-    """Guess the meaning of a column from its name; `head`: the chamber that the word head stands for."""
-    if len(label.name) > _LONGEST_NAME:
+def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
+    """Guess the meaning of a column from its name and unit; `head`: the chamber that the word head stands for."""
+    if len(label.name) > _MAX_NAME:
         return None
     name, unit = split_unit(label.name)
-    words = _words_of(name if label.unit is None and unit is not None else label.name)
+    words = _split_words(name if label.unit is None and unit is not None else label.name)
     unit = label.unit if label.unit is not None else unit
-    side = head if words & _SIDE["head"] and head else _side(words)
+    side = head if words & _SIDE["head"] and head else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
-    if unit is not None and words & _KIND["oil"] and same_dimension(unit, "K"):
+    if unit is not None and words & _KIND["oil"] and same_dimension(unit, "K"):  # before `other`, which has oil, too
         return _Guess("oil", "", unit)
     if words & _MEASURED["spool"]:
-        return _Guess("spool", "", unit) if unit is None or _commands(unit) else None
+        return _Guess("spool", "", unit) if unit is None or _is_command_unit(unit) else None
     if unit is not None and same_dimension(unit, "m^3/s"):
         kind = "leak" if words & _MEASURED["leak"] else "flow"
         return _Guess(kind, side, unit) if words & _MEASURED[kind] else None
-    measured = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
-    if words & _KIND["other"] or (words & _KIND["wanted"] and measured):
+    # a command may be called wanted, a measured quantity not
+    is_measured_quantity = any(words & _MEASURED[kind] for kind in ("pressure", "position", "speed", "angle"))
+    if words & _KIND["other"] or (words & _KIND["wanted"] and is_measured_quantity):
         return None
-    turns = unit is not None and (unit in WORDS["turns"] or same_dimension(unit, "rad/s"))
-    if turns and words & (_MEASURED["speed"] | _KIND["motor"]):
-        return _Guess("speed", side, "rpm" if unit in WORDS["turns"] else unit)
+    is_rotation = unit is not None and (unit in WORDS["rotation_units"] or same_dimension(unit, "rad/s"))
+    if is_rotation and words & (_MEASURED["speed"] | _KIND["motor"]):
+        return _Guess("speed", side, "rpm" if unit in WORDS["rotation_units"] else unit)
     if unit is not None and "s" in words and same_dimension(unit, "m"):  # the path in German books
         return _Guess("position", side, unit)
-    if unit is not None and words & _MEASURED["command"] and _commands(unit):
+    if unit is not None and words & _MEASURED["command"] and _is_command_unit(unit):
         return _Guess("command", side, unit)
-    for kind, known in _MEASURED.items():
-        fits = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
-        if words & known and fits and kind != "flow":
+    for kind, words_of_kind in _MEASURED.items():
+        fits_unit = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
+        if words & words_of_kind and fits_unit and kind != "flow":
             return _Guess(kind, side, unit)
     return None
 
 
-def _commands(unit: str) -> bool:
-    """Test whether a command may have this unit."""
-    return is_scaled(unit) or same_dimension(unit, "V")
+def _is_command_unit(unit: str) -> bool:
+    """Test whether a command can have this unit."""
+    return is_current_or_fraction(unit) or same_dimension(unit, "V")
 
 
-def is_scaled(unit: str) -> bool:
-    """Test whether a unit is a share of full scale, or the current of a valve or of a controller's output."""
-    return unit in _SHARES or same_dimension(unit, "A")
+def is_current_or_fraction(unit: str) -> bool:
+    """Test whether a unit is a fraction of full scale, or a current (of a valve or a controller's output)."""
+    return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
     """Guess a pressure `before` or `behind` a valve from a column's name; None for any other column."""
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
-    words = _words_of(name if label.unit is None else label.name)
+    words = _split_words(name if label.unit is None else label.name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
         return None
     return _Guess("pressure", "", unit)
 
 
-def suggested_map(label: Label) -> str:
-    """Return the channel that a column may be, as a map writes it: `q_pump=Flow [l/min]`."""
-    guess = _guess(label)
-    channel = "q_pump" if guess is not None and guess.kind == "flow" else None if guess is None else guess.channel
-    for valved, kind in (("p_1", "before"), ("p_2", "behind")):
-        channel = valved if channel is None and _guess_at_valve(label, kind) else channel
+def suggest_map_entry(label: Label) -> str:
+    """Format a map entry of a column and its likely channel: `q_pump=Flow [l/min]`, or `CHANNEL=...` if unknown."""
+    guess = _guess_meaning(label)
+    channel = None if guess is None else "q_pump" if guess.kind == "flow" else guess.channel
+    if channel is None:
+        at_valve = {"p_1": "before", "p_2": "behind"}
+        channel = next((name for name, kind in at_valve.items() if _guess_at_valve(label, kind)), None)
     return f"{channel or 'CHANNEL'}={label.whole}"
 
 
-def _side(words: set[str]) -> str:
+def _find_side(words: set[str]) -> str:
+    """Find the side that words name: A, B, pump, pump 1, pump 2 or a number; empty if unknown."""
     cap, rod = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
     number = next((digit for digit in ("1", "2") if digit in words), "")
     if words & _SIDE["pump"] or (words & _SIDE["port"] and cap == rod):
         return f"pump {number}".strip()
     if cap != rod:
         return "A" if cap else "B"
-    return "" if cap else number
+    return "" if cap else number  # both sides named: unknown

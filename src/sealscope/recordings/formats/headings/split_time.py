@@ -1,4 +1,4 @@
-"""The time in several columns: hours, minutes and seconds of their own, or parts of a second beside a stamp."""
+"""Time in several columns: separate hours, minutes and seconds, or parts of a second next to a stamp."""
 
 from __future__ import annotations
 
@@ -13,21 +13,23 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension
 
-_DATE, _CLOCK, _BELOW = ("year", "month", "day"), ("hour", "minute", "second"), ("ms", "us", "ns")
-#: Nanoseconds of each part, and where it ends.
+_DATE, _CLOCK, _SUBSECOND = ("year", "month", "day"), ("hour", "minute", "second"), ("ms", "us", "ns")
+#: Nanoseconds of each part, and the upper limit of its value.
 _NANOSECONDS = {"hour": 3600e9, "minute": 60e9, "second": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-_END = {"month": 13.0, "day": 32.0, "hour": 24.0, "minute": 60.0, "second": 60.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-#: Share of the steps that a rule must hold for: a log may have lost some samples.
-_MOST = 0.9
+_UPPER_LIMIT = {
+    "month": 13.0, "day": 32.0, "hour": 24.0, "minute": 60.0, "second": 60.0, "ms": 1e3, "us": 1e6, "ns": 1e9
+}  # fmt: skip
+#: Fraction of the steps that must follow a rule: a log may have lost some samples.
+_MIN_FRACTION = 0.9
 
 
-def parts_of_time(labels: Sequence[Label], used: Container[int], below: bool = False) -> dict[str, int]:
-    """Return part -> column of the time that several columns hold together: hours, minutes, seconds, and what is below.
+def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
+    """Find the columns that together form the time: part -> column.
 
-    Year, month and day are added where all three are there; empty without hours, minutes and seconds, each once.
-    `below`: only what stands beside a time of whole seconds: ms, us or ns.
+    Hours, minutes and seconds must occur once each; otherwise the result is empty. Parts of a second are added, and
+    year, month and day if all three exist. `only_subsecond`: find ms, us and ns only, which accompany whole seconds.
     """
-    held: dict[str, int] = {}
+    columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
         columns = [
             column
@@ -37,56 +39,61 @@ def parts_of_time(labels: Sequence[Label], used: Container[int], below: bool = F
             and (label.unit is None or same_dimension(label.unit, "s"))
         ]
         if len(columns) == 1:
-            held[part] = columns[0]
-    if not below and not held.keys() >= {*_CLOCK}:
+            columns_of_part[part] = columns[0]
+    if not only_subsecond and not columns_of_part.keys() >= {*_CLOCK}:
         return {}
-    dated = _DATE if held.keys() >= {*_DATE} else ()
-    return {part: held[part] for part in (() if below else (*dated, *_CLOCK)) + _BELOW if part in held}
+    date_parts = _DATE if columns_of_part.keys() >= {*_DATE} else ()
+    parts = _SUBSECOND if only_subsecond else (*date_parts, *_CLOCK, *_SUBSECOND)
+    return {part: columns_of_part[part] for part in parts if part in columns_of_part}
 
 
-def joined_time(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
-    """Return the moments (n,) that a column of dates or of whole seconds and the `parts` (n,) of it make.
+def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
+    """Combine a column of dates or whole seconds and the `parts` (n,) of its time to time stamps or seconds (n,).
 
-    `base`: datetime64, or doubles in `unit`. Where the parts hold hours, only its dates are used. None where the parts
-    are none: hours that are no whole numbers, milliseconds since the start beside stamps.
+    `base`: datetime64, or doubles in `unit`; with hours among the parts, only its dates are used. None if the parts are
+    not parts of this time: fractional hours, or milliseconds since the start next to stamps.
     """
-    below = [part for part in _BELOW if part in parts]
-    fine = below[-1] if below else "second"
+    second_parts = [part for part in _SUBSECOND if part in parts]
+    smallest_part = second_parts[-1] if second_parts else "second"
     for part, values in parts.items():
         known = values[np.isfinite(values)]
-        end = 1e3 if part in below[1:] else _END.get(part, np.inf)  # microseconds beside milliseconds
+        end = 1e3 if part in second_parts[1:] else _UPPER_LIMIT.get(part, np.inf)  # microseconds after milliseconds
         if not known.size or known.min() < 0.0 or known.max() >= end:
             return None
-        if part != fine and not np.array_equal(known, np.floor(known)):
+        # only the smallest part may have a fraction
+        if part != smallest_part and not np.array_equal(known, np.floor(known)):
             return None
     scaled = [values * _NANOSECONDS[part] for part, values in parts.items() if part in _NANOSECONDS]
     offset = np.sum(scaled, axis=0)
     if "hour" in parts:
-        return _dates(base, parts) + _nanoseconds(offset)
+        return _date_stamps(base, parts) + _to_timedelta(offset)
     if base.dtype.kind == "M":
-        whole = base == base.astype("datetime64[s]").astype(base.dtype)
+        is_whole = base == base.astype("datetime64[s]").astype(base.dtype)
         known = ~np.isnat(base)
     else:
-        whole, known = base == np.floor(base), np.isfinite(base)
-    if unit not in (None, "s") or not whole[known].all() or not _falls_back(base[known], offset[known]):
+        is_whole, known = base == np.floor(base), np.isfinite(base)
+    if unit not in (None, "s") or not is_whole[known].all() or not _restarts_each_second(base[known], offset[known]):
         return None
-    return base + _nanoseconds(offset) if base.dtype.kind == "M" else base + offset / 1e9
+    return base + _to_timedelta(offset) if base.dtype.kind == "M" else base + offset / 1e9
 
 
-def _falls_back(base: NDArray[Any], offset: Array) -> bool:
-    """Test whether the fraction of a second grows while the second stays, and begins again with the next."""
+def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
+    """Test whether `offset` grows while the second stays the same, and restarts with the next second."""
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
-    same, next_one, change = steps == 0, steps == 1, np.diff(offset)
-    if 2 * np.count_nonzero(same) < steps.size:
+    is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)
+    if 2 * np.count_nonzero(is_same_second) < steps.size:  # most seconds have one sample
         return False
-    grows = np.count_nonzero(change[same] > 0) >= _MOST * np.count_nonzero(same)
-    return bool(grows and np.count_nonzero(change[next_one] < 0) >= _MOST * np.count_nonzero(next_one))
+    grows = np.count_nonzero(change[is_same_second] > 0) >= _MIN_FRACTION * np.count_nonzero(is_same_second)
+    return bool(
+        grows and np.count_nonzero(change[is_next_second] < 0) >= _MIN_FRACTION * np.count_nonzero(is_next_second)
+    )
 
 
-def _dates(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
-    """Return the dates (n,) of `base` or of year, month and day; 1970-01-01 where neither holds any."""
+def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
+    """Make the date stamps (n,) of year, month and day, or else of `base`; 1970-01-01 if neither has dates."""
     if all(part in parts for part in _DATE):
         year, month, day = (np.nan_to_num(parts[part], nan=1.0) for part in _DATE)
+        # months since 1970, as numpy counts them
         months = ((np.clip(year, 1.0, 9999.0) - 1970) * 12 + month - 1).astype(np.int64).astype("datetime64[M]")
         dates = months.astype("datetime64[D]") + (day - 1).astype("timedelta64[D]")
         return np.asarray(dates.astype("datetime64[ns]"))
@@ -95,7 +102,8 @@ def _dates(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetim
     return np.full(base.shape, np.datetime64("1970-01-01", "ns"))
 
 
-def _nanoseconds(offset: Array) -> NDArray[np.timedelta64]:
+def _to_timedelta(offset: Array) -> NDArray[np.timedelta64]:
+    """Convert nanoseconds (n,) to timedelta64, NaT for values that are not finite."""
     result = np.round(np.nan_to_num(offset)).astype("timedelta64[ns]")
     result[~np.isfinite(offset)] = np.timedelta64("NaT")
     return result

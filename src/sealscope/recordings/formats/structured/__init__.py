@@ -1,1 +1,1 @@
-"""Logs that are more than one table: trees of signals, JSON, packets."""
+"""Logs of more than one table: trees of signals, JSON, packets."""

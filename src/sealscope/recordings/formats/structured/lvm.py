@@ -12,84 +12,91 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.cells import numbers
-from sealscope.recordings.formats.columns import Wanted
+from sealscope.recordings.formats.cells import parse_numbers
+from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import entries
-from sealscope.recordings.formats.table import Clock, RecordingFields, Series, check_size, table_of
-from sealscope.recordings.formats.text_layout import SNIFF, encoding_of
-from sealscope.recordings.formats.timebase import day_before_month, either_dates, stamps
+from sealscope.recordings.formats.headings.preamble import collect_remarks
+from sealscope.recordings.formats.table import Clock, RecordingFields, Series, build_fields, check_size
+from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
+from sealscope.recordings.formats.timebase import ambiguous_dates, is_day_first, parse_stamps
 
-#: What ends each header of the format.
-_END = "***End_of_Header***"
+#: Line that ends each header.
+_END_MARK = "***End_of_Header***"
 
 
 @dataclass
 class _Packet:
-    """`head`: rows of the channels' header; `names`: of the columns; `rows`: samples, NaN where a row is shorter."""
+    """A packet of samples.
+
+    `head`: rows of the channels' header by name; `names`: of the columns; `rows`: samples, NaN where a row is shorter.
+    """
 
     head: Mapping[str, list[str]]
     names: list[str]
     rows: list[Array] = field(default_factory=list)
 
     def entry(self, name: str, index: int) -> str:
-        """Return a channel's entry of the header; empty where there is none."""
+        """Return the entry in header row `name` of channel `index`; empty if there is none."""
         cells = self.head.get(name, [])
         return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
+        """Return the number in header row `name` of channel `index`; NaN if there is none."""
         try:
             return float(self.entry(name, index).replace(",", "."))
         except ValueError:
             return np.nan
 
     def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
-        """Return when a channel's first sample was taken; None where the header does not say."""
+        """Return the time of a channel's first sample; None if the header does not state it."""
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
         seconds, _, fraction = time.partition(".")
         try:
-            return stamps([f"{day} {seconds}.{fraction[:9] or '0'}"], day_first)[0] if day else None
+            return parse_stamps([f"{day} {seconds}.{fraction[:9] or '0'}"], day_first)[0] if day else None
         except ValueError:
             return None
 
     def column(self, index: int) -> Array:
+        """Return the samples (n,) of a column."""
         return np.array([row[index] for row in self.rows])
 
 
 def is_lvm(head: bytes) -> bool:
-    """Test whether a file that begins with `head` is a LabVIEW measurement file: the mark begins a line."""
-    return any(f"{end}{_END}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
+    """Test whether `head` begins a LabVIEW measurement file: the end mark of a header begins a line."""
+    return any(f"{end}{_END_MARK}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
-def read_lvm(path: Path, request: Wanted) -> RecordingFields:
-    """Read the wanted channels of a LabVIEW measurement file; packets of the same channels follow each other."""
+def read_lvm(path: Path, request: Request) -> RecordingFields:
+    """Read the requested channels of a LabVIEW measurement file; packets of the same channels are joined."""
     with path.open("rb") as file:
-        encoding = encoding_of(file.read(SNIFF)) or "cp1252"
+        encoding = detect_encoding(file.read(SNIFF)) or "cp1252"
     with path.open(encoding=encoding, errors="replace") as text:
         lines = enumerate((line.rstrip("\r\n").lstrip("\ufeff") for line in text), start=1)
         header: dict[str, str] = {}
         for _, line in lines:
-            if line.startswith(_END):
+            if line.startswith(_END_MARK):
                 break
             name, _, value = line.partition("\t" if "\t" in line else ",")
+            # the value of Decimal_Separator may be a comma, which otherwise ends a line
             header[name.strip().casefold()] = "," if value.strip("\t ") == "," else value.strip("\t, ")
         delimiter = "," if header.get("separator", "").casefold() == "comma" else "\t"
         decimal = "," if header.get("decimal_separator") == "," else "."
-        packets = list(_packets(lines, delimiter, decimal, str(path)))
+        packets = list(_iter_packets(lines, delimiter, decimal, str(path)))
     if not packets:
         raise InputError("a LabVIEW measurement file must have samples, got a header and no rows")
-    series = _series(packets, header.get("x_columns", "one").casefold())
-    remarks = entries((name, header[name]) for name in ("operator", "project", "description") if name in header)
-    return table_of(series, request, "LabVIEW measurement", remarks)
+    series = _list_series(packets, header.get("x_columns", "one").casefold())
+    remarks = collect_remarks((name, header[name]) for name in ("operator", "project", "description") if name in header)
+    return build_fields(series, request, "LabVIEW measurement", remarks)
 
 
-def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
+def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
+    """Yield the packets of a file from its numbered lines; rows are added to a packet after it was yielded."""
     head: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_head = True
     for number, line in lines:
         cells = [cell.strip() for cell in line.split(delimiter)]
-        if line.startswith(_END):
+        if line.startswith(_END_MARK):
             in_head, packet = False, None
         elif not any(cells):
             continue
@@ -98,14 +105,15 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
         elif packet is not None:
             names = packet.names
 
-            def where(index: int, number: int = number, names: Sequence[str] = names) -> str:
+            def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
+                """Format line, column and file of a cell."""
                 return f"(line {number}, column {names[index]}, {place})"
 
-            values, words = numbers(cells[: len(names)] + [""] * (len(names) - len(cells)), decimal, where)
+            values, words = parse_numbers(cells[: len(names)] + [""] * (len(names) - len(cells)), decimal, format_place)
             if words:
-                raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {where(words[0])}")
+                raise InputError(f"a sample must be a number, got {cells[words[0]][:40]!r} {format_place(words[0])}")
             packet.rows.append(values)
-            if len(packet.rows) % 2**16 == 0:
+            if len(packet.rows) % 2**16 == 0:  # before a long file fills the memory
                 check_size(len(packet.rows), len(names))
         elif in_head:
             texts = cells[1:]  # every second cell is empty where each channel has a time
@@ -115,44 +123,54 @@ def _packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, pla
             yield packet
 
 
-def _series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
-    """Return a series a channel, of all packets that have its columns; `x_columns`: one, multi or no."""
+def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
+    """Make a series for each channel from all packets that have its columns.
+
+    `x_columns`: "one" column of times for all channels, "multi", one before each channel, or "no", in which case the
+    packet's header states start and step.
+    """
     first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
     if not times:
         raise InputError(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)}")
-    same = [packet for packet in packets if packet.names == names]
-    check_size(sum(len(packet.rows) for packet in same), len(names))
-    day_first = day_before_month([either_dates(day for packet in same for day in packet.head.get("date", []))])
-    begins = _begins(same, day_first)
-    multiple, series = x_columns == "multi", []
+    matching = [packet for packet in packets if packet.names == names]
+    check_size(sum(len(packet.rows) for packet in matching), len(names))
+    day_first = is_day_first([ambiguous_dates(day for packet in matching for day in packet.head.get("date", []))])
+    offsets = _packet_offsets(matching, day_first)
+    is_multi, series = x_columns == "multi", []
     for index, column in enumerate(column for column in range(len(names)) if column not in times):
-        time = max((before for before in times if before < column), default=times[0]) if multiple else times[0]
-        values, seconds = [], []
-        for packet, begin in zip(same, begins, strict=True):
+        times_before = [time for time in times if time < column]
+        time_column = times_before[-1] if is_multi and times_before else times[0]
+        values, times_of_packets = [], []
+        for packet, offset in zip(matching, offsets, strict=True):
             samples = packet.column(column)
-            if multiple:  # it ends in blanks where others go on
+            if is_multi:  # shorter channels end in blanks
                 samples = samples[: np.flatnonzero(np.isfinite(samples)).max(initial=-1) + 1]
-            own_times = packet.column(time)[: samples.size]
-            if x_columns == "no":
-                step = packet.number("delta_x", index)
-                if not step > 0:
-                    raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
-                own_times = np.nan_to_num(packet.number("x0", index)) + step * np.arange(samples.size)
+            computed_times = _compute_times(packet, index, samples.size) if x_columns == "no" else None
             values.append(samples)
-            seconds.append(begin + own_times)
-        joined, t = np.concatenate(values), np.concatenate(seconds)
+            times_of_packets.append(
+                offset + (packet.column(time_column)[: samples.size] if computed_times is None else computed_times)
+            )
+        t = np.concatenate(times_of_packets)
         label = Label.parse(names[column], first.entry("y_unit_label", index) or None)
-        clock = Clock(time, partial(lambda *reading: reading, t, first.moment(index, day_first)))
-        series.append(Series("", label, t.size, partial(np.asarray, joined), clock))
+        clock = Clock.of_times(time_column, t, first.moment(index, day_first))
+        series.append(Series("", label, t.size, partial(np.asarray, np.concatenate(values)), clock))
     return series
 
 
-def _begins(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Compute the offset of each packet's times [s]: 0 if they go on from packet to packet or a moment is unknown."""
+def _compute_times(packet: _Packet, index: int, count: int) -> Array:
+    """Compute the times (count,) [s] of a channel without a column of times, from the packet's header."""
+    step = packet.number("delta_x", index)
+    if not step > 0:
+        raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
+    return np.asarray(np.nan_to_num(packet.number("x0", index)) + step * np.arange(count))
+
+
+def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
+    """Compute the offset of each packet's times [s]; all 0 if the times continue or a start is unknown."""
     moments = [packet.moment(0, day_first) for packet in packets]
-    firsts = [packet.number("x0", 0) for packet in packets]
+    first_times = [packet.number("x0", 0) for packet in packets]
     known = [moment for moment in moments if moment is not None]
-    if len(known) < len(packets) or all(after > before for before, after in pairwise(firsts)):
+    if len(known) < len(packets) or all(after > before for before, after in pairwise(first_times)):
         return [0.0] * len(packets)
     return [float((moment - known[0]) / np.timedelta64(1, "ns")) / 1e9 for moment in known]

@@ -1,6 +1,7 @@
-"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers behind the claims.
+"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers from which claims are judged.
 
-A case is run with the thesis's own method and step ("literal") and converged; the equations are the same in both.
+A case is run with the thesis's method and step ("as_published"), and with a step that converges; the equations are the
+same.
 """
 
 from __future__ import annotations
@@ -20,34 +21,33 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.engine.context import Context, SimulatedRun
 
-Solver = Literal["converged", "literal"]
-SOLVERS: tuple[Solver, ...] = ("converged", "literal")
-SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "literal": "RK4 1e-4 s"}
-#: The solvers in the legend of a figure, in the order of drawing.
-LABELS: dict[Solver, str] = {"literal": "RK4, 1e-4 s", "converged": "converged"}
+Solver = Literal["converged", "as_published"]
+SOLVERS: tuple[Solver, ...] = ("converged", "as_published")
+#: Labels of the solvers in tables ...
+SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "as_published": "RK4 1e-4 s"}
+#: ... and in the legends of figures, in the order of drawing.
+LABELS: dict[Solver, str] = {"as_published": "RK4, 1e-4 s", "converged": "converged"}
 #: The runs of one case by solver.
 Runs = dict[Solver, SimulatedRun]
-#: Step [s] of the thesis's own Runge-Kutta method (section 4.1.1).
+#: Step [s] of the thesis's Runge-Kutta method (section 4.1.1).
 THESIS_STEP = 1e-4
-#: Duration [s] of a run, and the whole periods of both commands in it that numbers are taken from.
+#: Duration [s] of a run, and the interval in it from which numbers are computed: whole periods of all commands.
 DURATION = 6.5
 STEADY = (math.pi, 2.0 * math.pi)
 WINDOW = "from pi to 2 pi s of a run from standstill"
-#: Every third step of 1e-4 s: a solution that alternates from step to step is met at both its values, which
-#: sampling every 2nd, 4th or 20th step would hide.
+#: One sample per three steps of 1e-4 s: if a solution alternates from step to step, an odd number samples both of its
+#: values, while every 2nd, 4th or 20th step would hide the oscillation.
 SAMPLE_RATE = 1.0 / (3.0 * THESIS_STEP)
-#: Pressure difference [Pa] below which a throttle is taken as laminar. Eqs. (4.9)-(4.12) have no such limit; 1 Pa is
-#: far below every drop, and above zero, so that the equations can be solved at all.
+#: Pressure difference [Pa] below which a throttle is laminar. Eqs. (4.9)-(4.12) have no such limit, and their infinite
+#: slope at zero cannot be integrated; 1 Pa is far below every drop.
 DP_0 = 1.0
 COMMANDS = ("3 sin(4t)", "5 sin(2t)", "7 sin(4t)")
 CLOSINGS = (25.0, 50.0, 75.0)
 #: Command of section 4.3, and its period [s].
 COMMAND, PERIOD = "5 sin(2t)", math.pi
-#: Length [s] and sampling rate [Hz] of the runs that show drift of the piston.
+#: Length [s] and sampling rate [Hz] of the runs for the drift of the piston.
 _DRIFT_DURATION, _DRIFT_RATE = 60.0, 100.0
-
-
-#: The rows of Tables 4.2 and 4.3: command, and how far both throttles are closed [%], None without them.
+#: The rows of Tables 4.2 and 4.3: command, and closing of both throttles [%], None if there are no throttles.
 CASES: dict[str, tuple[str, float | None]] = {
     **{f"4.2-{letter}": (command, None) for letter, command in zip("abc", COMMANDS, strict=True)},
     **{
@@ -59,11 +59,11 @@ CASES: dict[str, tuple[str, float | None]] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of the throttles' equations where the thesis contradicts itself or is silent.
+    """One reading of the throttles' equations, which the thesis states inconsistently or incompletely.
 
-    `metering` "meter-out" (the text: throttled return on both sides) or "literal" (eqs. 4.11, 4.12 as printed);
-    `closed_means` "area" (eq. 4.8) or "diameter" (the text's 3.75 mm of 5 mm); `d_line_mm` 7 (Table 4.1) or 5 (the
-    text); `V_line_cm3` V_1 = V_2, not given.
+    `metering`: "meter-out" (the text: return flow throttled on both sides) or "literal" (eqs. 4.11, 4.12 as printed);
+    `closed_means`: "area" (eq. 4.8) or "diameter" (the text's 3.75 mm of 5 mm); `d_line_mm`: 7 (Table 4.1) or 5 (the
+    text); `V_line_cm3`: V_1 = V_2, which the thesis does not give.
     """
 
     metering: Literal["meter-out", "literal"] = "meter-out"
@@ -73,25 +73,25 @@ class Reading:
 
     @property
     def title(self) -> str:
-        """The reading in a few words."""
+        """Short description of the reading."""
         metering = "as printed" if self.metering == "literal" else "meter-out"
         text = f"{metering}, closed by {self.closed_means}, {self.d_line_mm:g} mm"
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Build the rig's parameters by name for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
+        """Return the rig's parameters for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
-        # open throttles are the same under every reading
-        opened = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
+        # open throttles are the same under all readings; one key of parameters lets the runs be shared
+        reading = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
         return (
             *sampling,
             ("line.orifices", "present"),
             ("line.closed_A", closed_pct / 100.0),
             ("line.closed_B", closed_pct / 100.0),
-            ("line.metering", opened.metering),
-            ("line.closed_means", opened.closed_means),
+            ("line.metering", reading.metering),
+            ("line.closed_means", reading.closed_means),
             ("line.d_line", self.d_line_mm * 1e-3),
             ("line.V_1", self.V_line_cm3 * 1e-6),
             ("line.V_2", self.V_line_cm3 * 1e-6),
@@ -99,70 +99,78 @@ class Reading:
         )
 
 
-OURS = Reading()
-#: The reading that takes eqs. (4.11), (4.12) and the text's "3.75 mm of 5 mm" at their word.
+DEFAULT_READING = Reading()
+#: The reading that follows eqs. (4.11), (4.12) and the text's "3.75 mm of 5 mm" literally.
 AS_PRINTED = Reading(metering="literal", closed_means="diameter", d_line_mm=5.0)
-READINGS = (OURS, AS_PRINTED)
+READINGS = (DEFAULT_READING, AS_PRINTED)
 
 
-def spec(
+def make_experiment(
     command: str,
     closed_pct: float | None,
-    reading: Reading = OURS,
+    reading: Reading = DEFAULT_READING,
     solver: Solver = "converged",
     duration: float = DURATION,
-    changed: Mapping[str, str | float] = MappingProxyType({}),
+    overrides: Mapping[str, str | float] = MappingProxyType({}),
 ) -> Experiment:
-    """Build the run of a command with throttles closed by `closed_pct` [%] (None: absent); `changed` parameters."""
-    values = {**dict(reading.values(closed_pct)), **changed}
-    run = Experiment.of(command=command, duration=duration, set=values)
-    return replace(run, method="rk4", step=THESIS_STEP) if solver == "literal" else run
+    """Build the experiment of a command with throttles closed by `closed_pct` [%] (None: absent).
+
+    `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that replace the reading's.
+    """
+    values = {**dict(reading.values(closed_pct)), **overrides}
+    experiment = Experiment.of(command=command, duration=duration, set=values)
+    return replace(experiment, method="rk4", step=THESIS_STEP) if solver == "as_published" else experiment
 
 
-def drift_spec(reading: Reading, closed_pct: float | None, solver: Solver, **changed: str | float) -> Experiment:
-    """Build a long run of section 4.3's command for the drift of the piston."""
-    return spec(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, {"daq.sample_rate": _DRIFT_RATE, **changed})
+def make_drift_experiment(
+    reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
+) -> Experiment:
+    """Build a long run of section 4.3's command, for the drift of the piston; `overrides`: as in `make_experiment`."""
+    overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
+    return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
 
 
-def both_runs(context: Context, command: str, closed_pct: float | None, reading: Reading = OURS) -> Runs:
-    """Run a command as the thesis ran it, and converged."""
-    return {solver: context.run(spec(command, closed_pct, reading, solver)) for solver in LABELS}
+def run_both_solvers(
+    context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
+) -> Runs:
+    """Simulate a command with the thesis's solver and with a converged one."""
+    return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
-def resolved(runs: Runs) -> bool:
-    """Return True if all of the runs passed the halving test."""
+def all_resolved(runs: Runs) -> bool:
+    """Return True if all runs passed the test with half the step."""
     return all(run.resolved for run in runs.values())
 
 
-def finished_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
-    """List solver, label and run of those that did not diverge."""
+def completed_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
+    """List (solver, label, run) of the runs that did not diverge."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 
-def steady(run: SimulatedRun) -> np.ndarray:
-    """Select the samples in the whole periods that numbers are taken from, (n,) truth values."""
+def steady_mask(run: SimulatedRun) -> np.ndarray:
+    """Return the mask (n,) of the samples within `STEADY`."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
 def steady_output(run: SimulatedRun, name: str) -> Array:
-    """Return the output `name` over those whole periods; a single nan where the run diverged."""
-    return np.array([math.nan]) if run.diverged else np.asarray(run.outputs[name][steady(run)])
+    """Return the samples of an output within `STEADY`; a single nan if the run diverged."""
+    return np.array([math.nan]) if run.diverged else np.asarray(run.outputs[name][steady_mask(run)])
 
 
-def span(run: SimulatedRun, name: str) -> float:
-    """Compute the range (greatest less least) of an output over the whole periods."""
+def steady_range(run: SimulatedRun, name: str) -> float:
+    """Compute the range (maximum minus minimum) of an output within `STEADY`."""
     return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Compute the mean of one output less another over the whole periods."""
+    """Compute the mean of the difference `first` - `second` of two outputs within `STEADY`."""
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
-def numbers_of(run: SimulatedRun) -> dict[str, float]:
-    """Compute ranges, peaks and least value of the pressures, mean and largest drop at the orifices [Pa], by name.
+def summarise_run(run: SimulatedRun) -> dict[str, float]:
+    """Compute ranges, peaks and minimum of the pressures, mean and largest drop at the orifices [Pa], by name.
 
-    `flows differ`: rms of Q_A - Q_B over that of Q_A. All nan where the run diverged.
+    `flows differ`: rms of Q_A - Q_B over that of Q_A. All values are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
@@ -177,16 +185,16 @@ def numbers_of(run: SimulatedRun) -> dict[str, float]:
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Compute the shift [m] of a period's mean position from the first to the last whole one; nan if it diverged."""
+    """Compute the shift [m] of the piston's mean position from the first to the last whole period; nan if diverged."""
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]
-    last = int((t[-1] + t[1] - t[0]) // PERIOD) - 1
-    means = [float(x[(t >= k * PERIOD) & (t < (k + 1) * PERIOD)].mean()) for k in (0, last)]
+    last_period = int((t[-1] + t[1] - t[0]) // PERIOD) - 1
+    means = [float(x[(t >= k * PERIOD) & (t < (k + 1) * PERIOD)].mean()) for k in (0, last_period)]
     return means[1] - means[0]
 
 
 def visible_pressure() -> float:
-    """Compute the least pressure difference [Pa] that a transducer of the rig shows: its noise (standard deviation)."""
+    """Compute the smallest visible pressure difference [Pa]: the standard deviation of a transducer's noise."""
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)

@@ -1,7 +1,7 @@
-"""The testable sentences of chapter 4, each judged by number.
+"""Judge the testable sentences of chapter 4.
 
-Those on the orifices are judged on converged runs under both readings of the equations; what RK4 at 1e-4 s gives stands
-beside.
+Claims on the orifices are judged on converged runs under both readings of the equations; the results of RK4 at 1e-4 s
+are stated for comparison.
 """
 
 from __future__ import annotations
@@ -23,268 +23,310 @@ from sealscope.thesis.chapters.chapter4.cases import (
     CLOSINGS,
     COMMAND,
     COMMANDS,
-    OURS,
+    DEFAULT_READING,
     READINGS,
     SOLVERS,
     Reading,
     Solver,
-    spec,
+    make_experiment,
     steady_output,
 )
-from sealscope.thesis.chapters.chapter4.friction import falls_up_to, jumps_at_threshold, thesis_rig
+from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, friction_at_threshold, thesis_rig
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.engine.texts import judge_claim, note
+from sealscope.thesis.engine.texts import NOT_TESTED, format_note, judge_claim
 from sealscope.thesis.sines import sine_fit
 
-#: Share of the drift without orifices that a change of drift must reach to count.
-DRIFT_SHARE = 0.01
+#: A change of drift counts if it exceeds this fraction of the drift without orifices.
+DRIFT_FRACTION = 0.01
+#: Peaks of the pressures in the thesis's figures [MPa].
+_PRINTED_PEAK_MPA = 0.4
+#: Largest residual of the speed from a sine, and largest difference of the two flows, as fractions of their rms.
+_MAX_RESIDUAL, _MAX_FLOW_DIFFERENCE = 0.05, 0.05
 _T = TypeVar("_T")
-#: Numbers of several commands or closings, by name.
+#: Numbers (`cases.summarise_run`) of several commands or closings.
 Rows = list[dict[str, float]]
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
-    """Compute the median peak-to-peak [Pa] of p_A's fast part within `after` [s] of the pump's reversals.
+    """Compute the median peak-to-peak ringing [Pa] of the true p_A within `after` [s] of the pump's reversals.
 
-    The fast part is p_A less its mean over `window` [s]; there is no noise in it.
+    The ringing is p_A minus its moving mean over `window` [s].
     """
     rate = 1.0 / float(run.t[1] - run.t[0])
     p_A, omega = run.outputs["p_A"], run.outputs["omega"]
-    wide = max(3, round(window * rate) | 1)
-    fast = p_A - np.convolve(np.pad(p_A, wide // 2, mode="edge"), np.full(wide, 1.0 / wide), mode="valid")
-    turns = np.flatnonzero(np.diff(np.sign(omega)) != 0)
-    long = round(after * rate)
-    rings = [float(np.ptp(fast[k + wide : k + long])) for k in turns if run.t[k] > 1.0 and k + long < p_A.size - wide]
-    return float(np.median(rings))
+    n_window = max(3, round(window * rate) | 1)  # odd, so that the mean is centred
+    moving_mean = np.convolve(np.pad(p_A, n_window // 2, mode="edge"), np.full(n_window, 1.0 / n_window), mode="valid")
+    ringing_part = p_A - moving_mean
+    reversals = np.flatnonzero(np.diff(np.sign(omega)) != 0)
+    n_after, last = round(after * rate), p_A.size - n_window
+    # without the first second, in which the run starts, and without the ends of the moving mean
+    used = [k for k in reversals if run.t[k] > 1.0 and k + n_after < last]
+    return float(np.median([np.ptp(ringing_part[k + n_window : k + n_after]) for k in used]))
 
 
-def _without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge the claims on cases 4.2 a) to c)."""
-    runs = {command: context.run(spec(command, None)) for command in COMMANDS}
+def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, 4.2 a) to c)."""
+    runs = {command: context.run(make_experiment(command, None)) for command in COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
         command = parse_command(name)
         assert isinstance(command, Sine)
-        fit = sine_fit(run.t[cases.steady(run)], steady_output(run, "omega"), command.omega)
+        fit = sine_fit(run.t[cases.steady_mask(run)], steady_output(run, "omega"), command.omega)
         amplitude = float(np.abs(fit.amplitudes[0]))
-        rest = rms(fit.left) / (amplitude / math.sqrt(2.0))
-        share = amplitude / (command.amplitude * thesis_rig().motor.omega_per_volt)
-        fits.append(f"{name}: {rest * 100:.2f} % beside the sine, {share * 100:.0f} % of the commanded speed")
-        tests.append(rest < 0.05)
+        residual_ratio = rms(fit.residual) / (amplitude / math.sqrt(2.0))
+        speed_ratio = amplitude / (command.amplitude * thesis_rig().motor.omega_per_volt)
+        residual = f"{residual_ratio * 100:.2f} % rms residual from the sine"
+        fits.append(f"{name}: {residual}, {speed_ratio * 100:.0f} % of the commanded speed")
+        tests.append(residual_ratio < _MAX_RESIDUAL)
     yield judge_claim("4.2", tests, fits="; ".join(fits))
-    spans = "; ".join(f"{name}: {cases.span(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
-    yield judge_claim("4.4", [None], spans=spans)
+    spans = "; ".join(f"{name}: {cases.steady_range(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
+    yield judge_claim("4.4", NOT_TESTED, spans=spans)
     noise, rings = cases.visible_pressure(), {name: ringing(run) for name, run in runs.items()}
     text = ", ".join(f"{ring * 1e-3:.1f} kPa ({name})" for name, ring in rings.items())
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
-    changed: tuple[dict[str, str | float], ...] = ({}, {"F_pr": 0.0, "F_cfr": 0.0}, {"K_i": 0.0})
-    drifts = [
-        cases.piston_drift(context.run(cases.drift_spec(OURS, None, "converged", **overrides))) * 1e3
-        for overrides in changed
-    ]
-    usual, smooth, unintegrated = drifts
-    tests = [abs(usual - smooth) > DRIFT_SHARE * abs(usual)]
-    yield judge_claim("4.6", tests, usual=usual, smooth=smooth, unintegrated=unintegrated)
+
+    def drift_mm(**overrides: float) -> float:
+        """Compute the drift [mm] of the piston over a long run with some parameters replaced."""
+        run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
+        return 1e3 * cases.piston_drift(run)
+
+    # F_pr and F_cfr: Coulomb force without pressure, and its increase with pressure; breakaway is a multiple of both
+    baseline, without_friction, without_integral = drift_mm(), drift_mm(F_pr=0.0, F_cfr=0.0), drift_mm(K_i=0.0)
+    tests = [abs(baseline - without_friction) > DRIFT_FRACTION * abs(baseline)]
+    yield judge_claim("4.6", tests, baseline=baseline, smooth=without_friction, unintegrated=without_integral)
 
 
-def _step_and_gains(context: Context) -> Iterator[Claim]:
-    """Judge the claims on the method, its step, and the gains of the speed loop."""
-    runs = {case: context.run(spec(*case, solver="literal")) for case in cases.CASES.values()}
+def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.1 and 4.3 on the solver's step and the gains of the speed loop."""
+    runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
-    def worst(throttles: bool) -> str:
-        proofs = [run.proof for (_, closed), run in runs.items() if (closed is not None) == throttles]
-        moved = [proof[name] for proof in proofs for name in PRESSURES if name in proof]
-        return f"{max(moved):.3g} Pa rms" if moved else "diverged"
+    def largest_change(*, with_throttles: bool) -> str:
+        """Format the largest change of a pressure when the step is halved."""
+        matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
+        changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
+        return f"{max(changes):.3g} Pa rms" if changes else "diverged"
 
     tests = [run.resolved is True for run in runs.values()]
-    yield judge_claim("4.1", tests, plain=worst(False), throttled=worst(True), passed=sum(tests), cases=len(tests))
-    gains, texts, tests = {"motor.k_p": 50000.0, "motor.K_i": 100.0}, [], []
+    plain, throttled = largest_change(with_throttles=False), largest_change(with_throttles=True)
+    yield judge_claim("4.1", tests, plain=plain, throttled=throttled, passed=sum(tests), cases=len(tests))
+    drive_gains = {"motor.k_p": 50000.0, "motor.K_i": 100.0}  # section 4.2.1, in internal units
+    texts, tests = [], []
     for name, limits in (
         ("with the drive's voltage and current limits", {}),
         ("without limits", {"motor.V_max": 1e5, "motor.i_max": 1e5}),
     ):
-        run = context.run(spec(COMMANDS[0], None, solver="literal", changed={**gains, **limits}))
-        moved = f"halving the step moves the speed by {run.proof.get('omega', math.nan):.3g} rad/s rms"
-        texts.append(f"{name}: {run.diverged or moved}")
+        run = context.run(
+            make_experiment(COMMANDS[0], None, solver="as_published", overrides={**drive_gains, **limits})
+        )
+        change = f"halving the step moves the speed by {run.step_changes.get('omega', math.nan):.3g} rad/s rms"
+        texts.append(f"{name}: {run.diverged or change}")
         tests.append(run.resolved is True)
-    moved_speed = runs[COMMANDS[0], None].proof.get("omega", math.nan)
-    yield judge_claim("4.3", tests, runs="; ".join(texts), own=moved_speed)
+    speed_change = runs[COMMANDS[0], None].step_changes.get("omega", math.nan)  # with the rig's gains
+    yield judge_claim("4.3", tests, runs="; ".join(texts), rig_gains=speed_change)
 
 
-def _printed(context: Context) -> Iterator[Claim]:
-    """Judge the claims that the equations and tables themselves decide."""
+def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.7, 4.13, 4.17, 4.20, 4.22 and 4.23, which follow from the thesis's equations and tables."""
     rig = thesis_rig()
-    charge, run = rig.fluid.p_charge * 1e-6, context.run(spec(COMMANDS[0], 25.0))
+    charge, run = rig.fluid.p_charge * 1e-6, context.run(make_experiment(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
-    yield judge_claim("4.7", [None], low=low, high=high, charge=charge, needed=charge + 0.4 - high, lift=high - charge)
-    area, d_line = (3.75 / 5.0) ** 2, rig.line.d_line
-    tests = [math.isclose(area, 0.75, rel_tol=0.01), math.isclose(d_line, 5e-3)]
-    yield judge_claim("4.13", tests, area=area, closed=1 - area, d_line=d_line * 1e3)
-    yield from (judge_claim("4.17", [None]), judge_claim("4.22", [None]))
+    needed = charge + _PRINTED_PEAK_MPA - high  # charge pressure with which the peaks are as printed
+    yield judge_claim("4.7", NOT_TESTED, low=low, high=high, charge=charge, needed=needed, lift=high - charge)
+    open_area, d_line = (3.75 / 5.0) ** 2, rig.line.d_line  # 3.75 mm of 5 mm, printed as 25 % closed
+    tests = [math.isclose(open_area, 0.75, rel_tol=0.01), math.isclose(d_line, 5e-3)]
+    yield judge_claim("4.13", tests, area=open_area, closed=1 - open_area, d_line=d_line * 1e3)
+    yield from (judge_claim("4.17", NOT_TESTED), judge_claim("4.22", NOT_TESTED))
     F_pr = rig.friction.F_pr
-    jumps = jumps_at_threshold(F_pr)
+    jumps = friction_at_threshold(F_pr)
     tests = [math.isclose(force, above, rel_tol=1e-6) for force, above in jumps.values()]
     texts = [f"{name} bracket: {force:.1f} N at v_th, {above:.1f} N above" for name, (force, above) in jumps.items()]
-    yield judge_claim("4.20", tests, jumps="; ".join(texts), falls=falls_up_to(F_pr))
-    texts, free = [], {}
+    yield judge_claim("4.20", tests, jumps="; ".join(texts), falls=falling_friction_limit(F_pr))
+    texts, is_free = [], {}
     for metering, name in (("literal", "as printed"), ("meter-out", "with the areas of side B swapped")):
-        half = rig.with_overrides({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5, "metering": metering})
-        A_in, A_out, B_in, B_out = throttle_coefficients(half)
-        free[metering] = (A_in > A_out, B_in > B_out)
-        A, B = ("free to the cylinder" if side else "throttled to the cylinder" for side in free[metering])
+        throttled = rig.with_overrides({"orifices": "present", "closed_A": 0.5, "closed_B": 0.5, "metering": metering})
+        A_in, A_out, B_in, B_out = throttle_coefficients(throttled)
+        is_free[metering] = (A_in > A_out, B_in > B_out)  # whether flow to the cylinder meets less resistance
+        A, B = ("free to the cylinder" if free else "throttled to the cylinder" for free in is_free[metering])
         texts.append(f"{name}: side A {A}, side B {B}")
-    yield judge_claim("4.23", free["literal"], sides="; ".join(texts))
+    yield judge_claim("4.23", is_free["literal"], sides="; ".join(texts))
 
 
-def passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Count the single tests that passed, and name the readings under which all did."""
-    every = [test for row in tests.values() for test in row]
+def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
+    """Format how many tests passed, and under which readings all of them did."""
+    results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
-    text = f"{sum(every)} of {len(every)} tests pass"
-    if not any(every) or all(every):
+    text = f"{sum(results)} of {len(results)} tests pass"
+    if not any(results) or all(results):
         return text
     return f"{text}, all of them under {'; '.join(passing_readings) or 'neither reading'}"
 
 
-def _over(
+def _judge_runs(
     number: int,
     numbers: Mapping[Solver, Mapping[Reading, _T]],
     test: Callable[[_T], Iterable[bool]],
-    text: Callable[[list[_T]], str],
+    format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge a claim by the tests of its numbers under both readings; the converged runs decide."""
-    tests = {solver: {r: tuple(test(row_numbers)) for r, row_numbers in numbers[solver].items()} for solver in SOLVERS}
+    """Judge claim 4.`number` by testing its `numbers` by solver and reading; the converged runs decide."""
+    tests = {
+        solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
+    }
     simulation = "; ".join(
-        f"{cases.SOLVER_TEXT[solver]}: {text(list(numbers[solver].values()))}, {passed(tests[solver])}"
+        f"{cases.SOLVER_TEXT[solver]}: {format_numbers(list(numbers[solver].values()))}, {count_passed(tests[solver])}"
         for solver in SOLVERS
     )
-    every = [test for row in tests["converged"].values() for test in row]
-    return judge_claim(f"4.{number}", every, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
+    results = [passed for row in tests["converged"].values() for passed in row]
+    return judge_claim(f"4.{number}", results, simulation=simulation, noise=cases.visible_pressure() * 1e-3)
 
 
-def _range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
+def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
+    """Format minimum and maximum of the values, scaled by `factor` to `unit`."""
     scaled = [value * factor for value in values]
     return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
 
 
-def _ranges(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    return lambda every: f"{head} {_range(value for rows in every for value in values(rows))}"
+def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
+    """Build the function that formats `head` and the range of `values` over the rows of all readings."""
+    return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
 
-def _changes(rows: Rows, kind: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute the change of each later row against the first, in the `kind` of number of the named pressures."""
-    keys = [f"{kind} of {name}" for name in names]
+def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
+    """Compute the change of each later row from the first in a statistic ("peak" or "range") of the pressures."""
+    keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
-def _orifices(context: Context) -> Iterator[Claim]:
-    """Judge the claims on the orifices under several commands and closings."""
-    limit = cases.visible_pressure()
+def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
+    """Compute the numbers of each (command, closing) under both solvers and readings."""
 
-    def numbers_under(*cases_to_run: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-        """Compute the numbers of each command and closing, under both readings and solvers."""
-        return {
-            solver: {
-                reading: [cases.numbers_of(context.run(spec(*case, reading, solver))) for case in cases_to_run]
-                for reading in READINGS
-            }
-            for solver in SOLVERS
-        }
+    def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
+        return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
 
-    def both(rows: Rows) -> list[float]:
+    return {
+        solver: {reading: [summarise(*case, reading, solver) for case in commands_and_closings] for reading in READINGS}
+        for solver in SOLVERS
+    }
+
+
+def _judge_opening(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.8 to 4.12 on the change from open orifices to 25 % closed."""
+    min_visible = cases.visible_pressure()
+    opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
+    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
+
+    def peak_and_range_changes(rows: Rows) -> list[float]:
         return _changes(rows, "peak") + _changes(rows, "range")
 
-    def widest(rows: Rows) -> list[float]:
+    def format_flow_difference(rows_of_readings: list[Rows]) -> str:
+        """Format the largest difference of the two flows at 25 % closed."""
+        largest = max(rows[1][flows] for rows in rows_of_readings)
+        return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
+
+    changes = _range_text("25 % against open, peaks and ranges", peak_and_range_changes)
+    yield _judge_runs(8, opening, lambda rows: np.abs(peak_and_range_changes(rows)) < min_visible, changes)
+    yield _judge_runs(10, opening, lambda rows: np.abs(_changes(rows, "peak")) > min_visible, changes)
+    yield _judge_runs(9, opening, lambda rows: [rows[1][flows] < _MAX_FLOW_DIFFERENCE], format_flow_difference)
+    drop = _range_text(p_1, lambda rows: [rows[1][p_1]])
+    yield _judge_runs(11, opening, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -min_visible), drop)
+    drop = _range_text(p_2, lambda rows: [rows[1][p_2]])
+    yield _judge_runs(12, opening, lambda rows: (rows[1][p_2] > 0, rows[1][p_2] > min_visible), drop)
+
+
+def _judge_larger_closings(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices."""
+    min_visible = cases.visible_pressure()
+    by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
+    fast_by_closing = _run_cases(context, *((COMMANDS[2], closed) for closed in CLOSINGS))
+    slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
+
+    def range_changes_to_last(rows: Rows) -> list[float]:
         return _changes([rows[0], rows[-1]], "range")
 
-    def widened(rows: Rows) -> Iterator[bool]:
+    def ranges_grow(rows: Rows) -> Iterator[bool]:
+        """Test whether the range of each pressure grows with the closing, visibly in total."""
         for name in PRESSURES:
-            a, b, c = (row[f"range of {name}"] for row in rows)
-            yield a < b < c and c - a > limit
+            at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
+            yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
-    def rises(rows: Rows) -> list[float]:
+    def chamber_peak_changes(rows: Rows) -> list[float]:
         return _changes(rows, "peak", CHAMBERS)
 
-    def drops(rows: Rows) -> list[float]:
+    def largest_drops(rows: Rows) -> list[float]:
         return [row["largest drop"] for row in rows]
 
-    def most_unlike(every: list[Rows]) -> str:
-        return f"rms of Q_A - Q_B over rms of Q_A at most {100 * max(rows[1][flows] for rows in every):.2f} %"
-
-    opened = numbers_under((COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
-    commands = numbers_under(*((command, 50.0) for command in COMMANDS))
-    seven, five = (numbers_under(*((command, closed) for closed in CLOSINGS)) for command in (COMMANDS[2], COMMAND))
-    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
-    text = _ranges("25 % against open, peaks and ranges", both)
-    yield _over(8, opened, lambda rows: (abs(change) < limit for change in both(rows)), text)
-    yield _over(10, opened, lambda rows: (abs(change) > limit for change in _changes(rows, "peak")), text)
-    yield _over(9, opened, lambda rows: [rows[1][flows] < 0.05], most_unlike)
-    text = _ranges(p_1, lambda rows: [rows[1][p_1]])
-    yield _over(11, opened, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -limit), text)
-    text = _ranges(p_2, lambda rows: [rows[1][p_2]])
-    yield _over(12, opened, lambda rows: (rows[1][p_2] > 0, rows[1][p_2] > limit), text)
-    text = _ranges(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", widest)
-    yield _over(14, commands, lambda rows: (growth > limit for growth in widest(rows)), text)
-    text = _ranges(f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks", rises)
-    yield _over(15, seven, lambda rows: (rise > limit for rise in rises(rows)), text)
-    yield _over(16, five, widened, _ranges("75 against 25 % closed, ranges", widest))
-    text = _ranges(f"largest drop at 25, 50, 75 % under {COMMAND}", drops)
-    yield _over(21, five, lambda rows: (drop > limit for drop in drops(rows)), text)
+    changes = _range_text(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", range_changes_to_last)
+    yield _judge_runs(14, by_command, lambda rows: np.array(range_changes_to_last(rows)) > min_visible, changes)
+    changes = _range_text(f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks", chamber_peak_changes)
+    yield _judge_runs(15, fast_by_closing, lambda rows: np.array(chamber_peak_changes(rows)) > min_visible, changes)
+    changes = _range_text("75 against 25 % closed, ranges", range_changes_to_last)
+    yield _judge_runs(16, slow_by_closing, ranges_grow, changes)
+    drops = _range_text(f"largest drop at 25, 50, 75 % under {COMMAND}", largest_drops)
+    yield _judge_runs(21, slow_by_closing, lambda rows: np.array(largest_drops(rows)) > min_visible, drops)
 
 
-def _drift(context: Context) -> Iterator[Claim]:
-    """Judge the claims on the piston's drift."""
+def _judge_drift(context: Context) -> Iterator[Claim]:
+    """Judge claims 4.18 and 4.19 on the drift of the piston with orifices."""
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
-        return cases.piston_drift(context.run(cases.drift_spec(reading, closed, solver)))
+        """Compute the drift [m] of the piston over a long run."""
+        return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
-    drift_without = drift(OURS, None, "converged")
-    least = DRIFT_SHARE * abs(drift_without)
+    drift_without = drift(DEFAULT_READING, None, "converged")
+    min_change = DRIFT_FRACTION * abs(drift_without)
     drifts = {
         solver: {reading: [drift(reading, closed, solver) for closed in CLOSINGS] for reading in READINGS}
         for solver in SOLVERS
     }
 
-    def gained(rows: list[list[float]]) -> str:
-        parts = (_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
-        return ", ".join(f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
+    def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
+        """Build the function that formats the range of the added drift over the readings, at each closing."""
 
-    heads = {
-        18: f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at",
-        19: "drift over 60 s beyond that without orifices, at",
-    }
-    tests: dict[int, Callable[[list[float]], Iterable[bool]]] = {
-        18: lambda row: (abs(drift - drift_without) > least for drift in row),
-        19: lambda row: (abs(row[1]) - abs(row[0]) > least, abs(row[2]) - abs(row[1]) > least),
-    }
-    for number, test in tests.items():
-        yield _over(number, drifts, test, lambda rows, head=heads[number]: f"{head} {gained(rows)}")  # type: ignore[misc]
+        def format_drift(rows: list[list[float]]) -> str:
+            parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
+            texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
+            return f"{head} {', '.join(texts)}"
+
+        return format_drift
+
+    def differs(row: list[float]) -> Iterator[bool]:
+        """Test at each closing whether the drift differs from that without orifices."""
+        return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
+
+    def grows(row: list[float]) -> Iterator[bool]:
+        """Test whether the drift grows from each closing to the next."""
+        return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
+
+    head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"
+    yield _judge_runs(18, drifts, differs, drift_formatter(head))
+    head = "drift over 60 s beyond that without orifices, at"
+    yield _judge_runs(19, drifts, grows, drift_formatter(head))
 
 
-#: Numbers of a row of the table of readings, and the factor to their units.
-_SHOWN: dict[str, float] = {
+#: Numbers of a row of the table of readings, and the factors to the table's units.
+_TABLE_FACTORS: dict[str, float] = {
     **{f"range of {name}": 1e-6 for name in PRESSURES},
     "least pressure": 1e-6,
     **dict.fromkeys(("mean of p_1 - p_A", "mean of p_2 - p_B", "largest drop"), 1e-3),
     "flows differ": 100.0,
 }
-_TESTED = {True: "passed", False: "not passed", None: "not made"}
+_HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 
 
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
-    """Make the table of both readings, all closings and solvers, and judge the claims of chapter 4."""
-    parts = (_without_orifices, _step_and_gains, _printed, _orifices, _drift)
-    judgements = [claim for part in parts for claim in part(context)]
+    """Tabulate the numbers under both readings, all closings and solvers, and judge the claims of chapter 4."""
+    without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
+    with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)
+    judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]
     judgements.sort(key=lambda claim: int(claim.id.rpartition(".")[2]))
     rows: list[tuple[Cell, ...]] = []
     for reading, solver, closed in itertools.product(READINGS, SOLVERS, (0.0, *CLOSINGS)):
-        run = context.run(spec(COMMAND, closed, reading, solver))
-        numbers = cases.numbers_of(run)
-        values = (numbers[name] * factor for name, factor in _SHOWN.items())
+        run = context.run(make_experiment(COMMAND, closed, reading, solver))
+        numbers = cases.summarise_run(run)
+        values = (numbers[name] * factor for name, factor in _TABLE_FACTORS.items())
         cells = (value if math.isfinite(value) else None for value in values)
-        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, _TESTED[run.resolved]))
-    table = item.table(rows, note("readings", window=cases.WINDOW))
+        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, _HALVING_TEST[run.resolved]))
+    table = item.table(rows, format_note("readings", window=cases.WINDOW))
     return (replace(table, claims=tuple(claim.id for claim in judgements)), *judgements)

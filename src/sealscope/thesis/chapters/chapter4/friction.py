@@ -1,4 +1,4 @@
-"""Figs. 4.2 and 4.3: friction models and the Stribeck curve of the rig, under both bracketings of eq. (4.22)."""
+"""Draw Figs. 4.2 and 4.3: friction models, and the rig's Stribeck curve under both bracketings of eq. (4.22)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Figure, FigureCurve, Number, Panel
-from sealscope.thesis.engine.texts import note
+from sealscope.thesis.engine.texts import format_note
 
 _AXES = ("v [m/s]", "F_f [N]")
 
@@ -23,40 +23,43 @@ def thesis_rig() -> Rig:
     return load_rig("thesis")
 
 
-def stribeck(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
-    """Compute the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22)."""
+def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
+    """Compute the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22).
+
+    `literal_bracket`: place the bracket of eq. (4.22) as printed, which makes the friction jump at v_th.
+    """
     f = thesis_rig().friction
-    plain = getattr(stribeck_friction, "py_func", stribeck_friction)
-    return np.array([plain(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
+    friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
+    return np.array([friction(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
 
-def jumps_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
+def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
     """Compute friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
     v_th = thesis_rig().friction.v_th
-    sides = np.array([v_th, math.nextafter(v_th, 1.0)])
-    jumps = {}
+    velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
+    forces = {}
     for name, literal_bracket in (("continuous", False), ("literal", True)):
-        below, above = stribeck(sides, F_C, literal_bracket=literal_bracket)
-        jumps[name] = float(below), float(above)
-    return jumps
+        at_threshold, above = stribeck_force(velocities, F_C, literal_bracket=literal_bracket)
+        forces[name] = float(at_threshold), float(above)
+    return forces
 
 
-def falls_up_to(F_C: float) -> float:
-    """Compute the velocity [m/s] up to which friction falls: where F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
+def falling_friction_limit(F_C: float) -> float:
+    """Compute the velocity [m/s] up to which friction falls with speed: F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
     f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
 
 
-def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
+def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
     f = thesis_rig().friction
-    F, peak, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
+    F, F_brk, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
     sketches: dict[str, tuple[str, Any, Any]] = {
         "(a) Coulomb": ("F_C sign(v)", [-0.1, 0.0, 0.0, 0.1], [-F, -F, F, F]),
-        "(b) Static": ("F_C K_brk at standstill", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -peak, peak, F, F]),
-        "(c) Stick-slip": ("linear below v_th", [-0.1, -v_th, v_th, 0.1], [-F, -peak, peak, F]),
-        "(d) Stribeck": ("eqs. 4.21, 4.22", v, stribeck(v, F)),
+        "(b) Static": ("F_C K_brk at standstill", [-0.1, 0.0, 0.0, 0.0, 0.0, 0.1], [-F, -F, -F_brk, F_brk, F, F]),
+        "(c) Stick-slip": ("linear below v_th", [-0.1, -v_th, v_th, 0.1], [-F, -F_brk, F_brk, F]),
+        "(d) Stribeck": ("eqs. 4.21, 4.22", v, stribeck_force(v, F)),
     }
     panels = tuple(
         Panel(*_AXES, (FigureCurve(np.array(x), np.array(y), label, "reference"),), title)
@@ -64,30 +67,30 @@ def friction_models(context: Context, item: Item) -> tuple[Figure, ...]:
     )
     numbers = (
         Number("Coulomb force without pressure", f.F_pr, "N"),
-        Number("breakaway force", peak, "N"),
+        Number("breakaway force", F_brk, "N"),
         Number("threshold velocity", f.v_th, "m/s"),
     )
-    return (item.figure(panels, numbers, notes=note("friction-models")),)
+    return (item.figure(panels, numbers, notes=format_note("friction-models")),)
 
 
-def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction against velocity, near standstill under both bracketings, and its slope."""
+def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
+    """Draw Fig. 4.3: friction over velocity, near standstill for both readings of eq. 4.22's bracket, and its slope."""
     rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
     v = np.linspace(-0.2, 0.2, 1601)
-    near = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
-    ahead = np.linspace(f.v_th, 0.2, 800)
-    slope = np.gradient(stribeck(ahead, f.F_pr), ahead)
+    v_slow = np.linspace(-2.0 * f.v_th, 2.0 * f.v_th, 1601)
+    v_above = np.linspace(f.v_th, 0.2, 800)
+    slope = np.gradient(stribeck_force(v_above, f.F_pr), v_above)
     curves = (
-        FigureCurve(v, stribeck(v, f.F_pr), "no pressure", "reference"),
-        FigureCurve(v, stribeck(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
+        FigureCurve(v, stribeck_force(v, f.F_pr), "no pressure", "reference"),
+        FigureCurve(v, stribeck_force(v, charged), f"both chambers at {rig.fluid.p_charge / 1e6:g} MPa", "other"),
     )
     brackets = (
-        FigureCurve(near, stribeck(near, f.F_pr), "bracket closed: continuous", "converged"),
-        FigureCurve(near, stribeck(near, f.F_pr, literal_bracket=True), "bracket over all", "literal"),
+        FigureCurve(v_slow, stribeck_force(v_slow, f.F_pr), "bracket closed: continuous", "converged"),
+        FigureCurve(v_slow, stribeck_force(v_slow, f.F_pr, literal_bracket=True), "bracket over all", "as_published"),
     )
-    slopes = (FigureCurve(ahead, slope, "slope above v_th", "reference"),)
+    slopes = (FigureCurve(v_above, slope, "slope above v_th", "reference"),)
     panels = (
         Panel(*_AXES, curves, "(a) Stribeck curve"),
         Panel(*_AXES, brackets, "(b) Both bracketings of eq. 4.22"),
@@ -95,10 +98,10 @@ def stribeck_curve(context: Context, item: Item) -> tuple[Figure, ...]:
     )
     numbers = (
         *(
-            Number(f"friction {side} v_th, {name}", value, "N")
-            for name, both in jumps_at_threshold(f.F_pr).items()
-            for side, value in zip(("at", "above"), both, strict=True)
+            Number(f"friction {place} v_th, {name}", force, "N")
+            for name, forces in friction_at_threshold(f.F_pr).items()
+            for place, force in zip(("at", "above"), forces, strict=True)
         ),
-        Number("friction falls up to", falls_up_to(f.F_pr), "m/s"),
+        Number("friction falls up to", falling_friction_limit(f.F_pr), "m/s"),
     )
-    return (item.figure(panels, numbers, notes=note("stribeck")),)
+    return (item.figure(panels, numbers, notes=format_note("stribeck")),)

@@ -1,0 +1,348 @@
+"""The summaries of a machine's healthy recordings, in a file next to its text (`machine_file`).
+
+The file is lines: the first names the format, each other one is the summary of a recording, as its SHA-256, a blank and
+JSON. The text names the summaries it uses by their SHA-256. So a summary that was altered or lost is found and named, a
+summary that no text names does no harm, and a new file that has the old summaries, too, belongs to both texts, the old
+and the new, at whichever instant a writer is killed.
+
+JSON holds `digest`, `units`, `rate`, `seconds`, `start_s`, `about`, `summaries` by the names of detectors, and
+`statistics` by their names. Arrays are bytes (`storage.plain_state.plain_array`). Unknown names are read, too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Iterator, Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
+
+from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.signals import SIGNALS
+from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
+from sealscope.diagnosis.inference.terms import LEAK
+from sealscope.diagnosis.rms_change.blocks import DUTY
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
+from sealscope.errors import InputError
+from sealscope.signals.details import QUANTITIES
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.opening import open_regular
+from sealscope.storage.plain_state import plain_array, restore_array
+from sealscope.storage.plain_values import convert_type, parse_json
+
+#: What the file's name ends with, and its first line.
+SUFFIX, _HEAD = ".healthy", b"sealscope healthy summaries 1\n"
+#: The same before version 0.1, which this version still reads; so is "lessons" in place of the key "summaries".
+OLD_SUFFIX, _OLD_HEAD = ".lessons", b"sealscope lessons 1\n"
+#: Largest file and longest line [bytes]; most summaries in a file.
+MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
+#: Most commas, brackets and braces in a line: a number, and a fraction of its bytes. Each becomes an object in memory.
+_MAX_MARKS, _MAX_FRACTION = 40, 0.1
+#: Largest size of a number: products of two do not overflow. Times are within the years that calendars have [s].
+_MAX_NUMBER, _FIRST_TIME, _LAST_TIME = 1e100, -6.2e10, 2.5e11
+#: Largest size of the logarithm of a number that is neither zero nor infinite.
+_MAX_LOGARITHM = 750.0
+#: Largest ratio, due to rounding, of a squared product to the product of its squares (Cauchy's inequality).
+_ROUNDING = 1.0 + 1e-6
+#: Length of a checksum in hexadecimal digits.
+_DIGITS = 64
+
+
+class Line(NamedTuple):
+    """A line of the file: the `checksum` that it states, and the JSON of a summary, unread."""
+
+    checksum: str
+    data: bytes
+
+
+def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
+    """Make the pydantic type of a table from the types of its values; (type, None) for a value that may be absent.
+
+    `extra`: whether other values are preserved ("allow") or dropped.
+    """
+    config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
+    fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in value_types.items()}
+    return create_model("Table", __config__=config, **fields)  # type: ignore[call-overload]
+
+
+def uniform_table_type(value_type: Any) -> Any:
+    """Make the pydantic type of a table of any names and one type of values; errors name the first other value."""
+
+    def check_values(table: Any) -> Any:
+        """Check the values one after the other; raise ValueError for the first of another type."""
+        if not isinstance(table, dict):
+            raise ValueError(f"must be a table, got {table!r:.60}")
+        for name, value in table.items():
+            try:
+                convert_type(value_type, value)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+        return table
+
+    return Annotated[Any, AfterValidator(check_values)]
+
+
+def list_type(value_type: Any, min_length: int = 0) -> Any:
+    """Make the pydantic type of a list of one type of values; errors name the first other value."""
+    return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
+
+
+def _check_array(value: Any) -> Any:
+    """Check that a value is an array of finite numbers; raise ValueError otherwise."""
+    if not isinstance(value, np.ndarray):
+        raise ValueError("must be an array of numbers")
+    if not (np.abs(value) < _MAX_NUMBER).all():
+        raise ValueError(f"must hold finite numbers of a size below {_MAX_NUMBER:g}")
+    return value
+
+
+def _check_statistic(value: Any) -> Any:
+    """Check that a value is a finite number or an array of such; raise ValueError otherwise."""
+    _check_array(np.array(value) if isinstance(value, float) else value)
+    return value
+
+
+def _check_sums(summary: Any) -> Any:
+    """Check the shapes of a balance's Gram matrices, and that leak and flow obey Cauchy's inequality in them."""
+    size = len(summary.terms) + 1
+    if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
+        raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {summary.sums.shape}")
+    shut = summary.shut_sums
+    if shut is not None and shut.shape != (1, size + 1, size + 1):
+        raise ValueError(f"shut_sums must be of the shape (1, {size + 1}, {size + 1}), got {shut.shape}")
+    if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
+        raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
+    drop = summary.viscous_drop
+    if drop is not None and (drop.shape != (2,) or not np.abs(drop).max() < _MAX_LOGARITHM or drop[1] < 0.0):
+        raise ValueError("viscous_drop must hold a logarithm and its standard error")
+    if LEAK not in summary.terms:
+        raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
+    leak = summary.terms.index(LEAK)
+    squares, product = summary.sums[:, [leak, -1], [leak, -1]], summary.sums[:, leak, -1]
+    if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
+        raise ValueError("sums must be those of squares and products of a leak and a flow, got none such")
+    return summary
+
+
+def _check_levels(summary: Any) -> Any:
+    """Check the shapes of the levels of the ringing, and that they can be logarithms."""
+    expected = (len(QUANTITIES) * len(summary.chambers),)
+    if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
+        shapes = f"{summary.levels.shape} and {summary.duty.shape}"
+        raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
+    if not max(np.abs(summary.levels).max(), np.abs(summary.duty).max()) < _MAX_LOGARITHM:
+        raise ValueError(f"levels and duty must be logarithms, of a size below {_MAX_LOGARITHM:g}")
+    return summary
+
+
+_Array = Annotated[Any, AfterValidator(_check_array)]
+_Statistic = Annotated[Any, AfterValidator(_check_statistic)]
+_Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]
+_Magnitude = Annotated[float, Field(ge=0.0, lt=_MAX_NUMBER)]
+_Positive = Annotated[float, Field(gt=0.0, lt=_LAST_TIME)]
+_Time = Annotated[float, Field(gt=_FIRST_TIME, lt=_LAST_TIME)]
+_BALANCE = table_type(
+    "allow",
+    terms=list_type(str),
+    scale=_Magnitude,
+    sums=_Array,
+    shut_sums=(_Array, None),
+    held=(_Array, None),
+    shut_odds=(_Number, None),
+    held_odds=(_Number, None),
+    flow=_Magnitude,
+    pressure=_Magnitude,
+    start_s=(_Time, None),
+    oil_degC=(_Number, None),
+    viscous_drop=(_Array, None),
+)
+_RMS = table_type(
+    "allow",
+    chambers=list_type(str),
+    recorded=(list_type(str), None),
+    rate=_Positive,
+    start_s=(_Time, None),
+    levels=_Array,
+    duty=_Array,
+)
+#: Types of the summaries of Sealscope's own methods; those of others are plain tables.
+_SUMMARIES = {
+    VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
+    PRESSURE_RESPONSE: (table_type("allow", level=_Number), None),
+    RMS_CHANGE: (Annotated[_RMS, AfterValidator(_check_levels)], None),
+    SIGNALS: (table_type("allow", friction=_Number, drift_A=_Number, drift_B=_Number), None),
+}
+_ABOUT = {
+    "sha256": str,
+    "pressure_bar": _Number,
+    "oil_degC": _Number,
+    "noise": uniform_table_type(_Magnitude),
+    "log_units": uniform_table_type(str),
+    "wrong": list_type(str),
+}
+
+
+def _restore_arrays(value: Any, name: str) -> Any:
+    """Replace packed arrays in a parsed JSON value, at any depth, by numpy arrays; errors state its `name`."""
+    if isinstance(value, dict):
+        if value.keys() == {"shape", "f8"}:
+            try:
+                return restore_array(value, name)
+            except InputError:
+                raise ValueError(f"{name} must be the bytes of an array, with its shape") from None
+        return {key: _restore_arrays(inner, key) for key, inner in value.items()}
+    return value
+
+
+_BY_METHOD: Any = Annotated[
+    table_type("allow", **_SUMMARIES), BeforeValidator(lambda value: _restore_arrays(value, ""))
+]
+_RECORDING = table_type(
+    digest=Annotated[str, Field(min_length=1, max_length=200)],
+    units=uniform_table_type(str),
+    rate=_Positive,
+    seconds=_Positive,
+    start_s=(_Time, None),
+    about=(table_type("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
+    summaries=_BY_METHOD,
+    statistics=(
+        Annotated[uniform_table_type(_Statistic), BeforeValidator(lambda value: _restore_arrays(value, ""))],
+        None,
+    ),
+)
+
+
+def _pack_arrays(value: Any) -> Any:
+    """Convert a value for JSON, without members that are None; a list of fractional numbers becomes an array."""
+    if isinstance(value, Mapping):
+        return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | tuple) and value and isinstance(value[0], float | list | tuple):
+        try:
+            value = np.asarray(value)
+        except ValueError:  # rows of unequal lengths
+            return [_pack_arrays(row) for row in value]
+    if isinstance(value, np.ndarray):
+        return plain_array(value) if value.dtype.kind in "fiu" else _pack_arrays(value.tolist())
+    return [_pack_arrays(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _format_json(value: Any) -> bytes:
+    """Format a packed value as JSON; raise ValueError for numbers that are not finite, TypeError for other values."""
+    return json.dumps(_pack_arrays(value), allow_nan=False, sort_keys=True, separators=(",", ":")).encode("ascii")
+
+
+def check_summary(method: str, summary: Summary) -> None:
+    """Raise ArithmeticError if a method's summary could not be read again, for example with infinite numbers."""
+    try:
+        convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
+    except ValueError as error:
+        raise ArithmeticError(f"no summary: {error}") from None
+
+
+def format_summary(recording: SummarisedRecording) -> Line:
+    """Format a recording's summaries as a line; raise InputError if it would not be read again."""
+    fields = {name: value for name, value in vars(recording).items() if name != "file"}
+    try:
+        data = _format_json(fields)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the summary of {recording.file} must hold plain finite values, got: {error}") from None
+    line = Line(sha256(data).hexdigest(), data)
+    parse_summary(line, recording.file, recording.file)
+    return line
+
+
+def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
+    """Parse a line as the summaries of the recording `file`; `place`: path of the file of summaries, for errors.
+
+    Raises InputError if the checksum does not match, or a value breaks a rule.
+    """
+    if sha256(line.data).hexdigest() != line.checksum:
+        rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
+        raise InputError(f"the summary of {file} {rule}: {_REMEDY} ({place})")
+    n_marks, max_marks = sum(line.data.count(mark) for mark in b",[{"), _MAX_MARKS + int(_MAX_FRACTION * len(line.data))
+    try:
+        if n_marks > max_marks:
+            raise ValueError(f"it must hold its numbers in arrays, got {n_marks} values")
+        tree = parse_json(line.data)
+        if isinstance(tree, dict) and "lessons" in tree:  # the key of files from before version 0.1
+            tree["summaries"] = tree.pop("lessons")
+        fields = convert_type(_RECORDING, tree).model_dump(exclude_unset=True)
+    except ValueError as error:
+        raise InputError(f"the summary of {file} is wrong: {error} ({place})") from None
+    return SummarisedRecording(file, **{"start_s": None, **fields})
+
+
+#: What a person does about a summary that is lost or damaged.
+_REMEDY = "take its [[healthy]] out of the machine's file, or commission it anew"
+
+
+def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecording]:
+    """Read the recordings of `files`, each named by the checksum of its line, in their order.
+
+    Raises InputError if the file is missing, of another format or too large, or a line is missing, damaged or breaks a
+    rule.
+    """
+    recordings: dict[str, SummarisedRecording] = {}
+    for line in _iter_lines(path):
+        if line.checksum in files and line.checksum not in recordings:
+            recordings[line.checksum] = parse_summary(line, files[line.checksum], str(path))
+    for checksum, file in files.items():
+        if checksum not in recordings:
+            rule = "must be in the file of healthy summaries, got none such"
+            raise InputError(f"the summary {checksum[:12]}... of {file} {rule}: {_REMEDY} ({path})")
+    return [recordings[checksum] for checksum in files]
+
+
+def read_lines(path: Path) -> list[Line]:
+    """Read all lines, unparsed and unchecked; none if the file cannot be read."""
+    try:
+        return list(_iter_lines(path))
+    except InputError:
+        return []
+
+
+def write_lines(lines: Collection[Line], path: Path) -> None:
+    """Write the file of summaries atomically; raise InputError if it would be too large, or cannot be written."""
+    size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # with a blank and a line feed
+    max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)
+    if size > MAX_SIZE or len(lines) > _MAX_SUMMARIES or max_line > _MAX_LINE:
+        limits = f"{_MAX_SUMMARIES} summaries of {_MAX_LINE} bytes and {MAX_SIZE} bytes in all"
+        raise InputError(
+            f"a file of healthy summaries must have at most {limits}, got {len(lines)} and {size} bytes ({path})"
+        )
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(_HEAD)
+        for line in lines:
+            file.write(b"%b %b\n" % (line.checksum.encode(), line.data))
+
+
+def _iter_lines(path: Path) -> Iterator[Line]:
+    """Read the lines one after the other, without torn ones; raise InputError for a file that cannot be used."""
+    what = "a file of healthy summaries"
+    try:
+        with open_regular(path, what) as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            if size > MAX_SIZE:
+                raise InputError(f"{what} must be at most {MAX_SIZE} bytes, got {size} ({path})")
+            if file.readline(len(_HEAD)) not in (_HEAD, _OLD_HEAD):
+                raise InputError(f"{what} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
+            for _ in range(_MAX_SUMMARIES + 1):
+                row = file.readline(_MAX_LINE)
+                if not row:
+                    return
+                checksum, blank, data = row.rstrip(b"\n").partition(b" ")
+                if len(checksum) == _DIGITS and blank:  # else a torn line, whose summary is missing
+                    yield Line(checksum.decode("ascii", "replace"), data)
+            raise InputError(f"{what} must have at most {_MAX_SUMMARIES} summaries, got more ({path})")
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{what} must be readable, got: {reason} ({path})") from None

@@ -1,0 +1,150 @@
+"""Offset of the pressure difference that the sensors add, estimated from a change of the leakage and removed.
+
+Sensors with a constant error z turn a leak g (p_A - p_B) into g (d - z), d the recorded difference: a change of g then
+changes the flow's offset by -g z. Near z = 0 it is a term of every fit (`blocks`); an offset larger than the pressure
+difference itself is estimated here. In block k the Gram matrix determines two numbers: g_k, from how the flow depends
+on d within the block, and the flow's offset o_k at the block's mean difference d_k. With a step delta of the leak's
+coefficient at the onset s, a random walk w of unknown size q, and a drift of the flow's offset,
+
+    g = F a + w + delta s,    o = (d_k - z) g + B b,    cov w = kappa q min(k, l);
+
+F (level and slope) and B (level, slope and curvature) are projected out. z maximises the restricted likelihood, over
+onsets and (q, kappa), times its prior: a normal density for good sensors, with small odds of a wide one. The walk may
+be no larger than that fitted without z; else z and a free walk would describe changes that no leak explains. If the
+leak does not change, there is no information on z; it stays near zero, and nothing depends on it. Behind a servo valve
+both chambers have the same leak, step and z: their whitened rows are stacked.
+
+Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, WALKS
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.evaluation.scalar_search import find_minimum
+from sealscope.recordings.recording import Array
+
+#: Number of offsets on the first grid, which spans three standard deviations of the wide prior.
+N_GRID = 21
+
+
+def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
+    """Subtract the likeliest offset of p_A - p_B (maximum a posteriori) in the blocks' sums.
+
+    Return the blocks unchanged if the balance has no flow offset, or there are too few blocks.
+    """
+    if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
+        return blocks
+    coarse = blocks.merge(INFERENCE.blocks.coarse)
+    equations = [
+        whitened
+        for k, roles in enumerate(columns)
+        if (whitened := _whiten_steps(replace(coarse, gram=coarse.gram[:, k : k + 1]), roles)) is not None
+    ]
+    if not equations:
+        return blocks
+    leak_steps, offset_steps, z = (np.concatenate(parts) for parts in zip(*equations, strict=True))
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)
+    offset, gram = unit * _find_relative_offset(leak_steps, unit * offset_steps, z), blocks.gram.copy()
+    for k, roles in enumerate(columns):
+        assert roles.bias is not None
+        # (p_A - p_B) dt minus offset dt, in the rows and in the columns of the sums
+        gram[:, k, roles.leak] -= offset * gram[:, k, roles.bias]
+        gram[:, k, :, roles.leak] -= offset * gram[:, k, :, roles.bias]
+    return replace(blocks, gram=gram, zero=blocks.zero + offset)
+
+
+def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> float:
+    """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
+
+    A unit step of the leak from block k on changes the whitened residuals `z` (n,) by column k of `leak_steps` (n, K),
+    less offset times column k of `offset_steps` (n, K). The search is over asinh of the offset, which is linear near
+    zero and logarithmic far off.
+    """
+    usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
+    # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains
+    walks = WALKS[: int(_walk_likelihoods(leak_steps, z, WALKS).argmax()) + 1]
+
+    def log_likelihood(position: float) -> float:
+        return float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
+
+    def cost(position: float) -> float:
+        return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
+
+    positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
+    # start at the maxima of prior and likelihood: a far offset has a high likelihood and a low prior
+    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
+    ends = [(positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]) for start in starts]
+    position, _ = min((find_minimum(cost, *end, 1e-3) for end in ends), key=lambda fit: fit[1])
+    return float(np.sinh(position))
+
+
+class _WhitenedSteps(NamedTuple):
+    """Effects (n, K) of a unit step from each of K blocks on, of the leak and of the flow's offset; residuals z (n,).
+
+    The effect of the leak's step includes the recorded mean pressure difference.
+    """
+
+    leak: Array
+    flow_offset: Array
+    z: Array
+
+
+def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
+    """Whiten the effects of steps of leak and flow offset; None if the blocks have too little information.
+
+    With the precision P of leak and flow offset in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit
+    noise, and `design` = P^(1/2) are the effects on them. The leak's level and slope and the quadratic drift of the
+    flow's offset (F and B of the module) are projected out.
+    """
+    count = len(blocks)
+    precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
+    energies = np.diag(precision).reshape(2, count)  # of leak and offset; a block at rest may have none
+    floors = np.maximum(np.finfo(float).eps * energies.max(axis=1), np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(energies, floors[:, None])).ravel()
+    values, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
+    is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
+    index = np.linspace(-1.0, 1.0, count)
+    trend, drift = (np.polynomial.legendre.legvander(index, degree) for degree in (1, 2))
+    trend_and_drift = np.block([[trend, np.zeros_like(drift)], [pressure[:, None] * trend, drift]])
+    if np.count_nonzero(is_informative) < trend_and_drift.shape[1] + MIN_BLOCKS - 2:  # 2: the trend is in both
+        return None
+    root = np.sqrt(values[is_informative])
+    design = (vectors[:, is_informative] * root).T * scale
+    removed = design @ trend_and_drift
+    removed /= np.maximum(np.linalg.norm(removed, axis=0), np.finfo(float).tiny)
+    complement = np.linalg.qr(removed, mode="complete")[0][:, removed.shape[1] :].T  # orthogonal to trend and drift
+    z = complement @ ((vectors[:, is_informative].T @ (vector / scale)) / root)
+    unit_steps = np.tril(np.ones((count, count)))
+    flow_offset = complement @ design[:, count:]
+    leak = complement @ design[:, :count] + flow_offset * pressure
+    return _WhitenedSteps(leak @ unit_steps, flow_offset @ unit_steps, z)
+
+
+def _walk_likelihoods(steps: Array, z: Array, walks: Array) -> Array:
+    """Compute the log likelihood of z (n,) for each variance q of the random walk, with the best step up and noise.
+
+    cov z = kappa (I + q S S'), S = `steps` (n, K): a walk is a unit step of independent size in each block. Along the
+    eigenvectors of S' S it is diagonal. `walks`: q, of which 1 changes z as much as the noise does, on average.
+    """
+    eigen, basis = np.linalg.eigh(steps.T @ steps)
+    is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)
+    eigen, basis, n = eigen[is_informative], basis[:, is_informative], len(z)
+    walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
+    variances = 1.0 + walks[:, None] * eigen  # of z along the eigenvectors, over that of the noise
+    directions = steps @ (basis / np.sqrt(eigen))
+    in_span = directions.T @ z
+    off_span = z - directions @ in_span
+    total = float(off_span @ off_span) + (in_span**2 / variances).sum(axis=1)
+    # products of a step from each block on, (w, K), with z and with itself
+    moments = (np.sqrt(eigen) * in_span / variances) @ basis.T
+    energies = np.maximum((eigen / variances) @ (basis**2).T, np.finfo(float).tiny)
+    residual_squares = np.maximum(total - (np.maximum(moments, 0.0) ** 2 / energies).max(axis=1), 1e-9 * total)
+    return np.asarray(-0.5 * np.log(variances).sum(axis=1) - 0.5 * n * np.log(residual_squares))

@@ -1,0 +1,227 @@
+"""The rig reduced to the difference p_A - p_B of its chamber pressures, simulated in lanes.
+
+Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed, its current
+and the integral of its speed loop, under the laws of `sealscope.physics`. Friction has two hypotheses, Stribeck's law
+and LuGre's. A leak damps the ringing after each reversal by G/C, and reduces the ramp, the breakaway and the fall of
+the pressure while sliding. `response` fits its parameters to recorded pressures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from sealscope.compiled import contracted, kernel
+from sealscope.diagnosis.inference.pressures.fit import Priors
+from sealscope.diagnosis.priors.pressures import PRESSURE
+from sealscope.physics.cylinder import piston_acceleration, pressure_rate
+from sealscope.physics.friction import coulomb_friction, stribeck_force
+from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
+from sealscope.physics.leakage import laminar_leakage
+from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
+from sealscope.physics.pump import pump_flow, pump_torque
+from sealscope.physics.rig import rig_numbers
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Parameters of a block: speed per volt [rad/(s V)], constant speed [rad/s], stiffness of the oil [Pa], Coulomb
+#: friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay [s/m], relative increase of
+#: friction on the way out [1], conductance past the piston [m^3/(s Pa)], compliance of the contact before it slides
+#: [m/N], stiffness of the load [N/m]; then, with slopes that need no simulation: lead of the command [s], lag of the
+#: transducers [s], scale of p_A - p_B [1] and its offset [Pa].
+PARAMETERS = (
+    *("gain", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "give", "spring"),
+    *("lead", "lag", "scale", "offset"),
+)
+GAIN, BIAS, K_OIL, F_C, F_V, K_BRK, C_C, SIDE, G, COMPLIANCE, SPRING, LEAD, LAG, SCALE, OFFSET = range(len(PARAMETERS))
+#: Index of the position in a state.
+POSITION = 5
+State = tuple[float, float, float, float, float, float]
+Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+#: Numbers of the reduced rig, A_A the mean of both areas.
+Reduced = namedtuple("Reduced", "A_A V M_eq v_th q_b k_p K_i V_max C_m B_M J_M R_c L_c C_e i_max")
+#: Hypotheses of the friction: Stribeck's law of the rig, and LuGre's, whose contact does not creep.
+LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
+_FRICTION = {STRIBECK: PRESSURE.stribeck, BRISTLES: PRESSURE.bristles}
+_CENTRING_RATE = 1.0 / PRESSURE.follow.centring
+#: Maximum step of the solver [s]: RK4 is within 100 Pa there, far below the noise of transducers; length of spectra
+#: [samples].
+_MAX_STEP, _SEGMENT = 1.01e-3, 256
+
+
+@contracted
+def _direction_factor(v: float, theta: Parameters) -> float:
+    """Compute the factor 1 + side or 1 - side of the friction, for motion out or in."""
+    return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
+
+
+@contracted
+def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, float, float]:
+    """Compute the friction of steady sliding [N], its magnitude at full slip [N], and the slip speed [m/s]."""
+    speed = max(abs(v), m.v_th)
+    magnitude = stribeck_force(speed, theta[F_C], theta[K_BRK], theta[C_C]) * _direction_factor(v, theta)
+    return magnitude * min(max(v / m.v_th, -1.0), 1.0), magnitude, speed
+
+
+@contracted
+def _advance_friction(
+    friction_0: float, steady_0: float, v: float, h: float, theta: Parameters, m: Reduced
+) -> tuple[float, float]:
+    """Advance LuGre's friction force [N] by h [s]; return it and the friction of steady sliding at v.
+
+    Without the damping of its contact, which vanishes as it slides, the law is compliance dF/dt = v - |v| F/magnitude.
+    L-stable step of order 2: with a = h |v|/(compliance magnitude) and the steady friction F_s, F_s0 at its start,
+    F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2); both are multiplied by (compliance magnitude)^2.
+    """
+    steady, magnitude, speed = _steady_friction(v, theta, m)
+    slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: path in h, deflection at full friction
+    numerator = friction_0 * stretch * stretch + 0.5 * slip * (steady_0 * stretch + steady * (stretch + slip))
+    return numerator / (stretch * stretch + slip * (stretch + 0.5 * slip)), steady
+
+
+@contracted
+def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
+    """Compute dy/dt of y = (p, v, omega, i, I, x) under the commanded speed `omega_ref` [rad/s]."""
+    p, v, omega, i, integral, x = y
+    outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)
+    error = omega_ref - omega
+    voltage = controller_voltage(error, integral, m.k_p, m.K_i, m.V_max)
+    return (
+        2.0 * pressure_rate(pump_flow(omega, p, m.q_b, 0.0) - outflow, m.V, theta[K_OIL]),
+        piston_acceleration(0.5 * p, -0.5 * p, friction + viscous, theta[SPRING] * x, 0.0, m.A_A, m.A_A, m.M_eq),
+        shaft_acceleration(i, omega, pump_torque(p, m.q_b), m.C_m, m.B_M, m.J_M),
+        winding_current_rate(voltage, i, omega, m.R_c, m.L_c, m.C_e, m.i_max),
+        error,
+        v - x * _CENTRING_RATE,
+    )
+
+
+@contracted
+def _advance(y: State, h: float, k: State) -> State:
+    """Compute the state y + h k."""
+    return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4], y[5] + h * k[5]
+
+
+@contracted
+def _load_six(rows: Array, k: int) -> State:
+    """Load the six consecutive rows from row k on as lanes."""
+    return load(rows, k), load(rows, k + 1), load(rows, k + 2), load(rows, k + 3), load(rows, k + 4), load(rows, k + 5)
+
+
+@kernel
+def simulate_response(
+    command: np.ndarray, rate: float, n_substeps: int, sets: np.ndarray, states: np.ndarray, m: Reduced, out: np.ndarray
+) -> None:
+    """Simulate p_A - p_B [Pa] of all lanes at each sample, `out` (n, lanes), by RK4 with substeps of a sample.
+
+    `command` (n + 1,) [V]: at the previous sample, then at each, with ramps between; `sets` (p, lanes): a row for each
+    parameter; `states` (8, lanes): p, v, omega, i, I, x, friction and reading at the previous sample, on return at the
+    last. Friction advances by its own implicit step from the speed at each stage.
+    """
+    y, friction, reading = _load_six(states, 0), load(states, 6), load(states, 7)
+    theta = (*_load_six(sets, 0), *_load_six(sets, 6), load(sets, LAG))
+    h = 1.0 / (rate * n_substeps)
+    steady = _steady_friction(y[1], theta, m)[0]
+    for sample in range(command.size - 1):
+        rise = command[sample + 1] - command[sample]
+        lead_speed = theta[GAIN] * theta[LEAD] * (rise * rate) + theta[BIAS]
+        for step in range(n_substeps):
+            speed_0 = theta[GAIN] * (command[sample] + rise * (step / n_substeps)) + lead_speed
+            speed_1 = theta[GAIN] * (command[sample] + rise * ((step + 0.5) / n_substeps)) + lead_speed
+            speed_2 = theta[GAIN] * (command[sample] + rise * ((step + 1.0) / n_substeps)) + lead_speed
+            k_1 = _rates(y, friction, speed_0, theta, m)
+            y_1 = _advance(y, 0.5 * h, k_1)
+            k_2 = _rates(y_1, _advance_friction(friction, steady, y_1[1], 0.5 * h, theta, m)[0], speed_1, theta, m)
+            y_2 = _advance(y, 0.5 * h, k_2)
+            k_3 = _rates(y_2, _advance_friction(friction, steady, y_2[1], 0.5 * h, theta, m)[0], speed_1, theta, m)
+            y_3 = _advance(y, h, k_3)
+            k_4 = _rates(y_3, _advance_friction(friction, steady, y_3[1], h, theta, m)[0], speed_2, theta, m)
+            y = _advance(y, h / 6.0, _advance(_advance(_advance(k_1, 2.0, k_2), 2.0, k_3), 1.0, k_4))
+            friction, steady = _advance_friction(friction, steady, y[1], h, theta, m)
+            reading = reading + (y[0] - reading) * (h / (h + theta[LAG]))
+        store(out, sample, reading)
+    for row in range(6):
+        store(states, row, y[row])
+    store(states, 6, friction)
+    store(states, 7, reading)
+
+
+def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
+    """Compute the priors on `PARAMETERS` from a rig at its charge pressure and a `law` of friction."""
+    friction, gain = rig.friction, rig.motor.omega_per_volt
+    of_difference = friction.coulomb_pressure == "difference"
+    coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
+    rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
+    rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
+    # centre, width and wander of each parameter, relative to the rig's value if it has one
+    relative = {str(name): row for name, row in PRESSURE.response.items()} | {"give": _FRICTION[law].give}
+    return Priors(*np.array([rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]).T)
+
+
+class Machine(NamedTuple):
+    """The reduced rig of the simulation, at a rate [Hz] in `n_substeps` steps a sample."""
+
+    numbers: Reduced
+    rate: float
+    n_substeps: int
+    law: str
+
+    @staticmethod
+    def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
+        """Reduce a rig to the simulated states, with the creep speed of the law of friction."""
+        numbers = rig_numbers(rig)
+        numbers = numbers._replace(A_A=0.5 * (numbers.A_A + numbers.A_B), v_th=_FRICTION[law].creep or numbers.v_th)
+        reduced = Reduced(*(getattr(numbers, name) for name in Reduced._fields))
+        return Machine(reduced, rate, math.ceil(1.0 / rate / _MAX_STEP), law)
+
+    def simulate(self, command: Array, sets: Array, states: Array) -> tuple[Array, Array]:
+        """Simulate p_A - p_B (m, n) [Pa] of up to 16 parameter sets (m, p); return it and the last states (8, m).
+
+        `command` (n + 1,) [V] and `states` (8, m): from the previous sample on (`simulate_response`).
+        """
+        lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
+        theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)
+        ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
+        out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
+        simulate_response(command, self.rate, self.n_substeps, theta, ends, self.numbers, out)
+        return out[:, : len(sets)].T.astype(np.float64, order="C"), ends[:, : len(sets)].astype(np.float64)
+
+    def centred_start(self, speed: Array) -> float:
+        """Compute the initial position [m] that centres the stroke under the motor's speed (n,) [rad/s]."""
+        position = np.cumsum(speed) * self.numbers.q_b / (2.0 * math.pi * self.rate * self.numbers.A_A)
+        return float(-0.5 * (position.max() + position.min()))
+
+    def ringing_period(self, stiffness: float) -> float:
+        """Compute the period of the ringing [samples] at a stiffness of the oil [Pa]."""
+        m = self.numbers
+        return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
+
+    def ringing_stiffnesses(self, dp: Array, total: Array, priors: Priors) -> Array:
+        """Find the two stiffnesses of the oil [Pa] at which p_A - p_B rings most.
+
+        The spectrum of p_A + p_B, `total` (n,), which has the same noise and hum but does not ring, is subtracted from
+        that of p_A - p_B, `dp` (n,). If no resolved frequency is within the prior, both are the rig's stiffness.
+        """
+        relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
+        # bins of the zero-padded spectra: of the ringing at the centre of the prior, and around it
+        n_padded = 4 * _SEGMENT
+        middle = n_padded / self.ringing_period(priors.centre[K_OIL])
+        bins = np.arange(
+            math.ceil(middle * math.exp(-2.0 * relative_width)),
+            min(n_padded // 2, int(middle * math.exp(relative_width))),
+        )
+        if not bins.size:
+            return np.full(2, priors.centre[K_OIL])
+        segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
+        spectra = np.fft.rfft(segments * np.hanning(segments.shape[2] + 1)[:-1], n_padded)
+        powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method
+        excess = np.pad((powers[0] - powers[1])[bins], 1, constant_values=-np.inf)
+        peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
+        strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)
+        return np.asarray(priors.centre[K_OIL] * (bins[strongest] / middle) ** 2)  # frequency grows with its root

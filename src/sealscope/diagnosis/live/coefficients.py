@@ -1,0 +1,196 @@
+"""Recursive estimate of a balance's coefficients from sums over the last blocks, compiled.
+
+Columns are in the order nuisances (n), leak, left side. With C (n, n) the products of the nuisances with each other
+and m (n,) those with the left side, summed over the blocks, the leak's column eliminated from both,
+
+    c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
+
+N_k, n_k, b_k the products of the leak's column with itself, the left side and the nuisances over the rows of block k,
+s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. No law
+allocates memory: a unit for other simulators (`fmu.sensor`) runs the same laws in C.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.compiled import large_law, law
+from sealscope.diagnosis.inference.rows.row_weights import eliminate
+from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
+from sealscope.diagnosis.priors.live import LIVE
+
+#: Standard deviations beyond which a residual is a glitch or a step; fraction of the usual motion at a standstill.
+JUMP: float = LIVE.coefficients.jump
+STANDSTILL: float = LIVE.block.standstill
+#: Factors per block by which the weight of earlier blocks and the shift of the series decay.
+_MEMORY, _SHIFT_DECAY = (math.exp(-1.0 / blocks) for blocks in (LIVE.coefficients.memory, LIVE.coefficients.returns))
+TINY = float(np.finfo(float).tiny)
+
+#: Entries of `Coefficients.numbers`: number of rows in the sums, sum of squares of their left sides, variance of a
+#: row, sum of squares of the leak's column, shift of the series from the level, and residual variance of the last block
+#: over the usual one.
+ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
+
+
+class Coefficients(NamedTuple):
+    """Coefficients of n nuisances with the sums that they rest on, and arrays to work in.
+
+    `sums` (n + 2, n + 2); `values` (n,); `leak_products` (n,), products of the leak's column with the nuisances;
+    `numbers` (6,). To work in: `block` (n + 2, n + 2), sums of one block; `matrix` (n, n + 3), normal equations.
+    """
+
+    sums: Any
+    values: Any
+    leak_products: Any
+    numbers: Any
+    block: Any
+    matrix: Any
+
+
+def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes of the `Coefficients` of n nuisances."""
+    return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
+
+
+@law
+def load_block(model: Any, gram: Any, column_order: Any) -> None:
+    """Copy a block's Gram matrix (m, m) into `model.block`; `column_order`: indices of nuisances, leak, left side."""
+    for i in range(len(column_order)):
+        for j in range(len(column_order)):
+            model.block[i, j] = gram[column_order[i], column_order[j]]
+
+
+@large_law
+def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
+    """Add `model.block` to the sums, and reduce the weight of earlier blocks.
+
+    Between blocks the leak makes a random step, of the variance of a block's estimate, or unlimited if `has_stepped`.
+    """
+    sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
+    leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
+    for i in range(size):
+        leak_column[i] = sums[i, leak]
+    information = leak_column[leak] + (0.0 if has_stepped else max(block[leak, leak], TINY))
+    for i in range(size):
+        for j in range(size):
+            # what the sums lose where the leak before the random step is eliminated
+            loss = leak_column[i] * (leak_column[j] / information) if information > 0.0 else 0.0
+            sums[i, j] = _MEMORY * (sums[i, j] - loss) + weight * block[i, j]
+    for i in range(leak):
+        model.leak_products[i] = _MEMORY * model.leak_products[i] + block[i, leak]
+    model.numbers[ENERGY] = _MEMORY * model.numbers[ENERGY] + block[leak, leak]
+    model.numbers[ROWS] = _MEMORY * model.numbers[ROWS] + weight * rows
+    model.numbers[MOTION] = _MEMORY * model.numbers[MOTION] + weight * block[size - 1, size - 1]
+
+
+@large_law
+def _solve(model: Any) -> None:
+    """Solve the normal equations C x = r for the three right-hand sides r in `model.matrix[:, n:]`, in place.
+
+    C (n, n) and the first right-hand side m are computed here from the sums, with the leak's column eliminated.
+    """
+    sums, leak = model.sums, len(model.matrix)
+    n, left_side = leak, leak + 1  # indices of the leak's column and of the equation's left side
+    leak_energy = max(sums[leak, leak], TINY)
+    for i in range(n):
+        model.matrix[i, n] = sums[i, left_side] - sums[i, leak] * sums[leak, left_side] / leak_energy
+        for j in range(n):
+            model.matrix[i, j] = sums[i, j] - sums[i, leak] * sums[leak, j] / leak_energy
+    eliminate(model.matrix, n)
+
+
+@large_law
+def _sum_residual_squares(sums: Any, solution: Any) -> float:
+    """Compute the residual sum of squares of the coefficients solution[:, 0], minimised over the leak."""
+    n, square, leak_moment = len(solution), 0.0, 0.0
+    for i in range(n + 2):
+        residual = sums[i, n + 1]
+        for j in range(n):
+            residual -= sums[i, j] * solution[j, 0]
+        if i < n:
+            square -= solution[i, 0] * residual
+        elif i == n:
+            leak_moment = residual
+        else:
+            square += residual
+    return float(square - leak_moment**2 / max(sums[n, n], TINY))
+
+
+@large_law
+def fit_coefficients(model: Any) -> None:
+    """Compute the coefficients and the variance of a row from the sums."""
+    n = len(model.matrix)
+    solution = model.matrix[:, n:]
+    solution[:] = 0.0
+    _solve(model)
+    for i in range(n):
+        model.values[i] = solution[i, 0]
+    square = _sum_residual_squares(model.sums, solution)
+    rounding = 1e-14 * model.sums[n + 1, n + 1]  # a residual of exact data is no smaller
+    model.numbers[NOISE] = max(square, rounding, TINY) / model.numbers[ROWS]
+
+
+@large_law
+def _learn_block(model: Any, rows: float, g: float) -> float:
+    """Add `model.block`, with the leak's estimate `g`, to the sums and the usual noise; return the block's weight.
+
+    A residual variance over `JUMP`^2 times the usual one reduces the weight; a step of the leak by over `JUMP` standard
+    deviations frees the leak.
+    """
+    sums, numbers, n = model.sums, model.numbers, len(model.matrix)
+    variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
+    numbers[MISFIT] = variance / numbers[NOISE]
+    weight = min(1.0, JUMP**2 * numbers[NOISE] / max(variance, TINY))
+    moment, information = sums[n, n + 1], max(sums[n, n], TINY)
+    for i in range(n):
+        moment -= sums[n, i] * model.matrix[i, n]
+    energy = max(model.block[n, n], TINY)
+    # of the block's estimate, as much for the leak's random step, and of the earlier estimate, moment / information
+    step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
+    add_block(model, rows, weight, (g - moment / information) ** 2 > JUMP**2 * step_variance)
+    numbers[NOISE] += (1.0 - _MEMORY) * (variance * weight - numbers[NOISE])
+    return float(weight)
+
+
+@large_law
+def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
+    """Estimate the leak's coefficient in `model.block`; with `is_learned`, add the block to the earlier ones.
+
+    Return (w, w g, w s, w^2 V): the estimate g with its precision w, the shift s to subtract, so that better estimates
+    of the nuisances do not move the series, and the variance V due to the nuisances. `energy`: sum of squares of the
+    leak's column, N_k of the module; `usual_slope`: regression of a nuisance's column on it in the last blocks.
+    """
+    block, n, numbers = model.block, len(model.matrix), model.numbers
+    # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
+    solution = model.matrix[:, n:]
+    energy, usual_energy = max(block[n, n], TINY), max(numbers[ENERGY], TINY)
+    for i in range(n):
+        solution[i, 1] = block[i, n]
+        solution[i, 2] = block[i, n] - energy * (model.leak_products[i] / usual_energy)
+    _solve(model)
+    moment, unusual, systematic = block[n, n + 1], 0.0, 0.0
+    numbers[SHIFT] *= _SHIFT_DECAY
+    for i in range(n):
+        usual_slope = model.leak_products[i] / usual_energy
+        moment -= block[i, n] * solution[i, 0]
+        numbers[SHIFT] -= usual_slope * (solution[i, 0] - model.values[i])
+        unusual += (block[i, n] - energy * usual_slope) * solution[i, 2]
+        systematic += block[i, n] * solution[i, 1]
+        model.values[i] = solution[i, 0]
+    g, weight = moment / energy, 1.0
+    if is_learned:
+        weight = _learn_block(model, rows, g)
+    # an error of the nuisances adds to the noise where the block's products with them differ from the usual ones
+    precision = energy / (OVERLAP * numbers[NOISE] * (1.0 / weight + max(unusual, 0.0) / energy))
+    systematic_variance = max(systematic, 0.0) * OVERLAP * numbers[NOISE] * (precision / energy) ** 2
+    return precision, precision * g, precision * numbers[SHIFT], systematic_variance
+
+
+@law
+def relative_motion(square: float, rows: float, numbers: Any) -> float:
+    """Compute the mean `square` of a block's left side over that of earlier blocks; inf if those did not move."""
+    usual_square = numbers[MOTION] * rows
+    return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

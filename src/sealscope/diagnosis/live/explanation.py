@@ -1,0 +1,71 @@
+"""Explain a rise of the leakage in the last blocks of a running machine by an event.
+
+The e-detector (`sequential`) shows the rise at its rate of false alarms. The probability that a leak, a sensor or the
+duty caused it is computed as for a recording, from the same observables and the same table of events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import LEAK_EVENTS, explain, probability_of
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.diagnosis.verdict.evidence import Cause
+
+#: Probabilities from which a leak, and its kind, explain a rise; largest chance of a change that shows in the blocks.
+_MIN_PROBABILITY, _MAX_CHANCE = DECISION.explanation, LIVE.explanation.rare
+#: Cause of leaks to the outside, which raise the total of pump and piston in part.
+OUTSIDE: Cause = "external leak"
+#: Events for which a watched machine raises an alarm.
+ALARMING = (*LEAK_EVENTS, *(event.name for event in load_events() if event.cause == OUTSIDE))
+
+
+class RiseExplanation(NamedTuple):
+    """Explanation of a rise of the leakage.
+
+    `is_leak`: a leak explains it; `is_outside`: a leak to the outside, almost surely; `other_events`: those that
+    explain it instead, in words, "" if there are none.
+    """
+
+    is_leak: bool
+    is_outside: bool = False
+    other_events: str = ""
+
+
+#: The blocks do not explain the rise yet.
+UNKNOWN = RiseExplanation(is_leak=False)
+
+
+def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
+    """Explain a rise of the leakage by the observables of the blocks around it.
+
+    `data`: kind of data that the leakage is estimated from; its changes outside the interval `onset` [s] are
+    ignored. `is_settled`: enough blocks have followed to distinguish a leak to the outside from a sensor fault.
+    """
+    names = ALARMING if is_settled else LEAK_EVENTS
+    events = [event for event in load_events() if event.name in names]
+    at_onset = [observable for observable in observables if observable.data != data or _coincides(observable, onset)]
+    rare_changes = [
+        observable for observable in at_onset if observable.data == data and observable.chance < _MAX_CHANCE
+    ]
+    explanations = [explanation for explanation in explain(at_onset) if data in explanation.data]
+    if probability_of(explanations, *names) > _MIN_PROBABILITY.leak:
+        if not any(event.affects(observable) for event in events for observable in rare_changes):
+            return UNKNOWN
+        is_outside = probability_of(explanations, cause=OUTSIDE) > _MIN_PROBABILITY.named
+        return RiseExplanation(is_leak=True, is_outside=is_outside)
+    best = next((explanation for explanation in explanations if not explanation.has(*ALARMING)), None)
+    if best is None or not rare_changes:
+        return UNKNOWN
+    return RiseExplanation(is_leak=False, other_events=" and ".join(event.description for event in best.events))
+
+
+def _coincides(observable: Observable, onset: Interval) -> bool:
+    """Test whether the interval of an observable's onset overlaps another."""
+    change = observable.onset
+    return change is not None and change.low <= onset.high and change.high >= onset.low

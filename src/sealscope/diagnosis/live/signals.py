@@ -1,0 +1,122 @@
+"""Features of a running machine that no balance contains, block by block: duty, noise, hum, sense, mean pressures.
+
+Features and tests of their steps are those of a recording's blocks (`inference.changes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sealscope.diagnosis.inference.changes.features import (
+    amplitude_step_tests,
+    feature_step_test,
+    log_amplitudes,
+    sensor_features,
+)
+from sealscope.diagnosis.inference.changes.levels import (
+    LevelChange,
+    fit_pressure_levels,
+    motion_columns,
+    pattern_tests,
+    pressure_level_rows,
+    top_speed,
+)
+from sealscope.diagnosis.inference.changes.signals import (
+    duty_observables,
+    level_observables,
+    run_tests,
+    sensor_observables,
+)
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.recordings.recording import Array
+from sealscope.storage.plain_state import restore_attributes, save_attributes
+
+#: Blocks in the window, and fewest that are tested for a step.
+WINDOW: int = LIVE.explanation.window
+MIN_BLOCKS: int = CHANGES.levels.blocks[-1]
+#: Features of a block.
+DUTY = ("command", "motion")
+FEATURES = (
+    *DUTY,
+    "sense of p_A - p_B",
+    "noise of the pressures",
+    "noise of p_A beside that of p_B",
+    *(f"hum of {hertz:g} Hz" for hertz in CHANGES.features.mains),
+)
+#: Columns of a stored block: begin and end [s], number of samples, top speed, features, Gram matrix for the levels.
+_BEGIN, _END, _SAMPLES, _SPEED = range(4)
+_FEATURES = slice(_SPEED + 1, _SPEED + 1 + len(FEATURES))
+_GRAM = slice(_FEATURES.stop, None)
+#: Numbers of blocks that are averaged for a level, the first that suffices.
+_GROUP_SIZES = (1, 2, 4)
+
+
+class SignalWindow:
+    """The features of the last `WINDOW` blocks of a running machine, and tests of their steps."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((0, 0))
+        self._means = np.empty(0)  # of p_A and p_B in the first block [Pa]: levels are relative to them
+
+    @np.errstate(all="ignore")
+    def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
+        """Add the block that begins at the clock `begin` [s], unless samples are missing in it."""
+        if not all(np.isfinite(values).all() for values in channels.values()):
+            return
+        if not self._means.size:
+            self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
+        motion = motion_columns(channels, rate)
+        speed = 0.0 if motion is None else top_speed(motion)
+        max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
+        columns = pressure_level_rows(channels, rate, self._means, max_speed)
+        blocks = {name: values[None] for name, values in channels.items()}
+        values = {**dict(log_amplitudes(blocks)), **dict(sensor_features(blocks, rate))}
+        features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
+        n_samples, gram = len(channels["p_A"]), columns.T @ columns
+        row = np.array([begin, begin + n_samples / rate, n_samples, speed, *features, *gram.ravel()])
+        stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
+        self._rows = np.vstack([stored, row])
+
+    @np.errstate(all="ignore")
+    def observables(self, since: float) -> tuple[Observable, ...]:
+        """Test the features for a step in the blocks that begin at the clock `since` [s] or later."""
+        rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
+        if len(rows) < MIN_BLOCKS:
+            return ()
+        time, columns = rows[:, [_BEGIN, _END]].mean(axis=1), zip(FEATURES, rows[:, _FEATURES].T, strict=True)
+        features = {name: values for name, values in columns if np.isfinite(values).any()}
+        duty = {name: features.pop(name) for name in DUTY if name in features}
+        sensors = ((name, feature_step_test(time, values)) for name, values in features.items())
+        return run_tests(
+            lambda: duty_observables(amplitude_step_tests(time, duty)),
+            lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
+            lambda: level_observables(self._test_levels(rows, time)),
+        )
+
+    def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
+        """Test the pressure levels for steps, in the shortest groups of blocks with both directions of motion."""
+        # a row ends with a Gram matrix, flattened
+        n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)
+        for size in _GROUP_SIZES:
+            n_groups = len(rows) // size
+            if n_groups < MIN_BLOCKS:
+                break
+            groups = rows[-n_groups * size :].reshape(n_groups, size, -1)
+            gram = groups[:, :, _GRAM].sum(axis=1).reshape(n_groups, n_columns, n_columns)
+            values = fit_pressure_levels(gram, float(groups[:, :, _SAMPLES].sum(axis=1).max()), self._means)
+            if values is not None:  # None if a group moves in one direction only
+                return pattern_tests(time[-n_groups * size :].reshape(n_groups, size).mean(axis=1), values)
+        return ()
+
+    def state(self) -> dict[str, Any]:
+        """Return the state as plain values."""
+        return save_attributes(self, ("_rows", "_means"))
+
+    def load_state(self, state: Any) -> None:
+        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        restore_attributes(self, ("_rows", "_means"), state)

@@ -1,0 +1,44 @@
+"""Typed tables of `inference/changes/priors.toml`: priors on signals that a leak does not change."""
+
+from sealscope.storage.toml_file import PriorTable, read_priors
+
+
+class SignalPriors(PriorTable):
+    """Features of the signals: `mains` [Hz]; `neighbours` [bins]; `shortest` [s]; the others are numbers."""
+
+    blocks: int
+    order: int
+    mains: tuple[float, ...]
+    highest: float
+    neighbours: tuple[float, ...]
+    shortest: float
+    wander: float
+
+
+class PressureLevelPriors(PriorTable):
+    """Mean pressures in either direction of motion."""
+
+    blocks: tuple[int, ...]
+    least: float
+    slowest: float
+
+
+class HealthyLevelPriors(PriorTable):
+    """Friction and drifts compared with healthy recordings; `drift` [Pa], the others are numbers."""
+
+    slowest: float
+    friction: float
+    scatter: float
+    recordings: float
+    drift: float
+
+
+class ChangePriors(PriorTable):
+    """The tables of `inference/changes/priors.toml`."""
+
+    features: SignalPriors
+    levels: PressureLevelPriors
+    healthy: HealthyLevelPriors
+
+
+CHANGES = read_priors("sealscope.diagnosis.inference.changes", ChangePriors)

@@ -1,0 +1,19 @@
+"""Typed tables of `commissioned/priors.toml`: requirements on the smallest leak that a machine's file states."""
+
+from sealscope.storage.toml_file import PriorTable, read_priors
+
+
+class SmallestLeakPriors(PriorTable):
+    """The smallest leak that is detected in the next recording."""
+
+    power: float
+    repeats: tuple[int, ...]
+
+
+class CommissionedPriors(PriorTable):
+    """The table of `commissioned/priors.toml`."""
+
+    smallest: SmallestLeakPriors
+
+
+COMMISSIONED = read_priors("sealscope.diagnosis.commissioned", CommissionedPriors)

@@ -1,0 +1,196 @@
+"""The rise of a machine's leakage over its recordings, as a measure of a leak for `decision.decide`.
+
+The sequential test of `wear` gives the chance of the rise in a healthy machine: the time between two recordings over
+the mean time to a false alarm. Rival explanations are observed as in a diagnosis: terms of the balance in all
+recordings since the onset, and the ringing of the last one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
+from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable, Observed, Remark, Ringing
+from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
+from sealscope.diagnosis.inference.scatter import RecordingSums, Rise
+from sealscope.diagnosis.inference.volumes.rivals import rival_rises
+from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries
+from sealscope.diagnosis.trend.reading import TrendPoint
+from sealscope.diagnosis.trend.wear import Episode, Wear
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Cause, Evidence, TotalLeakage
+from sealscope.units import DAYS_PER_YEAR
+
+#: Fewest comparable recordings with a verdict.
+MIN_RECORDINGS = 3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrendLeak:
+    """The rise of the leakage over recordings, a `LeakMeasure` whose flows are in the unit of the levels.
+
+    It has no test within a recording, so that the step and its flow are none, and no history but the trend itself.
+    """
+
+    provider: str
+    cause: Cause
+    rise: Rise | None
+    rise_flow: Flow
+    rise_onset: Interval | None
+    bound_flow: float
+    pump_flow: tuple[float, float]
+    lpm_per_flow: float | None
+    size_deviation: float
+    present_leakage: TotalLeakage | None
+    step: None = None
+    flow_per_conductance: float = 0.0
+    flow_factors: tuple[float, float] = (1.0, 1.0)
+    excess: float | None = None
+    ratio: Interval | None = None
+    remarks: Sequence[Remark] = ()
+
+    @property
+    def step_flow(self) -> Flow:
+        """Flow of a step within a recording: unknown."""
+        return Flow(0.0, np.inf)
+
+    @property
+    def step_rise(self) -> LeakRise | None:
+        """The rise, with no step within a recording as its rival."""
+        return None if self.rise is None else LeakRise(self.rise)
+
+    def relative(self, flow: Flow) -> None:
+        """Return None: a trend states no leak relative to the pump."""
+
+    def total(self, detectable_flow: float | None) -> TotalLeakage | None:
+        """Return the present flow past pump and piston [L/min], None if the levels are relative."""
+        return self.present_leakage
+
+    def history(self, onset_s: float | None) -> None:
+        """Return None: the history of the leak is the trend itself."""
+
+
+def decide_trend(
+    points: Sequence[TrendPoint],
+    episode: Episode,
+    *,
+    trend_units_per_level: float,
+    pressure: float | None,
+    interval: float,
+    years: float,
+) -> Evidence:
+    """Decide whether leakage has risen since the last repair, by the compared recordings since then, in time order.
+
+    `pressure`: difference for which L/min are stated [Pa], None if the levels are relative; `interval`: typical time
+    between two recordings [days]; `years`: machine-years to a false alarm.
+    """
+    wear = episode.wear
+    # interval over the mean time to a false alarm of this score
+    chance = min(float(np.exp(np.log(interval) - episode.log_days)), 1.0)
+    if points[0].basis == "ringing":
+        report = _report_ringing(points, wear, chance)
+    else:
+        leak = _measure_leak(points, wear, chance, trend_units_per_level, pressure)
+        report = Observed(leak.provider, _rival_changes(points, wear), leak)
+    if len(points) < MIN_RECORDINGS:
+        lack = f"{len(points)} comparable recordings are too few, {MIN_RECORDINGS} are needed"
+        report = Observed(report.provider, lack=lack)
+    probability = interval / (years * DAYS_PER_YEAR)
+    return decide(report, [_report_rms_change(points, wear)], HealthyNull(), probability)
+
+
+def _measure_leak(
+    points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
+) -> TrendLeak:
+    """Measure the rise since the last repair; arguments as for `decide_trend`, with the `chance` of the rise.
+
+    Leak laws between laminar and orifice flow are mixed: the flow goes with the pressure to one of `EXPONENTS`.
+    """
+    onset_day = -np.inf if wear.onset is None else wear.onset.value
+    pressures_since = [point.pressure for point in points if point.day >= onset_day]
+    pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
+    # a level is a flow over a pressure: at the stated pressure the flow of each law differs from it by a factor
+    flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
+    leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
+    pump = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
+    pump = pump if np.isfinite(pump) else 0.0
+    size_deviation = max(point.size_error for point in points)
+    return TrendLeak(
+        provider=str(points[0].basis),
+        cause="leak inside or outside" if points[0].basis == "pressure response" else "piston or pump leak",
+        rise=_normal_rise(wear, chance),
+        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
+        rise_onset=wear.onset and Interval(*(points[0].time_of_day(day) for day in wear.onset)),
+        bound_flow=wear.bound,
+        pump_flow=(pump, pump),
+        lpm_per_flow=None if pressure is None else 1.0,
+        size_deviation=size_deviation,
+        present_leakage=None if pressure is None else _total_leakage(wear.total, size_deviation, pressure),
+    )
+
+
+def _normal_rise(wear: Wear, chance: float) -> Rise | None:
+    """Return the rise as a normal law with the standard deviation that gives it the chance; None if it is not rare."""
+    from scipy.special import ndtri
+
+    score = -float(ndtri(chance))
+    if not (score > 0.0 and np.isfinite(score) and wear.bound > 0.0):
+        return None
+    value = wear.leak.value or wear.bound
+    return Rise(value, value / score, np.inf)
+
+
+def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
+    """State the total flow [L/min], with the error of the machine's size added to its interval."""
+    below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
+    return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
+
+
+def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
+    """Report the fall of the ringing, which bounds no leak."""
+    size = -wear.leak.value / 100.0  # change of the logarithm, from %
+    fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
+    ringing = None
+    if wear.onset is not None:
+        ringing = Ringing(np.inf, 0.0, len(_split_at_onset(points, wear)[0]), is_dated=True)
+    return Observed(RMS_CHANGE, (fall,), ringing=ringing)
+
+
+def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
+    """Split the recordings comparable with the last one into those before and since the onset, or the last day."""
+    onset = points[-1].day if wear.onset is None else wear.onset.value
+    comparable = [point for point in points if point.group == points[-1].group]
+    before = [point for point in comparable if point.day < onset]
+    return before, comparable[len(before) :]
+
+
+def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
+    """Compare the balance's other terms since the onset with before, where the same single balance describes both."""
+    names = [roles.names for roles in points[-1].terms]
+    sums_before, sums_since = (
+        [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]
+        for part in _split_at_onset(points, wear)
+    )
+    if not sums_before or not sums_since or len(names) != 1:
+        return ()
+    flow, pressure = (float(np.mean([getattr(sums, name) for sums in sums_since])) for name in ("flow", "pressure"))
+    judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure)
+    return rival_rises(judged, [sums._replace(held=None) for sums in sums_before], points[-1].terms)
+
+
+def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
+    """Compare the ringing of the last recording with those before the onset that have the same channels and rate."""
+    judged = points[-1].ringing
+    if judged is None or points[-1].basis == "ringing":
+        return Observed(RMS_CHANGE)
+    healthy = [
+        point.ringing
+        for point in _split_at_onset(points, wear)[0]
+        if point.ringing is not None
+        and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded", "rate"))
+    ]
+    return Observed(RMS_CHANGE, compare_summaries(judged, healthy, judged["chambers"])[0] if healthy else ())

@@ -1,0 +1,39 @@
+"""Circuits: the connection of a machine's pump with the chambers of its cylinder, as every package asks for it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class HydraulicCircuit(NamedTuple):
+    """Connection of pump and chambers; a new circuit is a row below, chosen by `Rig.circuit`.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages.
+    valve_controlled : bool
+        A servo valve with a supply of constant pressure meters a flow into each chamber. Else the flow is the pump's.
+    pump_feeds_chambers : bool
+        The pump's delivery flows into A and what leaves B returns to the pump: one balance of volumes holds for both.
+    pump_is_measured : bool
+        An encoder on the pump's motor records its angle and speed.
+    holds_load : bool
+        Both chambers are shut while the command rests at zero, so that a load creeps by what leaks alone.
+    """
+
+    name: str
+    valve_controlled: bool
+    pump_feeds_chambers: bool
+    pump_is_measured: bool
+    holds_load: bool
+
+
+#: A pump whose speed is commanded, in a closed circuit with the cylinder.
+PUMP_CIRCUIT = HydraulicCircuit(
+    "pump-controlled", valve_controlled=False, pump_feeds_chambers=True, pump_is_measured=True, holds_load=False
+)
+#: A servo valve between a supply and the cylinder.
+VALVE_CIRCUIT = HydraulicCircuit(
+    "valve-controlled", valve_controlled=True, pump_feeds_chambers=False, pump_is_measured=False, holds_load=True
+)

@@ -1,0 +1,109 @@
+"""Headings with names outside the heading row: tables of channels, rows of labels, TwinCAT Scope, X-Y pairs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.units import same_dimension
+
+_ROW = WORDS["row"]
+#: Names of columns in pairs: `X`, `p_A X` or `p_A.x`, and the same with `Y`.
+_PAIR_NAMES = {axis: re.compile(rf"(?P<name>.*?)[\s_.:-]{{0,3}}\b{axis}\d{{0,3}}", re.IGNORECASE) for axis in "xy"}
+_MAX_NAME = 80
+#: Rows that only a TwinCAT Scope export has; a unit with its quantity: `V (Voltage)`, `(None)`.
+_SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
+    ("SampleTime[ms]", "Starttime of export"),
+    re.compile(r"([^()]{0,20})\([^()]{0,40}\)"),
+)
+
+
+def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
+    """Rename labels by tables of channels and rows of labels above the heading.
+
+    The columns' own names stay in `called`. A description may give the unit if the heading does not. `rows`: cells of
+    the lines above the heading, and of rows of labels in it.
+    """
+    names: dict[str, str] = {}
+    name_column: int | None = None
+    for row in rows:
+        cells = [cell.strip().strip('"').strip() for cell in row]
+        keys = [cell.casefold() for cell in cells]
+        if not cells:
+            continue
+        if keys[0] in _ROW["channel"]:  # the heading of a table of channels
+            name_column = next((keys.index(name) for name in _ROW["description"] if name in keys[1:]), None)
+        elif keys[0] in _ROW["label"]:  # a row of labels
+            for label, cell in zip(labels[1:], cells[1:], strict=False):
+                names.setdefault(_column_key(label), cell)
+        elif name_column is not None and name_column < len(cells):  # a row of the table
+            names.setdefault(_fold(cells[0]), cells[name_column])
+    return [_rename_label(label, names.get(_column_key(label), "")) for label in labels]
+
+
+def _fold(text: str) -> str:
+    """Remove blanks and case from a text, for comparison."""
+    return text.replace(" ", "").casefold()
+
+
+def _column_key(label: Label) -> str:
+    """Return a column's own name for comparison, the last word, as a row of groups may be prefixed to it."""
+    return _fold(label.name.rpartition(" ")[2] or label.name)
+
+
+def _rename_label(label: Label, name: str) -> Label:
+    """Rename a label unless the new name is empty, too long or the column's own name."""
+    if not name or len(name) > _MAX_NAME or _fold(name) == _column_key(label):
+        return label
+    renamed = Label.parse(name)  # the description may end in a unit
+    last_word = label.name.rpartition(" ")[2]
+    return replace(label, name=renamed.name, unit=label.unit or renamed.unit, called=last_word)
+
+
+def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
+    """Parse the heading of a TwinCAT Scope export to (labels, number of its lines); None for any other text.
+
+    `lines`: those above the first sample. Each row of a property repeats its name above the time columns, which are in
+    milliseconds since the start of the export.
+    """
+    rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
+    begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
+    if begin is None or not any(row[0] in _SCOPE_ROWS for row in rows):
+        return None
+    properties = {row[0]: row for row in rows[begin:]}
+    names, units, labels = properties["Name"], properties.get("Unit", []), []
+    for column, name in enumerate(names):
+        text = units[column] if column < len(units) else ""
+        match = _UNIT_WITH_QUANTITY.fullmatch(text)
+        unit = (match[1] if match else text).strip()
+        labels.append(Label("t [ms]", "t", "ms") if name == "Name" else Label.parse(name, unit or None))
+    return labels, sum(1 for line in lines[begin:] if line.strip())
+
+
+def split_pairs(labels: Sequence[Label]) -> list[Label]:
+    """Rename the labels of alternating times X and values Y to `t` and the channels' names; return others unchanged.
+
+    `X [s], p_A [bar], X [s], p_B [bar]` and `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`; an X without a unit is in
+    seconds.
+    """
+    times, values = labels[::2], labels[1::2]
+    are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)
+    if len(labels) < 4 or len(labels) % 2 or not are_times:
+        return list(labels)
+    x_matches = [_PAIR_NAMES["x"].fullmatch(label.name.replace("_", " ")) for label in times]
+    y_matches = [_PAIR_NAMES["y"].fullmatch(label.name.replace("_", " ")) for label in values]
+    is_unnamed = all(x_match is not None and not x_match["name"] for x_match in x_matches)
+    same_names = all(
+        x_match is not None and y_match is not None and x_match["name"].casefold() == y_match["name"].casefold()
+        for x_match, y_match in zip(x_matches, y_matches, strict=True)
+    )
+    if not (is_unnamed or same_names):
+        return list(labels)
+    result = []
+    for time, value, y_match in zip(times, values, y_matches, strict=True):
+        name = value.name if is_unnamed or y_match is None else value.name[: len(y_match["name"])]
+        result += [replace(time, name="t", unit=time.unit or "s"), replace(value, name=name)]
+    return result

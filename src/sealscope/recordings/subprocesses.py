@@ -1,0 +1,211 @@
+"""Run risky work in subprocesses that have limits of time, memory and disk.
+
+A damaged file makes the C libraries of some formats crash, hang or fill the memory, and they do not react to signals.
+A subprocess is started when it is first needed, serves one request after the other, and ends with the program. It is a
+fresh interpreter, not a fork, so that scripts need no `__main__` guard; it imports nothing from the working folder.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import BoundedSemaphore, Timer
+from typing import Any, TypeVar
+
+from sealscope.errors import SealscopeError, UnreadableFile
+from sealscope.storage.unpacking import MAX_UNPACKED
+
+T = TypeVar("T")
+#: Time that starting a process may take in addition to the work [s].
+_MAX_START_TIME = 30.0
+#: Most memory of a process [bytes]: a few copies of the largest recording.
+MAX_MEMORY = 12 * 2**30
+#: A process that occupies more memory than this after a request is not used again [bytes].
+_MAX_IDLE_MEMORY = 2**30
+#: Most processes at a time: with several, a slow file does not delay the files of other threads.
+_MAX_PROCESSES = 4
+#: Environment that saves memory: libraries start a thread for each core, and Arrow's allocator reserves a gigabyte.
+_LOW_MEMORY_ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
+
+
+class CrashedSubprocessError(RuntimeError):
+    """The subprocess ended before it returned a result."""
+
+
+class _RemoteTraceback(Exception):  # noqa: N818 - never raised itself
+    """The traceback of an error in the subprocess, shown as the cause of the error raised here."""
+
+    def __str__(self) -> str:
+        return f"\n{self.args[0]}"
+
+
+class _Process:
+    """A subprocess that serves one request after the other."""
+
+    def __init__(self) -> None:
+        """Start a new interpreter, with a temporary folder for it."""
+        self._is_fresh = True
+        self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "sealscope.recordings.subprocesses"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **_LOW_MEMORY_ENVIRONMENT, "TMPDIR": self._folder.name},  # removed with the process
+        )
+
+    @property
+    def is_alive(self) -> bool:
+        """Test whether the process is running."""
+        return self._process.poll() is None
+
+    def send(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
+        """Run a pickled request; return (result or error, traceback of the error or None, is_spent).
+
+        `limit`: longest time of the work [s]. `is_spent`: the process occupies too much memory to be used again.
+        """
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        # in case the alarm of the process itself does not end it
+        killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
+        killer.daemon = True
+        killer.start()
+        try:
+            process.stdin.write(request)
+            process.stdin.flush()
+            value, remote_traceback = pickle.load(process.stdout)
+            is_spent = bool(pickle.load(process.stdout))
+        except (EOFError, OSError, pickle.UnpicklingError):
+            timed_out = not killer.is_alive() or process.wait() == -getattr(signal, "SIGALRM", 0)
+            failure = f"took over {limit:g} s" if timed_out else "crashed"
+            raise CrashedSubprocessError(f"the library that reads it {failure}") from None
+        finally:
+            killer.cancel()
+        self._is_fresh = False
+        return value, remote_traceback, is_spent
+
+    def end(self) -> None:
+        """Kill the process and remove its folder."""
+        self._process.kill()
+        self._process.communicate()
+        self._folder.cleanup()
+
+
+_slots = BoundedSemaphore(_MAX_PROCESSES)
+_idle: list[_Process] = []
+
+
+def _take_process() -> _Process:
+    """Take an idle process, or start a new one."""
+    with suppress(IndexError):
+        while True:
+            process = _idle.pop()
+            if process.is_alive:
+                return process
+            process.end()
+    return _Process()
+
+
+def run_in_subprocess(
+    work: Callable[..., T], *arguments: Any, limit: float, memory: int = MAX_MEMORY, disk: int = MAX_UNPACKED
+) -> T:
+    """Run ``work(*arguments)`` in a subprocess and return its result; arguments and result are pickled.
+
+    `limit`: longest time [s]; `memory`: most memory [bytes], at most `MAX_MEMORY` and half the machine's; `disk`:
+    longest file that it may write [bytes]. Raises CrashedSubprocessError if the process crashes or exceeds `limit`, and
+    the errors of `work`: SealscopeError and MemoryError as they are, others as a RuntimeError with the same text.
+    """
+    with _slots:
+        process = _take_process()
+        try:
+            value, remote_traceback, is_spent = process.send(
+                pickle.dumps((work, arguments, (limit, memory, disk))), limit
+            )
+        except BaseException:  # after an interrupt, too: the next request would read this one's result
+            process.end()
+            raise
+        if is_spent:
+            process.end()
+        else:
+            _idle.append(process)
+    if remote_traceback is not None:
+        raise value from _RemoteTraceback(remote_traceback)
+    return value  # type: ignore[no-any-return]
+
+
+def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
+    """Run ``work(file, *arguments)`` by `run_in_subprocess`; errors name `file` as given, not by its absolute path."""
+    place = file.absolute()  # the process may work in another folder
+    try:
+        return run_in_subprocess(work, place, *arguments, **limits)
+    except UnreadableFile as error:
+        raise UnreadableFile(str(error).replace(str(place), str(file))) from error
+
+
+def _set_limits(seconds: float, memory: int, disk: int) -> None:
+    """Limit time [s], memory and disk [bytes] of this process, which then ends even if its parent is dead."""
+    with suppress(ImportError, AttributeError, OSError, ValueError):
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        import resource
+
+        machine_memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        for resource_kind, limit in (
+            (resource.RLIMIT_DATA, min(memory, MAX_MEMORY, machine_memory // 2)),
+            (resource.RLIMIT_FSIZE, disk),
+        ):
+            _, hard = resource.getrlimit(resource_kind)
+            resource.setrlimit(resource_kind, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+
+
+def _is_spent() -> bool:
+    """Test whether this process occupies more memory than an idle process may."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
+    except OSError:
+        return False
+    return pages * os.sysconf("SC_PAGE_SIZE") > _MAX_IDLE_MEMORY
+
+
+def _serve() -> None:
+    """Serve requests from standard input until it ends; output of libraries is discarded."""
+    responses = os.fdopen(os.dup(1), "wb")
+    discard = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(discard, 1)
+    sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 - for the life of the process
+    with suppress(EOFError, KeyboardInterrupt, BrokenPipeError):
+        while True:
+            work, arguments, limits = pickle.load(sys.stdin.buffer)
+            _set_limits(*limits)
+            value, error_traceback = _run_work(work, arguments)
+            _set_limits(0.0, MAX_MEMORY, MAX_UNPACKED)
+            responses.write(pickle.dumps((value, error_traceback), protocol=5))
+            del work, arguments, value
+            pickle.dump(_is_spent(), responses)
+            responses.flush()
+    with suppress(OSError):  # if the program was killed, nobody else removes it
+        Path(tempfile.gettempdir()).rmdir()
+
+
+def _run_work(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
+    """Run `work`; return (result, None), or (error, traceback) with an error that the program can unpickle."""
+    try:
+        return work(*arguments), None
+    except (SealscopeError, MemoryError) as error:
+        return error, traceback.format_exc()
+    except Exception as error:
+        return RuntimeError(" ".join(str(error).split()) or type(error).__name__), traceback.format_exc()
+
+
+if __name__ == "__main__":
+    _serve()

@@ -1,0 +1,249 @@
+"""Position targets of the piston, and loads on it over time, position or velocity, as data and as text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sealscope.errors import InputError
+from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import (
+    NUMBER,
+    UNSIGNED,
+    Command,
+    Sine,
+    normalize_blanks,
+    parse_command,
+    sampled_signal,
+)
+from sealscope.storage.opening import open_regular
+from sealscope.units import to_si
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+    from sealscope.physics.rig import RigNumbers
+
+_LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_FORCES = {"N": 1.0, "kN": 1e3}
+_SPEEDS = {"mm/s": 1e-3, "cm/s": 1e-2, "m/s": 1.0}
+_STIFFNESSES = {"N/mm": 1e3, "kN/mm": 1e6, "N/m": 1.0, "kN/m": 1e3}
+_DAMPINGS = {"N s/mm": 1e3, "kN s/mm": 1e6, "N s/m": 1.0, "kN s/m": 1e3}
+#: Most rows of a table of force over position or velocity: every stage of every step evaluates them all.
+MAX_LOAD_ROWS = 200
+#: A piecewise linear force a + b s + sum of c_k max(s - s_k, 0): (a, b), then (s_k, c_k).
+Breakpoints = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Position:
+    """A position target x = signal(t) [m] from mid-stroke, which a controller follows; `words`: its text."""
+
+    signal: Command
+    words: str
+
+    def value_at(self, t: Array) -> Array:
+        """Compute the target [m] at times t [s]."""
+        return self.signal.volts(t)
+
+    def __str__(self) -> str:
+        return f"position {self.words}"
+
+
+@dataclass(frozen=True)
+class Force:
+    """A load against +x in addition to the rig's own: F = signal(t) + f(x) + g(v) [N]; `words`: its text.
+
+    `over_x`, `over_v`: the piecewise linear f over position [m] and g over velocity [m/s] of the piston.
+    """
+
+    signal: Command
+    words: str
+    over_x: Breakpoints = ()
+    over_v: Breakpoints = ()
+
+    def value_at(self, t: Array) -> Array:
+        """Compute the force [N] at times t [s], without its part over the piston's position and velocity."""
+        return self.signal.volts(t)
+
+    def tables(self) -> tuple[Array, Array] | None:
+        """Build the tables of `piecewise_linear_force` over position and velocity; None if it depends on neither."""
+        if not (self.over_x or self.over_v):
+            return None
+        x, v = (np.array(breakpoints or ((0.0, 0.0),), dtype=np.float64) for breakpoints in (self.over_x, self.over_v))
+        return x, v
+
+    def __str__(self) -> str:
+        return f"load {self.words}"
+
+
+def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
+    """Build the compiled model's parameters of a rig under a load."""
+    from sealscope.physics.rig import rig_numbers
+
+    numbers = rig_numbers(rig)
+    # a load over time alone has no tables: one entry in `pushed` compiles its force in
+    return numbers if load is None else numbers._replace(pushed=load.tables() or (True,))
+
+
+def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
+    """Compute the state of a rig at t = 0: its piston is at standstill at x [m] under a load."""
+    from sealscope.physics.cylinder import piecewise_linear_force
+    from sealscope.physics.standstill import initial_state
+
+    force, tables = (0.0, None) if load is None else (float(load.value_at(np.zeros(()))), load.tables())
+    if tables is not None:
+        over_x, over_v = tables
+        force = float(force + piecewise_linear_force(x, over_x) + piecewise_linear_force(0.0, over_v))
+    return initial_state(rig, x, force)
+
+
+def breakpoints_through(s: Array, F: Array) -> Breakpoints:
+    """Convert points (s, F) with rising s to the breakpoints of a force that is constant beyond the outer points."""
+    # the coefficient c_k of a breakpoint is the change of slope there
+    slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
+    return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
+
+
+def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
+    """Parse a signal in the form of a command, with sizes in one of `units` (unit -> factor), to SI units.
+
+    `what`: name of the quantity in messages. Raises InputError for another form or a missing unit.
+    """
+    names = "|".join(sorted(units, key=len, reverse=True))
+    number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({names})\b\]?")
+    if not number_with_unit.search(text):
+        example = f"step 100 {next(iter(units))}"
+        raise InputError(f"{what} must have its unit ({', '.join(units)}), such as '{example}', got {text!r}")
+    in_si = number_with_unit.sub(lambda match: repr(float(match[1]) * units[match[2]]), text)
+    if re.fullmatch(NUMBER, in_si.strip()):
+        return Sine(0.0, 0.0, 0.0, float(in_si))
+    try:
+        return parse_command(in_si)
+    except InputError as error:
+        raise InputError(
+            str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
+        ) from None
+
+
+def parse_position(text: str) -> Position | None:
+    """Parse a target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
+
+    The words are those of `parse_command`, with a length in mm, cm or m; ``position file LOG`` is the channel x of a
+    recording. Return None if the text does not begin with ``position``.
+    """
+    words = normalize_blanks(text, "command")
+    if not words.lower().startswith("position "):
+        return None
+    words = words[len("position ") :]
+    if words.lower().startswith("file "):
+        from sealscope.recordings import read
+
+        path = words[5:].strip()
+        recording = read(path)
+        if "x" not in recording or recording.units["x"] != "m":
+            raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
+        return Position(sampled_signal(recording.t - recording.t[0], recording["x"], path), words)
+    return Position(_parse_signal(words, _LENGTHS, "position"), words)
+
+
+def command_or_target(text: str) -> Command | Position:
+    """Parse a position target, or else a command for the drive."""
+    return parse_position(text) or parse_command(text)
+
+
+class _Column(NamedTuple):
+    """A column of a table: its position in the row, and its unit as written."""
+
+    position: int
+    unit: str
+
+
+def _read_force(path: str, words: str) -> Force:
+    """Read a load from a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
+
+    The load is linear between the rows and constant beyond them. A column of times takes precedence over the others;
+    the first of them becomes t = 0.
+    """
+    with open_regular(path, "a recorded load") as file:
+        head = file.readline(4096).decode("utf-8-sig", "replace")
+        headings = [re.fullmatch(r"\s*(\w+)\s*\[([^\]]+)\]\s*", cell) for cell in head.split(",")]
+        columns = {match[1]: _Column(k, match[2]) for k, match in enumerate(headings) if match}
+        arguments = [name for name in ("t", "x", "v") if name in columns]
+        if "F" not in columns or not arguments or arguments == ["x", "v"]:
+            raise InputError(
+                "a recorded load must have the columns t [s] and F [N], or F [N] with one of x [m] and v [m/s], got "
+                f"{head.strip()[:80]!r} ({path})"
+            )
+        try:
+            table = np.loadtxt(
+                file, delimiter=",", usecols=[columns[arguments[0]].position, columns["F"].position], ndmin=2
+            )
+        except ValueError as error:
+            raise InputError(f"a recorded load must hold numbers, got a table of which {error} ({path})") from None
+    argument = arguments[0]
+    unit = {"t": "s", "x": "m", "v": "m/s"}[argument]
+    s = to_si(table[:, 0], columns[argument].unit, unit, name=argument, place=path)
+    F = to_si(table[:, 1], columns["F"].unit, "N", name="F", place=path)
+    if argument == "t":
+        return Force(sampled_signal(s - s[:1], F, path), words)
+    if s.size > 1 and s[0] > s[-1]:  # a falling table is the same curve
+        s, F = s[::-1], F[::-1]
+    if not (2 <= s.size <= MAX_LOAD_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):
+        raise InputError(
+            f"a load over {argument} must have 2 to {MAX_LOAD_ROWS} rows of finite numbers whose {argument} rises, got "
+            f"{s.size} rows ({path})"
+        )
+    return Force(_NO_FORCE, words, **{f"over_{argument}": breakpoints_through(s, F)})
+
+
+_NO_FORCE = Sine(0.0, 0.0)
+
+
+def _unit_pattern(units: Mapping[str, float]) -> str:
+    """Return the pattern of any of the units, the longest first, with or without their blanks."""
+    return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
+
+
+def _term_pattern(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
+    """Compile the pattern of a term such as ``- 5 kN/mm over x from 50 mm``: sign, slope, unit, place, its unit."""
+    start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(places)})\b\]?)?"
+    return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_unit_pattern(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
+
+
+_TERM_UNITS = {"x": (_STIFFNESSES, _LENGTHS), "v": (_DAMPINGS, _SPEEDS)}
+
+
+def parse_force(text: str) -> Force:
+    """Parse a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`.
+
+    Terms over the piston's position or velocity may be added: ``200 N/mm over x``, ``5 kN/mm over x from 50 mm`` (0
+    below 50 mm), ``2 kN s/m over v``. ``file LOAD.csv`` is a table of ``F [N]`` over ``t [s]``, ``x [m]`` or
+    ``v [m/s]``.
+    """
+    words = normalize_blanks(text, "load")
+    if words.lower().startswith("file "):
+        return _read_force(words[5:].strip(), words)
+    rest, terms = words, {}
+    for letter, (slopes, places) in _TERM_UNITS.items():
+        pattern, constant_slope, breakpoints = _term_pattern(letter, slopes, places), 0.0, []
+        for sign, number, unit, place, place_unit in pattern.findall(rest):
+            slope = float(f"{sign}{number}") * slopes[_match_unit(unit, slopes)]
+            if place:
+                breakpoints.append((float(place) * places[place_unit], slope))
+            else:
+                constant_slope += slope
+        if pattern.search(rest):
+            terms[f"over_{letter}"] = ((0.0, constant_slope), *breakpoints)
+        rest = pattern.sub("", rest)
+    if terms:
+        rest = re.sub(r"^\s*\+|[+]\s*$", "", rest).strip()
+    return Force(_NO_FORCE if terms and not rest else _parse_signal(rest, _FORCES, "load"), words, **terms)
+
+
+def _match_unit(unit: str, units: Mapping[str, float]) -> str:
+    """Find the unit that is spelled as `unit` up to blanks."""
+    return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

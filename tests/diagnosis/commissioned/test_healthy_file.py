@@ -1,0 +1,306 @@
+"""The summaries of a machine lie beside its text: whole, checked, found again, and never half of a pair."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.commissioned.healthy_file import SUFFIX, Line, format_summary, parse_summary, read_lines
+from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.errors import InputError
+from sealscope.storage.plain_state import plain_array
+
+from ...refusals import refusal
+
+
+@pytest.fixture
+def pair(file: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """Copies of a machine's text and of its summaries."""
+    text, summaries = tmp_path / "actuator7.toml", tmp_path / "actuator7.healthy"
+    text.write_bytes(file.read_bytes())
+    summaries.write_bytes(file.with_suffix(SUFFIX).read_bytes())
+    return text, summaries
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        ss.read_machine(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_summary_is_read_as_it_was_learnt(machine):
+    """To the last bit, with names that this version does not know."""
+    numbers = np.array([[1.0, 1e-300], [-0.1, 3e90]])
+    statistics = {"rise": 0.25, "later kind": numbers, "empty": np.zeros((0, 3))}
+    summaries = {**machine.healthy[0].summaries, "a plug-in's": {"names": ["a", "b"], "n": 3, "curve": [0.1, 0.2]}}
+    learnt = replace(machine.healthy[0], statistics=statistics, summaries=summaries)
+    again = parse_summary(format_summary(learnt), learnt.file, "place")
+    assert (again.digest, again.units, again.rate, again.seconds) == (
+        learnt.digest, learnt.units, learnt.rate, learnt.seconds,
+    )  # fmt: skip
+    assert again.about == learnt.about
+    assert {name: np.shape(value) for name, value in again.statistics.items()} == {
+        "rise": (), "later kind": (2, 2), "empty": (0, 3),
+    }  # fmt: skip
+    np.testing.assert_array_equal(again.statistics["later kind"], numbers)
+    np.testing.assert_array_equal(again.summaries["volume balance"]["sums"], summaries["volume balance"]["sums"])
+    assert format_summary(again) == format_summary(learnt)
+    np.testing.assert_array_equal(again.summaries["a plug-in's"].pop("curve"), [0.1, 0.2])
+    assert again.summaries["a plug-in's"] == {"names": ["a", "b"], "n": 3}
+
+
+def test_the_text_is_small(pair, machine):
+    """What a person edits is three lines a recording, however large their summaries."""
+    text, summaries = pair
+    rows = text.read_text().partition("\n[[healthy]]\n")[2]
+    assert len(rows) < 150 * len(machine.healthy)
+    assert len(summaries.read_bytes()) > 30 * len(rows)
+
+
+def test_numbers_that_are_not_finite_are_no_summary(machine):
+    for value in (np.nan, [1.0, np.inf]):
+        with refusal("run1.nc"):
+            format_summary(replace(machine.healthy[0], statistics={"rise": value}))
+
+
+def test_a_damaged_summary_is_named(pair):
+    text, summaries = pair
+    data = bytearray(summaries.read_bytes())
+    data[data.index(b"run") if b"run" in data else len(data) // 2] ^= 1
+    summaries.write_bytes(data)
+    message = refused(text)
+    assert "must have the SHA-256" in message
+    assert "run" in message
+    assert "take its [[healthy]] out of the machine's file, or commission it anew" in message
+
+
+def test_without_its_damaged_summary_the_machine_has_the_others(pair):
+    text, summaries = pair
+    rows = summaries.read_bytes().splitlines(keepends=True)
+    rows[2] = rows[2].replace(b'"rate":', b'"rote":')
+    summaries.write_bytes(b"".join(rows))
+    assert "run2.nc" in refused(text)
+    parts = text.read_text().split("[[healthy]]")
+    text.write_text("[[healthy]]".join(part for part in parts if "run2.nc" not in part))
+    assert [learnt.file for learnt in ss.read_machine(text).healthy] == ["run1.nc", "run3.nc", "run4.nc"]
+
+
+def test_a_summary_that_is_not_there_is_named(pair):
+    text, summaries = pair
+    summaries.write_bytes(b"".join(summaries.read_bytes().splitlines(keepends=True)[:-1]))
+    assert "of run4.nc must be in the file of healthy summaries, got none such" in refused(text)
+
+
+def test_summaries_that_were_left_behind_are_asked_for(pair):
+    text, summaries = pair
+    summaries.unlink()
+    assert refused(text).startswith("actuator7.healthy must lie beside a machine's file, got none: move it there")
+
+
+def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
+    text, summaries = pair
+    alone = text.rename(tmp_path / "press.toml")
+    assert len(ss.read_machine(alone).healthy) == 4
+    summaries.rename(tmp_path / "press.healthy")
+    assert len(ss.read_machine(alone).healthy) == 4
+    ss.write_machine(ss.read_machine(alone), alone)
+    assert 'summaries = "press.healthy"' in alone.read_text()
+
+
+def test_a_machine_of_before_version_0_1_is_read_and_written_anew(pair):
+    """Its summaries are a file of `lessons`, which the text that is kept as .bak still finds."""
+    text, summaries = pair
+    rows = text.read_text().replace("summaries = ", "lessons = ").replace(".healthy", ".lessons")
+    lessons = [line.data.replace(b'"summaries":', b'"lessons":') for line in read_lines(summaries)]
+    for line, lesson in zip(read_lines(summaries), lessons, strict=True):
+        rows = rows.replace(f'summary = "{line.checksum}"', f'lesson = "{sha256(lesson).hexdigest()}"')
+    data = b"".join(b"%b %b\n" % (sha256(lesson).hexdigest().encode(), lesson) for lesson in lessons)
+    summaries.with_suffix(".lessons").write_bytes(b"sealscope lessons 1\n" + data)
+    new, _ = ss.read_machine(text), (summaries.unlink(), text.write_text(rows))
+    old = ss.read_machine(text)
+    assert [format_summary(entry) for entry in old.healthy] == [format_summary(entry) for entry in new.healthy]
+    ss.write_machine(old, text)
+    assert "lesson" not in text.read_text()
+    summaries.with_suffix(".lessons").unlink()
+    assert len(ss.read_machine(text).healthy) == 4
+    text.with_suffix(".toml.bak").rename(text)
+    assert len(ss.read_machine(text).healthy) == 4
+
+
+@pytest.mark.parametrize("name", ["../actuator7.healthy", "/etc/passwd", "sub/actuator7.healthy", "passwd"])
+def test_a_text_names_no_summaries_elsewhere(pair, tmp_path, name):
+    text, _ = pair
+    other = tmp_path / "inner"
+    other.mkdir()
+    hostile = other / "hostile.toml"
+    hostile.write_text(text.read_text().replace('summaries = "actuator7.healthy"', f'summaries = "{name}"'))
+    assert refused(hostile).startswith("hostile.healthy must lie beside")
+
+
+def test_each_text_keeps_its_summaries_whichever_file_was_written_last(pair, machine, monkeypatch):
+    """Broken off after any of the three files, text and kept text are those of before or of after."""
+    text, _ = pair
+    ss.write_machine(replace(machine, name="kept"), text)
+    ss.write_machine(replace(machine, name="first"), text)
+    new = ss.simulate(command="3 sin(4t)", duration="20 s", seed=40)
+    later = replace(machine.with_healthy(new, file="new.nc"), name="later")
+    later = replace(later, healthy=later.healthy[2:])
+    from sealscope.diagnosis.commissioned import healthy_file, machine_file
+
+    def written(count: int) -> list[tuple[str, int]]:
+        """Texts after a write that ends before its file number `count`."""
+        left, write = [count], healthy_file.atomic_write
+
+        def stop(path: Path):
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return write(path)
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(healthy_file, "atomic_write", stop)
+            patch.setattr(machine_file, "atomic_write", stop)
+            ss.write_machine(later, text)
+        texts = (ss.read_machine(path) for path in (text, text.with_suffix(".toml.bak")))
+        return [(known.name, len(known.healthy)) for known in texts]
+
+    assert [written(count) for count in range(3)] == [
+        [("first", 4), ("kept", 4)],
+        [("first", 4), ("kept", 4)],
+        [("first", 4), ("first", 4)],
+    ]
+    ss.write_machine(later, text)
+    assert len(ss.read_machine(text).healthy) == 3
+    assert len(ss.read_machine(text.with_suffix(".toml.bak")).healthy) == 4
+
+
+def test_summaries_that_no_text_names_are_kept_for_its_copies_while_they_are_few(pair, machine, monkeypatch):
+    text, summaries = pair
+    copy = text.with_name("before.toml")
+    copy.write_bytes(text.read_bytes())
+    for _ in range(3):
+        ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
+    assert len(ss.read_machine(copy).healthy) == 4
+    monkeypatch.setattr("sealscope.diagnosis.commissioned.machine_file._SPARE", 0)
+    ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
+    assert len(summaries.read_bytes().splitlines()) == 2
+
+
+def test_a_torn_line_is_a_summary_that_is_missing(pair):
+    text, summaries = pair
+    data = summaries.read_bytes()
+    second = data.splitlines(keepends=True)[2]
+    summaries.write_bytes(data.replace(second, second[:40] + b"\n"))
+    assert "of run2.nc must be in the file of healthy summaries" in refused(text)
+
+
+def altered(line: Line, change: str, value: object) -> Line:
+    tree = json.loads(line.data)
+    *path, name = change.split("/")
+    place = tree
+    for part in path:
+        place = place[part]
+    place[name.strip()] = value
+    data = json.dumps(tree).encode()
+    return Line(sha256(data).hexdigest(), data)
+
+
+def packed(values: object) -> dict[str, object]:
+    return plain_array(np.asarray(values, dtype=float))
+
+
+def sums_of(scale: float) -> dict[str, object]:
+    return packed(np.full((1, 25, 25), scale))
+
+
+HOSTILE = {
+    "digest": (3, "digest"),
+    "rate": (-1.0, "rate"),
+    "seconds": (0.0, "seconds"),
+    "units": ([], "units"),
+    "start_s": ("now", "start_s"),
+    "summaries/volume balance/sums": ([[1.0]], "must be an array of numbers"),
+    "summaries/volume balance/sums ": (sums_of(0.0), "sums must be those of squares and products"),
+    "summaries/volume balance/sums  ": (sums_of(1e200), "finite numbers of a size below 1e+100"),
+    "summaries/volume balance/sums   ": (sums_of(np.nan), "finite numbers"),
+    "summaries/volume balance/scale": (1e300, "scale"),
+    "summaries/volume balance/flow": (-1.0, "flow"),
+    "summaries/volume balance/start_s": (1e18, "start_s"),
+    "summaries/rms change/duty": (packed([1.0, 2.0]), "levels and duty must be of the shapes (10,) and (4,)"),
+    "summaries/rms change/duty ": (packed([1.0, 2.0, 3.0, 1e9]), "must be logarithms"),
+    "about/noise": ({"p_A": "x"}, "noise: p_A"),
+    "summaries/volume balance/terms": (["a"], "sums must be of the shape"),
+    "summaries/volume balance/pressure": (None, "pressure"),
+    "summaries/rms change/levels": ({"shape": [3], "f8": "AAAA"}, "levels"),
+    "summaries/other": ([[], []] * 4000, "must hold its numbers in arrays"),
+    "statistics/rise": ("high", "statistics: rise: must be an array"),
+}
+
+
+@pytest.mark.parametrize("change", HOSTILE)
+def test_an_altered_summary_with_the_right_checksum_is_refused_in_one_line(pair, change):
+    line = read_lines(pair[1])[0]
+    value, rule = HOSTILE[change]
+    with pytest.raises(InputError) as caught:
+        parse_summary(altered(line, change, value), "run1.nc", "hostile.healthy")
+    message = str(caught.value)
+    assert message.startswith("the summary of run1.nc is wrong: ")
+    assert rule in message
+    assert "hostile.healthy" in message
+    assert "\n" not in message
+
+
+def test_a_file_of_summaries_takes_less_than_ten_times_its_size_in_memory(pair):
+    """The worst that may be written: many short summaries of empty lists."""
+    text, summaries = pair
+    line = read_lines(summaries)[0]
+    bare = {"digest": "a", "units": {}, "rate": 1.0, "seconds": 1.0, "summaries": {"other": {"x": [[]] * 25}}}
+    rows = []
+    for number in range(2000):
+        data = json.dumps({**bare, "digest": f"{number:064}"}).replace(" ", "").encode()
+        rows.append((sha256(data).hexdigest(), data))
+    summaries.write_bytes(
+        b"sealscope healthy summaries 1\n" + b"".join(b"%b %b\n" % (own.encode(), data) for own, data in rows)
+    )
+    head = text.read_text().partition("\n[[healthy]]\n")[0]
+    text.write_text(head + "".join(f'\n[[healthy]]\nfile = "r"\nsummary = "{own}"\n' for own, _ in rows))
+    assert parse_summary(line, "run1.nc", "place").digest
+    tracemalloc.start()
+    try:
+        assert len(ss.read_machine(text).healthy) == 2000
+        assert tracemalloc.get_traced_memory()[1] < 10 * (text.stat().st_size + summaries.stat().st_size)
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
+    """What the others say is stated beside it."""
+    judged = ss.simulate(command="3 sin(4t)", duration="20 s", seed=41)
+    assert machine.diagnose(judged).verdict == "no leak"
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.detector.VolumeBalance.observe", fail)
+    diagnosis = machine.diagnose(judged)
+    assert diagnosis.verdict == "cannot tell"
+    assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason
+    assert ss.diagnose(judged).verdict == "cannot tell"
+
+
+def test_what_could_not_be_read_again_is_not_learnt(folder, tmp_path, monkeypatch):
+    """The other methods' summaries are kept, and the machine is written."""
+    learn = RmsChange.learn
+    monkeypatch.setattr(RmsChange, "learn", lambda *words: {**learn(*words), "levels": np.full(10, -np.inf)})
+    machine = ss.commission(folder / "run1.nc", rig="thesis")
+    assert "rms change" not in machine.healthy[0].summaries
+    assert len(ss.read_machine(ss.write_machine(machine, tmp_path / "m.toml")).healthy) == 1

@@ -1,0 +1,73 @@
+"""Friction and drifts of whole recordings, against those of healthy ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
+from sealscope.recordings.recording import Recording
+
+RATE, SECONDS = 100.0, 40.0
+T = np.arange(round(RATE * SECONDS)) / RATE
+
+
+def record(
+    friction: float = 2e5, drift_A: float = 0.0, drift_B: float = 0.0, contact: float = 0.0, seed: int = 0
+) -> Recording:
+    """Record a sine against a spring; `friction` and drifts [Pa]; `contact`: pressure at one end of the stroke."""
+    rng = np.random.default_rng(seed)
+    x = 0.1 * np.sin(2.0 * np.pi * 0.4 * T)
+    way = np.sign(np.cos(2.0 * np.pi * 0.4 * T))
+    p_A = 30e5 + 5e6 * x + 0.5 * friction * way + drift_A * T / SECONDS + contact * (x > 0.095)
+    p_B = 10e5 - 0.5 * friction * way + drift_B * T / SECONDS
+    noise = 2e3 * rng.standard_normal((2, len(T)))
+    return Recording(
+        T, {"p_A": p_A + noise[0], "p_B": p_B + noise[1], "x": x}, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE
+    )
+
+
+HEALTHY = [record(2e5 * factor, seed=seed) for seed, factor in enumerate((0.9, 1.0, 1.1, 1.05, 0.95), 1)]
+
+
+def chances(recording: Recording) -> dict[str, float]:
+    return {observable.name: observable.chance for observable in HealthyLevels().compare(recording, HEALTHY)}
+
+
+@pytest.mark.parametrize("contact", [0.0, 80e5])
+def test_friction_and_drifts_are_those_of_the_recording(contact: float) -> None:
+    learnt = HealthyLevels().learn(record(3e5, drift_A=2e5, drift_B=-1e5, contact=contact))
+    assert learnt is not None
+    assert np.exp(learnt["friction"]) == pytest.approx(3e5, rel=0.03)
+    assert (learnt["drift_A"], learnt["drift_B"]) == (pytest.approx(2e5, rel=0.05), pytest.approx(-1e5, rel=0.05))
+
+
+def test_each_change_shows_in_its_number_alone() -> None:
+    for change, name in (
+        ({"friction": 8e5}, "friction"),
+        ({"drift_A": 3e5}, "drift of p_A"),
+        ({"drift_B": -3e5}, "drift of p_B"),
+        ({"drift_A": 3e5, "drift_B": 3e5}, "drift of both"),
+    ):
+        found = chances(record(**change, seed=9))
+        assert min(found, key=lambda known: found[known]) == name
+        assert found[name] < 1e-3
+        if name != "drift of both":  # which both pressures show
+            found.pop(name)
+            assert min(found.values()) > 0.05
+
+
+def test_less_friction_is_no_wear() -> None:
+    assert chances(record(1e5))["friction"] > 0.9
+
+
+def test_nothing_is_learnt_of_a_piston_that_rests() -> None:
+    still = record()
+    assert HealthyLevels().learn(still.only(["p_A", "p_B"])) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_nothing_is_learnt_of_hardly_any_samples(count: int) -> None:
+    """A file with a heading and no rows is read as an empty recording, which has no difference to take."""
+    shortest = Recording(T[:count], {name: np.zeros(count) for name in ("p_A", "p_B", "x")}, record().units, RATE)
+    assert HealthyLevels().learn(shortest) is None
