@@ -76,6 +76,32 @@ def test_each_step_has_its_cause_and_its_time(kind: str) -> None:
     assert event is None or abs(onset_of(event) - 60.0) < 6.0
 
 
+def resting(recording: Recording, seconds: float, noise: float) -> Recording:
+    """Hold the piston for the last `seconds`, the drive off: no command, no ripple, p_A - p_B of a load."""
+    rest = recording.t > recording.t[-1] - seconds
+    noise_A, noise_B = np.random.default_rng(7).standard_normal((2, T.size)) * noise
+    held = {"u": 0.0 * T, "x": 0.01 + 0.0 * T, "p_A": 6e5 + noise_A, "p_B": 4e5 + noise_B}
+    channels = {name: np.where(rest, held[name], values) for name, values in recording.channels.items()}
+    return replace(recording, channels=channels)
+
+
+@pytest.mark.parametrize("seconds", [10.0, 60.0])
+def test_a_rest_changes_neither_duty_nor_noise_nor_sense(seconds: float) -> None:
+    """A drive that is off is another regime: quieter, without a size of the duty, friction or its sign."""
+    at_rest = resting(machine(), seconds, 200.0)
+    assert {observable.data for observable in observe_signals(at_rest).observables} >= {"duty", "noise", "hum"}
+    assert other_event(at_rest) is None
+
+
+def test_noise_that_changes_while_the_piston_moves_is_named_beside_a_rest() -> None:
+    recording = machine()
+    late = (T >= 40.0) * 3e3 * np.random.default_rng(5).standard_normal(T.size)
+    noisier = replace(recording, channels={**recording.channels, "p_A": recording["p_A"] + late})
+    event = other_event(resting(noisier, 30.0, 200.0))
+    assert event is not None
+    assert (event.cause, round(onset_of(event) / 10.0)) == ("sensor fault", 4)
+
+
 def test_missing_positions_hide_nothing() -> None:
     changed, cause = STEPS["friction"]
     whole = machine(**changed)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error
+from sealscope.diagnosis.inference.differences import (
+    Estimate,
+    PriorScatter,
+    compare_estimates,
+    compare_with_healthy,
+    excess_error,
+)
 
 HEALTHY = (1.0, 1.1, 0.9, 1.05, 0.95)
 
@@ -35,6 +41,40 @@ def test_a_value_that_no_possible_change_explains_is_no_evidence_of_one() -> Non
     assert chance(8.0) < 1e-4
     assert chance(8.0, prior_change=10.0) < 0.01
     assert chance(8.0, prior_change=0.01) > 0.5
+
+
+def estimates_chance(value: float, healthy: list[Estimate], error: float = 0.05, scatter: float = 0.1) -> float:
+    observable = compare_estimates("a", "b", Estimate(value, error), healthy, PriorScatter(scatter, 3.0))
+    assert observable is not None
+    return observable.chance
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0])
+def test_chances_of_estimates_are_those_stated_where_the_scatter_is_no_larger_than_believed(ratio: float) -> None:
+    """Errors differ tenfold from day to day; the scatter is drawn from its prior, or is smaller throughout."""
+    random, chances = np.random.default_rng(2), []
+    for _ in range(1000):
+        scatter = ratio * 0.1 * np.sqrt(3.0 / random.chisquare(3.0))
+        errors = 10.0 ** random.uniform(-2.0, -1.0, 7)
+        values = random.normal(0.0, np.hypot(scatter, errors))
+        healthy = [Estimate(*pair) for pair in zip(values[1:], errors[1:], strict=True)]
+        chances.append(estimates_chance(values[0], healthy, errors[0]))
+    for level in (0.1, 0.01):
+        low, high = binom.ppf([0.0005, 0.9995], len(chances), level)
+        count = np.sum(np.array(chances) < level)
+        assert count <= high
+        assert count >= low or ratio < 1.0
+
+
+def test_a_day_with_a_large_error_hides_no_change() -> None:
+    healthy = [Estimate(value, 0.05) for value in HEALTHY]
+    expected = estimates_chance(2.0, healthy)
+    assert expected < 1e-3
+    assert estimates_chance(2.0, [*healthy, Estimate(3.0, 2.0)]) < 3.0 * expected
+    assert estimates_chance(2.0, [*healthy, Estimate(3.0, 0.05)]) > 0.05
+    assert estimates_chance(2.0, healthy, error=1.0) > 0.1
+    assert compare_estimates("a", "b", Estimate(1.0, 0.1), healthy[:2], PriorScatter(0.1, 3.0)) is None
+    assert compare_estimates("a", "b", Estimate(np.nan, 0.1), healthy, PriorScatter(0.1, 3.0)) is None
 
 
 def test_a_vague_value_shows_less_than_a_precise_one() -> None:

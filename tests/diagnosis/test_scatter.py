@@ -15,6 +15,7 @@ from sealscope.diagnosis.inference.scatter import (
     RecordingSums,
     Rise,
     find_unusual_conditions,
+    motion_change,
     rise,
 )
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
@@ -364,6 +365,44 @@ def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_log
         np.median([oily_days(random, leak, error, shows=True).chance for _ in range(9)]) for error in (0.02, 1.0)
     )
     assert found < 0.01 and found < 0.2 * doubted
+
+
+MOVING = ColumnRoles(
+    Equation(
+        "test",
+        nothing,
+        (
+            Term("motion", "", nothing, "sensor fault", "motion"),
+            Term("oil", "", nothing, "air in the oil", "compliance"),
+            Term(LEAK, "", nothing, "piston or pump leak", "leak"),
+        ),
+    )
+)
+
+
+def moving(random: np.random.Generator, leak: float, scale: float = 1.0) -> np.ndarray:
+    """Gram matrix (4, 4) of a recording whose pressure goes with its speed, as friction makes it.
+
+    `leak`: over the flow that motion takes; `scale` of that flow.
+    """
+    speed = random.standard_normal(400)
+    pressure = np.sign(speed) + 0.5 * random.standard_normal(400)
+    x = np.column_stack([speed, random.standard_normal(400), PRESSURE * pressure])
+    y = FLOW * (scale * speed + 0.1 * x[:, 1] + leak * pressure + 1e-3 * random.standard_normal(400))
+    values = np.column_stack([x, y]) / (1e-3 * FLOW)
+    return values.T @ values
+
+
+def test_the_flow_that_motion_takes_does_not_depend_on_what_leaks() -> None:
+    """Leakage of 2 to 8 % of the flow, as cold and warm oil make it, under a pressure that goes with the speed."""
+    random, errors = np.random.default_rng(4), []
+    for leak, scale in (*10 * [(0.02, 1.0), (0.08, 1.0), (0.2, 1.0)], *10 * [(0.04, 1.02)]):
+        healthy = [moving(random, healthy_leak) for healthy_leak in (0.02, 0.04, 0.08)]
+        days = [*healthy, moving(random, leak, scale)]
+        changes, deviations = zip(*(motion_change(day, np.sum(healthy, axis=0), MOVING) for day in days), strict=True)
+        assert np.ptp(changes[:-1]) < 10.0 * max(deviations)
+        errors.append((changes[-1] - np.mean(changes[:-1]) - np.log(scale)) / deviations[-1])
+    assert np.std(errors) == pytest.approx(np.sqrt(1.0 + 1.0 / 3.0), rel=0.3)
 
 
 def test_conditions_that_no_healthy_recording_had_are_named() -> None:

@@ -174,7 +174,18 @@ _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
     PRESSURE_RESPONSE: (table_type("allow", level=_Number), None),
     RMS_CHANGE: (Annotated[_RMS, AfterValidator(_check_levels)], None),
-    SIGNALS: (table_type("allow", friction=_Number, drift_A=_Number, drift_B=_Number), None),
+    SIGNALS: (
+        table_type(
+            "allow",
+            friction_pressure=(_Number, None),
+            friction_error=(_Magnitude, None),
+            drift_A=_Number,
+            drift_B=_Number,
+            ratio=(_Number, None),
+            tilt=(_Number, None),
+        ),
+        None,
+    ),
 }
 _ABOUT = {
     "sha256": str,

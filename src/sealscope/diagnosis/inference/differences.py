@@ -1,19 +1,28 @@
-"""Test of a difference between a number of a recording and those of healthy recordings of unknown scatter.
+"""Tests of a difference between a number of a recording and those of healthy recordings of unknown scatter.
 
-n healthy values are normal about an unknown mean with an unknown standard deviation, at least the error e of a single
-value (Jeffreys prior), or with the scatter of some more recordings as a prior (inverse gamma, which adds them to the
-n - 1 degrees of freedom). The next value then follows Student's law of n - 1 degrees of freedom,
+*Without a prior on the scatter* (`compare_with_healthy`): n healthy values are normal about an unknown mean with an
+unknown standard deviation, at least the error e of a single value (Jeffreys prior). The next value then follows
+Student's law of n - 1 degrees of freedom,
 
     t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
 
 Five values that agree to a thousandth thus show that a sixth differs by a few thousandths; two show next to nothing.
 
-Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2 and 3.3.
+*With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i of its own and varies about an
+unknown mean mu by the scatter s, y_i ~ N(mu, s^2 + e_i^2), and s^2 has a scaled inverse chi-square prior: the scatter
+s_0 counts as much as that of m recordings. On a grid of s, with the weights w_i = 1/(s^2 + e_i^2) and W = sum w_i,
+
+    p(s | y) ~ p(s) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
+
+and the next value is a mixture of N(mean, s^2 + e^2 + 1/W).
+
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 3.3 and 5.4.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +31,24 @@ from sealscope.diagnosis.priors.inference import StepSize
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
+#: Number of grid points of the scatter, and its largest ratio to the prior's, either way.
+NODES, MAX_RATIO = 64, 100.0
+#: Smallest positive number that is divided by.
+TINY = float(np.finfo(float).tiny)
+
+
+class Estimate(NamedTuple):
+    """An estimate and its standard deviation."""
+
+    value: float
+    deviation: float
+
+
+class PriorScatter(NamedTuple):
+    """Prior standard deviation of a number between recordings, and the number of recordings that it counts as."""
+
+    deviation: float
+    recordings: float
 
 
 def compare_with_healthy(
@@ -32,16 +59,14 @@ def compare_with_healthy(
     error: float = 0.0,
     *,
     above: bool = False,
-    prior_scatter: tuple[float, float] = (0.0, 0.0),
     prior_change: float = np.inf,
 ) -> Observable | None:
     """Compare a value with those of healthy recordings by Student's t, as an observable.
 
     Return None for fewer than `MIN_HEALTHY` recordings, or if a number is not finite. `name`, `data`: of the
     observable; `error`: standard error of a single value; `above`: only a value above the healthy ones counts;
-    `prior_scatter`: of healthy recordings, and the number of recordings it counts as; `prior_change`: standard
-    deviation of a true change. The chance is at least the inverse of the Bayes factor of such a change, so that a value
-    that it explains no better than chance does counts for nothing.
+    `prior_change`: standard deviation of a true change. The chance is at least the inverse of the Bayes factor of such
+    a change, so that a value that it explains no better than chance does counts for nothing.
     """
     from scipy.special import stdtr
 
@@ -49,21 +74,59 @@ def compare_with_healthy(
     if len(healthy_values) < MIN_HEALTHY or not np.isfinite([value, error, *healthy_values]).all():
         return None
     count, change = len(healthy_values), value - float(healthy_values.mean())
-    scatter, n_prior = prior_scatter
-    freedom = count - 1 + n_prior
-    scatter_variance = float(healthy_values.var() * count + n_prior * scatter**2) / freedom
+    freedom = count - 1
+    scatter_variance = float(healthy_values.var() * count) / freedom
     variance = (scatter_variance + error**2) * (1.0 + 1.0 / count)
-    t = change / max(float(np.sqrt(variance)), np.finfo(float).tiny)
+    t = change / max(float(np.sqrt(variance)), TINY)
     chance = float(stdtr(freedom, -t if above else -abs(t))) * (1.0 if above else 2.0)
     score = t * t if t > 0.0 or not above else 0.0
     if not np.isfinite(score):
         return None
     if np.isfinite(prior_change):
         # Bayes factor: density of Student's law, its variance larger by that of a true change, over the null's density
-        variance_ratio = 1.0 + prior_change**2 / max(variance, np.finfo(float).tiny)
+        variance_ratio = 1.0 + prior_change**2 / max(variance, TINY)
         log_factor = 0.5 * (freedom + 1.0) * np.log1p(t * t / freedom)
         log_factor -= 0.5 * (freedom + 1.0) * np.log1p(t * t / variance_ratio / freedom) + 0.5 * np.log(variance_ratio)
         chance = max(chance, float(np.exp(-max(log_factor, 0.0))))
+    return Observable(name=name, data=data, score=score, chance=min(1.0, chance), size=change)
+
+
+def compare_estimates(
+    name: str,
+    data: str,
+    judged: Estimate,
+    healthy: Sequence[Estimate],
+    prior: PriorScatter,
+    *,
+    above: bool = False,
+) -> Observable | None:
+    """Compare an estimate with those of healthy recordings, each with its own error, as an observable.
+
+    Return None for fewer than `MIN_HEALTHY` recordings, or if a number is not finite. `name`, `data`: of the
+    observable; `prior`: scatter between recordings; `above`: only a value above the healthy ones counts. The size is
+    the difference from their weighted mean, the score its square over its variance.
+    """
+    from scipy.special import ndtr
+
+    if len(healthy) < MIN_HEALTHY or not np.isfinite([judged, *healthy]).all():
+        return None
+    values, errors = np.array(healthy, dtype=float).T
+    ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(MAX_RATIO), NODES))
+    scatter = prior.deviation * ratios
+    weights = 1.0 / (scatter[:, None] ** 2 + errors**2)
+    precision = weights.sum(axis=1)
+    means = weights @ values / precision
+    squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)
+    # density of log s: the prior's is s^-m exp(-m s_0^2 / (2 s^2))
+    log_posterior = -prior.recordings * (np.log(ratios) + 0.5 / ratios**2)
+    log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.log(precision) - squares)
+    posterior = np.exp(log_posterior - log_posterior.max())
+    posterior /= posterior.sum()
+    variances = scatter**2 + judged.deviation**2 + 1.0 / precision
+    z = (judged.value - means) / np.sqrt(variances)
+    chance = float(posterior @ (ndtr(-z) if above else 2.0 * ndtr(-np.abs(z))))
+    change = judged.value - float(posterior @ means)
+    score = change**2 / max(float(posterior @ variances), TINY) if change > 0.0 or not above else 0.0
     return Observable(name=name, data=data, score=score, chance=min(1.0, chance), size=change)
 
 
@@ -79,5 +142,5 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
 
 def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
     """Compute -2 log of a step's log-normal prior density over its maximum; `above`: penalise only steps above it."""
-    deviation = float(np.log(max(abs(step), np.finfo(float).tiny) / prior.size)) / prior.spread
+    deviation = float(np.log(max(abs(step), TINY) / prior.size)) / prior.spread
     return float(max(deviation, 0.0) ** 2 if above else deviation**2)

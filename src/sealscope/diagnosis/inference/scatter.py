@@ -603,25 +603,28 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
     return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
-def motion_change(judged: Array, baseline: Sequence[Array], roles: ColumnRoles) -> tuple[float, float]:
-    """Compute the log ratio of the flow explained by motion in a recording to that in others, and its standard error.
+def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
+    """Compute the log ratio of the flow explained by motion in a recording to the healthy one, and its standard error.
 
-    `judged`, `baseline`: Gram matrices (m, m). The flow is the sum of the least-squares coefficients of motion,
-    weighted by the energies of their columns in the recording. The ratio differs from 1 if area over displacement
-    changed: another machine, or another scale. The error is that of the recording alone.
+    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones. The flow is the sum
+    of the coefficients of motion, weighted by the energies of their columns in the recording. The leak is fitted beside
+    the motion, which otherwise takes what leaks in proportion to the speed; the other coefficients differ from the
+    healthy ones by a normal prior (`between`). The ratio differs from 1 if area over displacement changed: another
+    machine, or another scale. The error is that of the recording alone.
     """
-    reference, motion = np.sum(baseline, axis=0), list(roles.motion)
-    nuisance = list(roles.nuisance)
-    motion_index = [nuisance.index(k) for k in motion]
-    weights = np.zeros(len(nuisance))
-    weights[motion_index] = np.diag(judged)[motion]
-    flows, deviations = list[float](), list[float]()
-    for gram in (judged, reference):
-        right_sides = np.column_stack([gram[nuisance, roles.left], weights])
-        coefficients, error_weights = solve(gram[np.ix_(nuisance, nuisance)], right_sides).T
-        flows.append(max(abs(float(weights @ coefficients)), np.finfo(float).tiny))
-        deviations.append(math.sqrt(max(float(weights @ error_weights), 0.0)))
-    return math.log(flows[0] / flows[1]), deviations[0] / flows[0]
+    motion = list(roles.motion)
+    fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
+    reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
+    is_free = np.isin(fitted, [*motion, roles.leak])
+    with np.errstate(divide="ignore", over="ignore"):
+        precision = 1.0 / (np.abs(reference) * roles.between_deviation[fitted]) ** 2
+    gram = judged[np.ix_(fitted, fitted)]
+    prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
+    weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
+    right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
+    coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
+    flow, healthy_flow = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
+    return math.log(flow / healthy_flow), math.sqrt(max(float(weights @ error_weights), 0.0)) / flow
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:

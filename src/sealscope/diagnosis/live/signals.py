@@ -13,8 +13,10 @@ import numpy as np
 from sealscope.diagnosis.inference.changes.features import (
     amplitude_step_tests,
     feature_step_test,
+    is_in_motion,
     log_amplitudes,
     sensor_features,
+    time_in_motion,
 )
 from sealscope.diagnosis.inference.changes.levels import (
     LevelChange,
@@ -48,9 +50,10 @@ FEATURES = (
     "noise of p_A beside that of p_B",
     *(f"hum of {hertz:g} Hz" for hertz in CHANGES.features.mains),
 )
-#: Columns of a stored block: begin and end [s], number of samples, top speed, features, Gram matrix for the levels.
-_BEGIN, _END, _SAMPLES, _SPEED = range(4)
-_FEATURES = slice(_SPEED + 1, _SPEED + 1 + len(FEATURES))
+#: Columns of a stored block: begin and end [s], number of samples, top speed, fraction of its time in motion, features,
+#: Gram matrix for the levels.
+_BEGIN, _END, _SAMPLES, _SPEED, _MOVING = range(5)
+_FEATURES = slice(_MOVING + 1, _MOVING + 1 + len(FEATURES))
 _GRAM = slice(_FEATURES.stop, None)
 #: Numbers of blocks that are averaged for a level, the first that suffices.
 _GROUP_SIZES = (1, 2, 4)
@@ -73,12 +76,13 @@ class SignalWindow:
         motion = motion_columns(channels, rate)
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
+        fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed)[0])
         columns = pressure_level_rows(channels, rate, self._means, max_speed)
         blocks = {name: values[None] for name, values in channels.items()}
         values = {**dict(log_amplitudes(blocks)), **dict(sensor_features(blocks, rate))}
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), columns.T @ columns
-        row = np.array([begin, begin + n_samples / rate, n_samples, speed, *features, *gram.ravel()])
+        row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
         stored = self._rows[1 - WINDOW :] if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
         self._rows = np.vstack([stored, row])
 
@@ -88,12 +92,13 @@ class SignalWindow:
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()
-        time, columns = rows[:, [_BEGIN, _END]].mean(axis=1), zip(FEATURES, rows[:, _FEATURES].T, strict=True)
+        time, is_moving = rows[:, [_BEGIN, _END]].mean(axis=1), is_in_motion(rows[:, _MOVING])
+        moving_time, columns = time[is_moving], zip(FEATURES, rows[is_moving, _FEATURES].T, strict=True)
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
-        sensors = ((name, feature_step_test(time, values)) for name, values in features.items())
+        sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
         return run_tests(
-            lambda: duty_observables(amplitude_step_tests(time, duty)),
+            lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
             lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
             lambda: level_observables(self._test_levels(rows, time)),
         )

@@ -12,6 +12,7 @@ class SignalPriors(PriorTable):
     highest: float
     neighbours: tuple[float, ...]
     shortest: float
+    busy: float
     wander: float
 
 
@@ -33,12 +34,33 @@ class HealthyLevelPriors(PriorTable):
     drift: float
 
 
+class OctavePriors(PriorTable):
+    """Spectra of both pressures in octaves: `lowest`, `highest` [Hz], `seconds` [s]; the others are numbers."""
+
+    lowest: float
+    highest: float
+    share: float
+    seconds: float
+    error: float
+    scatter: float
+    recordings: float
+
+
+class FilteredPriors(PriorTable):
+    """Size of a change that a filter makes (logarithm)."""
+
+    size: float
+    spread: float
+
+
 class ChangePriors(PriorTable):
     """The tables of `inference/changes/priors.toml`."""
 
     features: SignalPriors
     levels: PressureLevelPriors
     healthy: HealthyLevelPriors
+    octaves: OctavePriors
+    filtered: FilteredPriors
 
 
 CHANGES = read_priors("sealscope.diagnosis.inference.changes", ChangePriors)

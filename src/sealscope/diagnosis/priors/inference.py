@@ -81,8 +81,15 @@ class SizePriors(PriorTable):
     laminar: float
     readings: int
     meter: float
-    motion: float
     area: float
+
+
+class RepeatPriors(PriorTable):
+    """Repetition of the flow that motion takes from day to day (relative standard deviations)."""
+
+    error: float
+    scatter: float
+    recordings: float
 
 
 class GrowthPriors(PriorTable):
@@ -187,6 +194,7 @@ class InferencePriors(PriorTable):
     conditions: ConditionPriors
     oil: OilPriors
     size: SizePriors
+    repeats: RepeatPriors
     growth: GrowthPriors
     scale: StepSize
     sense: SensePriors

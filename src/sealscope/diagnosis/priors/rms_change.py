@@ -53,13 +53,6 @@ class RingingRates(PriorTable):
     slowest: float
 
 
-class FilteredPriors(PriorTable):
-    """Size of a change that a filter makes (logarithm)."""
-
-    size: float
-    spread: float
-
-
 class RmsChangePriors(PriorTable):
     """The tables of `rms_change/priors.toml`."""
 
@@ -68,7 +61,6 @@ class RmsChangePriors(PriorTable):
     recordings: LevelScatter
     blocks: RmsBlockPriors
     rate: RingingRates
-    filtered: FilteredPriors
 
 
 RMS_PRIORS = read_priors("sealscope.diagnosis.rms_change", RmsChangePriors)

@@ -7,13 +7,12 @@ it went down (p_A) or up (p_B). Here d2..d4 of all chambers are tested for a ste
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.differences import compare_with_healthy
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import Interval, StepTest, step_tests
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
@@ -27,17 +26,15 @@ from sealscope.diagnosis.rms_change.blocks import (
 )
 from sealscope.diagnosis.rms_change.ringing import change_information, estimate_rises
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
-from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, min_samples
+from sealscope.signals.details import min_samples
 
 #: Name of the data that these observables describe.
 DETAILS = "details"
-#: Details that ringing dominates, not noise.
-RINGING = ("d2", "d3")
 
 
 class RmsChange:
@@ -164,29 +161,7 @@ def compare_summaries(
         score = 2.0 * change.log_ratio(change.value)
         observables.append(_make_observable(name, weight * rise.value, score, change.chance, chambers))
         bounds += [change.bound()] if _is_judged(name) else []
-    observables += _compare_chambers(judged, summaries, chambers)
     return tuple(observables), min(bounds)
-
-
-def _compare_chambers(judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]) -> Iterator[Observable]:
-    """Test the ratio of the chambers' ringing for a change: a filter at one sensor makes one, the machine does not."""
-    if len(chambers) != len(CHAMBERS):
-        return
-    ringing = [QUANTITIES.index(name) for name in RINGING]
-
-    def mean_difference(summary: Summary) -> float:
-        """Average the log ratio of p_A's ringing to p_B's."""
-        levels_A, levels_B = _summary_levels(summary, chambers).reshape(2, -1)
-        return float(np.mean(levels_A[ringing] - levels_B[ringing]))
-
-    error: float = RMS_PRIORS.recordings.error
-    healthy = [mean_difference(summary) for summary in summaries]
-    observable = compare_with_healthy("p_A beside p_B", "sides", mean_difference(judged), healthy, error)
-    if observable is not None:
-        filter_prior = RMS_PRIORS.filtered
-        # changes smaller than those that filters usually make count against a filter
-        deviations = np.log(max(abs(observable.size), error) / filter_prior.size) / filter_prior.spread
-        yield replace(observable, advantage=-float(min(deviations, 0.0) ** 2))
 
 
 def _is_judged(column: str) -> bool:

@@ -1,7 +1,8 @@
 """Spikes: single samples that a transmission error sets to zero or full scale.
 
-The value jumps and returns at once, by several times more than any other change nearby. Spikes are set to NaN and
-bridged as gaps. Called by the inspection.
+The value leaps and returns at once, by several times more than any other sample nearby that leaps and returns, than
+the channel's slope there, and than its usual changes. A pressure that rises within one sample stays: it does not
+return. Spikes are set to NaN and bridged as gaps. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.spike
-#: Changes on either side that a spike is compared with, and fewest samples of a channel.
+#: Leaps on either side that a spike is compared with, and fewest samples of a channel.
 _NEIGHBOURS, _MIN_SAMPLES = 10, 50
 #: Smallest spike, in quantisation steps.
 _MIN_QUANTA = 10.0
@@ -43,7 +44,7 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def find_spikes(values: Array) -> NDArray[np.intp]:
-    """Find the rows in which a channel (n,) leaps and returns by several times its changes nearby."""
+    """Find the rows in which a channel (n,) leaps and returns by several times its leaps and its slope nearby."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:
         return np.empty(0, dtype=np.intp)
@@ -53,10 +54,13 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     jumps = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(step_sizes[:-1], step_sizes[1:]), 0.0)
     usual_step = float(np.quantile(step_sizes[:: max(1, step_sizes.size // _N_CHANGES)], 0.9))
     threshold = _PRIORS.times * usual_step + _MIN_QUANTA * estimate_quantum(values[known])
+    # of the neighbouring samples: over the leap, before and after it
+    outer_steps = np.maximum(np.append(0.0, step_sizes[:-2]), np.append(step_sizes[2:], 0.0))
+    slopes = np.maximum(0.5 * np.abs(steps[:-1] + steps[1:]), outer_steps)
     rows = []
     for k in np.flatnonzero(jumps > threshold).tolist():
-        nearby_steps = np.r_[step_sizes[max(k - _NEIGHBOURS, 0) : k], step_sizes[k + 2 : k + 2 + _NEIGHBOURS]]
-        if jumps[k] > _PRIORS.times * nearby_steps.max(initial=0.0):
+        nearby_jumps = np.r_[jumps[max(k - _NEIGHBOURS, 0) : k], jumps[k + 1 : k + 1 + _NEIGHBOURS]]
+        if jumps[k] > _PRIORS.times * max(slopes[k], nearby_jumps.max(initial=0.0)):
             rows.append(known[k + 1])
     # with many of them, the channel itself leaps
     return np.array(rows if len(rows) <= _PRIORS.share * known.size else [], dtype=np.intp)

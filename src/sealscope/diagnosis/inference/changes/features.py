@@ -1,8 +1,8 @@
 """Tests of steps of features that no balance contains: of the duty's amplitude, of sensor noise, of hum.
 
-Each feature is one number in each block, tested against its scatter between blocks. A leak changes none of them: the
-operator gives the command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not
-ring.
+Each feature is one number in each block with motion, tested against its scatter between blocks: what a pump's ripple,
+a held load or a drive that is off show at rest is another regime. A leak changes none of them: the operator gives the
+command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not ring.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import Information, StepTest, two_sided_step_test
+from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, two_sided_step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -37,7 +39,28 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks = _split_blocks(recording, length)
-    return amplitude_step_tests(time, dict(log_amplitudes(blocks)))
+    is_moving = _find_moving_blocks(recording, length)
+    amplitudes = {kind: values[is_moving] for kind, values in log_amplitudes(blocks)}
+    return amplitude_step_tests(time[is_moving], amplitudes)
+
+
+def time_in_motion(speeds: Array, max_speed: float) -> Array:
+    """Compute the fraction of its time (K,) that a block of speeds (K, length) moves; NaN counts as rest."""
+    return np.asarray((np.abs(speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
+
+
+def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
+    """Flag blocks (K,) that move almost as long as the busiest, by their `time_in_motion`."""
+    return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
+
+
+def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
+    """Flag the blocks of `length` samples with motion (K,); all of them if no motion is recorded."""
+    count, motion = len(recording) // length, motion_columns(recording.channels, recording.rate)
+    if motion is None:
+        return np.ones(count, dtype=bool)
+    speeds = motion[: count * length, 0].reshape(count, length)
+    return is_in_motion(time_in_motion(speeds, top_speed(motion)))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
@@ -62,11 +85,16 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     """Test the features that change with a sensor alone for a step; return the tests with their names."""
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
-    time, blocks = _split_blocks(recording, len(recording) // BLOCKS)
+    length = len(recording) // BLOCKS
+    time, blocks = _split_blocks(recording, length)
     if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples
         return []
-    features = sensor_features(blocks, recording.rate)
-    return [(name, test) for name, values in features if (test := feature_step_test(time, values)) is not None]
+    is_moving = _find_moving_blocks(recording, length)
+    tests = (
+        (name, feature_step_test(time[is_moving], values[is_moving]))
+        for name, values in sensor_features(blocks, recording.rate)
+    )
+    return [(name, test) for name, test in tests if test is not None]
 
 
 def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
@@ -119,8 +147,11 @@ def _row_statistic(statistic: Callable[..., Array], values: Array) -> Array:
 
 
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
-    """Test a feature's values (K,) in blocks at times (K,) [s] for a step; None if they are constant or missing."""
-    if not np.isfinite(values).all() or not np.ptp(values) > 0.0:
+    """Test a feature's values (K,) in blocks at times (K,) [s] for a step.
+
+    Return None if they are constant or missing, or too few.
+    """
+    if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None
     unit_precision, drift = np.eye(len(values)), _PRIORS.wander
     return two_sided_step_test(Information(time, unit_precision, values, slope=drift, walk=drift))

@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.balance import (
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.circuit.without_position import circulations
-from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error
+from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import duplicate_leak_column
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
@@ -254,16 +254,16 @@ class VolumeBalance:
 
 def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Iterator[Observable]:
     """Compare the flow explained by motion with the healthy recordings; a change means another machine or scale."""
-    columns, sums = balance.columns[0], [recording.sums[0] for recording in healthy]
-    change, error = motion_change(balance.recording_sums.sums[0], sums, columns)
-    from_others = [
-        motion_change(recording_sums, sums[:k] + sums[k + 1 :], columns)
-        for k, recording_sums in enumerate(sums if len(sums) > 1 else ())
-    ]
-    # a change from the mean of the n - 1 others is n / (n - 1) times that from the mean of all n
-    healthy_changes = [healthy_change * (len(sums) - 1) / len(sums) for healthy_change, _ in from_others]
-    error = float(np.hypot(INFERENCE.size.motion, excess_error(error, [error_k for _, error_k in from_others])))
-    observable = compare_with_healthy("motion", "motion", change, healthy_changes, error)
+    prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
+
+    def estimate(sums: RecordingSums) -> Estimate:
+        """Estimate the log ratio of a recording's flow to the healthy one."""
+        change, error = motion_change(sums.sums[0], healthy_sums, balance.columns[0])
+        return Estimate(change, float(np.hypot(prior.error, error)))
+
+    judged = estimate(balance.recording_sums)
+    scatter = PriorScatter(prior.scatter, prior.recordings)
+    observable = compare_estimates("motion", "motion", judged, [estimate(sums) for sums in healthy], scatter)
     yield from () if observable is None else (observable,)
 
 

@@ -1,0 +1,129 @@
+"""Robust fit of the pressures over the samples in which the piston moves.
+
+A pressure, or p_A - p_B, is fitted by
+
+    p = level(x) + half sign(v) + b v + c dv/dt + drift t/T,
+
+with the level free in each of some bins of the position and t/T the time over the recording's duration, by iteratively
+reweighted least squares (weights of Cauchy's law), so that contact with a workpiece does not count. Standard errors are
+those of residuals that are correlated within each of some parts of the recording (cluster-robust). Called for friction
+and drifts (`healthy_levels`) and for the viscous drop (`viscous_drop`).
+
+Sources: P. W. Holland, R. E. Welsch, Communications in Statistics A6 (1977) 813 (the weights); K.-Y. Liang, S. L.
+Zeger, Biometrika 73 (1986) 13 (the standard error).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.inference.changes.levels import motion_columns, motion_scales
+from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.recording import Array, Recording, compute_once
+
+#: Number of bins of the position.
+BINS = 24
+#: Maximum and minimum number of rows of a fit, and its number of iterations.
+MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 200, 8
+#: Scale of the weights' decrease with the residual, over the median residual.
+WEIGHT_SCALE = 2.0
+#: Smallest length that is divided by, and smallest scale of residuals [Pa].
+TINY, MIN_RESIDUAL = 1e-300, 1.0
+#: Number of parts of a recording whose residuals count as independent.
+PARTS = 20
+#: Indices of the columns sign(v), t/T and v.
+DIRECTION, TIME, SPEED = 0, 1, 2
+
+
+class Motion(NamedTuple):
+    """Samples in motion: their indices `rows` (n,), and the columns `design` (n, m) of the module's equation.
+
+    The columns are the sign of the speed, time, speed, acceleration, and bins of the position; the speed is relative to
+    `top_speed`.
+    """
+
+    rows: NDArray[np.intp]
+    design: Array
+    top_speed: float
+
+
+def select_motion(recording: Recording) -> Motion | None:
+    """Select the samples in motion; None without both chamber pressures, a motion, or enough samples."""
+    if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
+        return None
+    motion = motion_columns(recording.channels, recording.rate)
+    if motion is None:
+        return None
+    scales = motion_scales(motion)
+    motion = motion / scales
+    is_known = np.isfinite(motion).all(axis=1) & np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
+    rows = np.flatnonzero(is_known & (np.abs(motion[:, 0]) > CHANGES.healthy.slowest))
+    if len(rows) < MIN_ROWS:
+        return None
+    rows = rows[:: max(1, len(rows) // MAX_ROWS)]
+    speed, time = motion[rows, 0], (recording.t[rows] - recording.t[rows].mean()) / recording.duration
+    position = motion[rows, 2] if motion.shape[1] > 2 else np.zeros(len(rows))
+    bins = np.minimum((BINS * (position - position.min()) / max(float(np.ptp(position)), TINY)), BINS - 1)
+    occupied = np.eye(BINS)[bins.astype(int)]
+    design = np.column_stack([np.sign(speed), time, motion[rows, :2], occupied[:, occupied.any(axis=0)]])
+    return Motion(rows, design, float(scales[0]))
+
+
+def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
+    """Fit coefficients (m,) to values (n,) by reweighted least squares, with weights 1/sqrt(1 + (residual/scale)^2).
+
+    Returns the coefficients and the weights (n,).
+    """
+    weight = np.ones(len(values))
+    for _ in range(ITERATIONS):
+        coefficients = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
+        residual = np.abs(values - design @ coefficients)
+        scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
+        weight = 1.0 / np.hypot(1.0, residual / scale)
+    return np.asarray(coefficients), weight
+
+
+class DifferenceFit(NamedTuple):
+    """Fit of p_A - p_B: the pressure `friction` that reverses with the motion, and the `drop` over the speed.
+
+    `friction` [Pa] and `drop` [Pa over the unit of the speed], each with its standard error.
+    """
+
+    friction: float
+    friction_error: float
+    drop: float
+    drop_error: float
+
+
+def fit_difference(recording: Recording) -> DifferenceFit | None:
+    """Fit p_A - p_B by the module's equation, once for a recording; None without enough motion."""
+    return compute_once(recording, ("motion fit of p_A - p_B",), _fit_difference)
+
+
+@np.errstate(all="ignore")
+def _fit_difference(recording: Recording) -> DifferenceFit | None:
+    """Fit p_A - p_B with cluster-robust errors of the coefficients of sign(v) and v."""
+    motion = select_motion(recording)
+    if motion is None:
+        return None
+    rows, design, top_speed = motion
+    difference = recording["p_A"][rows] - recording["p_B"][rows]
+    coefficients, weight = fit_robustly(design, difference)
+    weighted = design * weight[:, None]
+    residual = (difference - design @ coefficients) * weight
+    edges = np.linspace(0, len(rows), PARTS + 1).astype(int)[:-1]
+    # error^2 = P / (P - 1) sum over P parts of (influence of the part's residuals on the coefficient)^2
+    scores = np.add.reduceat(weighted * residual[:, None], edges, axis=0)
+    influences = np.linalg.pinv(weighted.T @ weighted)[[DIRECTION, SPEED]] @ scores.T
+    errors = np.sqrt(PARTS / (PARTS - 1.0) * (influences**2).sum(axis=1))
+    fit = DifferenceFit(
+        float(coefficients[DIRECTION]),
+        float(errors[0]),
+        float(coefficients[SPEED] / top_speed),
+        float(errors[1] / top_speed),
+    )
+    return fit if np.isfinite(fit).all() else None

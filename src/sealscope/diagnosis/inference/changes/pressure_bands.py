@@ -1,0 +1,91 @@
+"""Spectra of both chamber pressures in octaves, which a filter of one sensor or its line makes unlike.
+
+A low-pass filter takes more of one pressure the higher the frequency. With A_k, B_k the RMS of p_A and p_B in octave k,
+from periodograms of Hann windows (Welch), two numbers are compared with healthy recordings:
+
+    ratio = mean over the upper two octaves of log(A_k / B_k),    tilt = ratio - the same mean over the lower two.
+
+A filter changes both alike. A load that one chamber carries changes the ratio at all frequencies, and what moves slowly
+changes the lower octaves; neither changes both numbers. So the larger of their two chances is stated. Called for
+recordings with both chamber pressures (`healthy_levels`).
+
+Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.recording import Array, Recording
+
+#: `Observable.data` of the comparison of the chambers' spectra, and its name.
+SIDES, BESIDE = "sides", "p_A beside p_B"
+#: Minimum number of octaves, and number of those at either end that are averaged.
+MIN_OCTAVES, AVERAGED = 3, 2
+#: Minimum power whose logarithm is taken [Pa^2].
+MIN_POWER = 1e-6
+
+
+class Octaves(NamedTuple):
+    """Log ratio of p_A to p_B in the upper octaves, and its `tilt` from the lower to the upper ones."""
+
+    ratio: float
+    tilt: float
+
+
+def compare_octaves(recording: Recording) -> Octaves | None:
+    """Compare the spectra of p_A and p_B by the module's numbers; None if the recording has too few octaves."""
+    priors = CHANGES.octaves
+    if not set(CHAMBERS) <= set(recording.channels):
+        return None
+    length = round(priors.seconds * recording.rate)
+    n_octaves = int(np.log2(max(min(priors.highest, priors.share * recording.rate) / priors.lowest, 1.0)))
+    if n_octaves < MIN_OCTAVES or len(recording) < length:
+        return None
+    edges = np.asarray(priors.lowest * 2.0 ** np.arange(n_octaves + 1))
+    log_A, log_B = (_log_octave_rms(recording[name], recording.rate, length, edges) for name in CHAMBERS)
+    ratios = log_A - log_B
+    ratio = float(ratios[-AVERAGED:].mean())
+    octaves = Octaves(ratio, ratio - float(ratios[:AVERAGED].mean()))
+    return octaves if np.isfinite(octaves).all() else None
+
+
+def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
+    """Compute the logarithm of the RMS of values (n,) in octaves between `edges` (k + 1,) [Hz], from windows, (k,)."""
+    starts = range(0, len(values) - length + 1, max(length // 2, 1))
+    windows = np.stack([values[start : start + length] for start in starts])
+    spectra = np.fft.rfft((windows - windows.mean(axis=1, keepdims=True)) * np.hanning(length), axis=1)
+    power, frequencies = (np.abs(spectra) ** 2).mean(axis=0), np.fft.rfftfreq(length, 1.0 / rate)
+    octave = np.searchsorted(edges, frequencies, side="right") - 1
+    return np.array([0.5 * np.log(power[octave == k].sum() + MIN_POWER) for k in range(len(edges) - 1)])
+
+
+def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
+    """Test for a filter of one pressure by both numbers and those of healthy recordings; None for too few of them.
+
+    A change smaller than those that filters make counts against a filter.
+    """
+    prior, filtered = CHANGES.octaves, CHANGES.filtered
+    scatter = PriorScatter(prior.scatter, prior.recordings)
+    tests = [
+        compare_estimates(
+            BESIDE, SIDES, Estimate(value, prior.error), [Estimate(v, prior.error) for v in values], scatter
+        )
+        for value, values in zip(judged, zip(*healthy, strict=True), strict=True)
+    ]
+    ratio, tilt = tests if len(tests) == len(judged) else (None, None)
+    if ratio is None or tilt is None:
+        return None
+    weaker = max(ratio, tilt, key=lambda test: test.chance)
+    if ratio.size * tilt.size <= 0.0:
+        return replace(weaker, score=0.0, chance=1.0)
+    deviations = np.log(max(abs(tilt.size), prior.error) / filtered.size) / filtered.spread
+    return replace(weaker, size=tilt.size, advantage=-float(min(deviations, 0.0) ** 2))
