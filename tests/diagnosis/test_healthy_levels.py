@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
 
+from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.pressure_bands import compare_octaves
 from sealscope.recordings.recording import Recording
@@ -103,6 +104,27 @@ def test_spectra_need_three_octaves_and_differ_by_a_filter_in_both_numbers() -> 
     assert octaves is not None and by_load is not None and by_filter is not None
     assert by_load == pytest.approx((octaves.ratio - np.log(3.0), octaves.tilt), abs=0.02)
     assert min(by_filter.ratio - octaves.ratio, by_filter.tilt - octaves.tilt) > 0.7
+
+
+@pytest.mark.parametrize("known", [0, 2])
+def test_healthy_days_without_spectra_leave_the_other_comparisons(known: int) -> None:
+    """A machine's file may be older than this comparison, or hold recordings that are too short for it."""
+    expected = chances(record(5e5, seed=9))
+    days = [
+        SummarisedRecording(
+            str(k),
+            "",
+            {},
+            RATE,
+            SECONDS,
+            None,
+            {"signals": {key: learnt[key] for key in learnt if key != "tilt" or k < known}},
+        )
+        for k, learnt in enumerate(HealthyLevels().learn(day) or {} for day in HEALTHY)
+    ]
+    found = {observable.name: observable.chance for observable in HealthyLevels().compare(record(5e5, seed=9), days)}
+    assert expected.pop("p_A beside p_B") > 0.01
+    assert found == pytest.approx(expected)
 
 
 def test_nothing_is_learnt_of_a_piston_that_rests() -> None:

@@ -104,19 +104,24 @@ class Case:
 
         Observables are tried from the rarest on, as long as they are too rare for a healthy recording.
         """
-        allowed = DECISION.explanation.heading * self.false_alarm_probability
-        allowed /= max(len({observable.data for observable in self.observables}), 1)
-        chances = {id(observable): self.null.chance(observable) for observable in self.observables}
-        for observable in sorted(self.observables, key=lambda other: chances[id(other)]):
-            if chances[id(observable)] >= allowed:
+        named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
+        candidates_of = {
+            observable: [event for event in named_events if event.affects(observable)]
+            for observable in self.observables
+        }
+        # several tests may name an event: one for each kind of data that shows one
+        n_tests = len({observable.data for observable, candidates in candidates_of.items() if candidates})
+        allowed = DECISION.explanation.heading * self.false_alarm_probability / max(n_tests, 1)
+        chances = {observable: self.null.chance(observable) for observable in self.observables}
+        for observable in sorted(self.observables, key=chances.__getitem__):
+            if chances[observable] >= allowed:
                 return None
-            candidates = [event for event in load_events() if event.affects(observable)]
-            causes = dict.fromkeys(event.cause for event in candidates if event.name not in LEAK_EVENTS)
-            for cause in (cause for cause in causes if cause is not None):
+            candidates = candidates_of[observable]
+            for cause in dict.fromkeys(event.cause for event in candidates):
                 probability = probability_of(self.explanations, cause=cause, data_kind=observable.data)
-                if probability > DECISION.explanation.named:
+                if cause is not None and probability > DECISION.explanation.named:
                     likeliest = max((e for e in candidates if e.cause == cause), key=lambda e: e.probability)
-                    return OtherEvent(cause, likeliest.description, probability, observable, chances[id(observable)])
+                    return OtherEvent(cause, likeliest.description, probability, observable, chances[observable])
         return None
 
 

@@ -74,14 +74,15 @@ def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable |
     A change smaller than those that filters make counts against a filter.
     """
     prior, filtered = CHANGES.octaves, CHANGES.filtered
-    scatter = PriorScatter(prior.scatter, prior.recordings)
-    tests = [
-        compare_estimates(
-            BESIDE, SIDES, Estimate(value, prior.error), [Estimate(v, prior.error) for v in values], scatter
-        )
-        for value, values in zip(judged, zip(*healthy, strict=True), strict=True)
-    ]
-    ratio, tilt = tests if len(tests) == len(judged) else (None, None)
+
+    def compare(values: Sequence[float], value: float) -> Observable | None:
+        """Compare one of the numbers with those of the healthy recordings."""
+        estimates = [Estimate(healthy_value, prior.error) for healthy_value in values]
+        scatter = PriorScatter(prior.scatter, prior.recordings)
+        return compare_estimates(BESIDE, SIDES, Estimate(value, prior.error), estimates, scatter)
+
+    ratio = compare([octaves.ratio for octaves in healthy], judged.ratio)
+    tilt = compare([octaves.tilt for octaves in healthy], judged.tilt)
     if ratio is None or tilt is None:
         return None
     weaker = max(ratio, tilt, key=lambda test: test.chance)
