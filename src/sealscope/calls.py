@@ -34,7 +34,7 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate `function` so that a call with wrong arguments raises InputError; signature and docstring stay.
+    """Decorate `function` to raise InputError for wrong arguments; its signature and docstring stay.
 
     The error for an unknown keyword suggests the nearest known one: ``simulate has no argument 'comand'; did you mean
     'command'?``. Missing and surplus arguments raise InputError too. Errors of the function itself pass unchanged.
@@ -65,14 +65,17 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
-    """Declare an argument as a dataclass field: its type in words, its meaning, and a number's SI unit."""
+    """Declare an argument as a dataclass field; `kind`: type in words, `text`: meaning, `unit`: SI unit of a number."""
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
     )
 
 
 def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
-    """Decorate a function of a dataclass to take its `argument` fields, in signature and docstring."""
+    """Build a decorator that lets a function of the dataclass `declared` take its fields as arguments.
+
+    The fields, declared by `argument`, replace the dataclass in signature and docstring.
+    """
     lines: list[str] = []
     for declared_field in fields(declared):  # type: ignore[arg-type]
         wrapped = fill(declared_field.metadata["text"], 110, break_long_words=False, break_on_hyphens=False)

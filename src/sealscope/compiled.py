@@ -57,10 +57,7 @@ def is_known_version(version: str) -> bool:
 
 @cache
 def _compiler() -> ModuleType:
-    """Choose the module that compiles.
-
-    It uses numba's private classes if this version's are known, else numba's whole pipeline.
-    """
+    """Import the module that compiles: with numba's private classes if this version's are known, else without."""
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -93,7 +90,7 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove all but the most recently used generations of compiled code."""
+    """Remove the folders in `kernels` except `current` and the `_MAX_GENERATIONS` - 1 most recently used others."""
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
@@ -104,7 +101,7 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a directory, no link, of this user, without the `forbidden` bits."""
+    """Raise PermissionError unless `folder` is a directory, no link, of this user, without `forbidden` mode bits."""
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
         return
@@ -159,7 +156,7 @@ def kernel(function: _F, fastmath: Any = False) -> _F:
 
 
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a physical law that other compiled functions call."""
+    """Compile a law for calls from other compiled functions; return it unchanged if numba is disabled."""
     if numba.config.DISABLE_JIT:
         return function
     return _compiler().compile_law(function, fastmath, inlined, cache_directory())  # type: ignore[no-any-return]
@@ -171,14 +168,14 @@ def law(function: _F) -> _F:
 
 
 def large_law(function: _F) -> _F:
-    """Compile a law like `law`, but one too large to be inlined at each call."""
+    """Compile a law that is too large to be inlined in other compiled functions, which call it."""
     return _compile_law(function, False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
     """Compile a law whose products and sums may be contracted to fused multiply-adds.
 
-    Divisions by loop invariants may become products. The last digits depend on the processor, but not on the block or
+    Divisions may become products with the reciprocal. The last digits depend on the processor, but not on the block or
     the lane.
     """
     return _compile_law(function, {"contract", "arcp"})
@@ -229,13 +226,13 @@ def address_of(context: Any, pointer: Any) -> Any:
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the dtype of a record of doubles by name, and of parts: arrays of a shape, or records of a dtype."""
+    """Build the dtype of a record of doubles named `numbers`, and `parts`: arrays by shape or records by dtype."""
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make a record array (1,) from `values`, or else from attributes of `source` by name, or zeros."""
+    """Make a record array (1,); each field is from `values`, else from the attribute of `source`, else zero."""
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))
@@ -271,7 +268,7 @@ def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]
     """Compile a function to LLVM code without Python; return the code and the function's symbol.
 
     `arguments`: "double*", "double" or "int64" each. The function returns an integer, takes pointers and numbers, and
-    allocates nothing; what C calls is ``int symbol(int64_t *result, void **unused, arguments...)``.
+    allocates nothing; C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
     """
     kinds = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
     signature = numba.int64(*(kinds[argument] for argument in arguments))

@@ -72,5 +72,5 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
 
 
 def _diagnose_file(machine: CommissionedMachine, folder: Path, name: str) -> Diagnosis:
-    """Diagnose a recording in the folder; the diagnosis gets its file name."""
+    """Diagnose the recording `name` in `folder`; the diagnosis states this name as its file."""
     return replace(machine.diagnose(machine.read(folder / name)), file=name)

@@ -76,10 +76,10 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 
 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
-    """Make a source that simulates the experiment and delivers its blocks in time, from the first unknown one on."""
+    """Make an actuator's source: it simulates, and delivers in scaled real time the blocks that are not yet stored."""
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate if any block is unknown to the store, and deliver the unknown blocks in time."""
+        """Simulate if the store lacks any block, and deliver each missing block when its time has passed."""
         blocks = range(math.floor(experiment.duration / BLOCK_S))
         # the store knows all blocks before some block, and none after it
         first = bisect_left(blocks, True, key=lambda number: not receiver.store.is_known(name, block_identity(number)))

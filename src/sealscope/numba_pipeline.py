@@ -36,10 +36,10 @@ EXTENSION_NAMES = {
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
 class ConstantLengths(FunctionPass):  # type: ignore[misc]
-    """Replace len(p.law) by its number, for an argument `p`, a named tuple or record, and `law`, a tuple or array.
+    """Compiler pass that replaces len(p.law) by a constant, for an argument `p` that is a named tuple or record.
 
-    The same holds for len(choice) of an argument that is a tuple. Branches on the length are then decided before types
-    are inferred, and an absent law is not compiled.
+    `law` is a tuple or array; the len of an argument that is a tuple is replaced, too. Branches on the length are then
+    decided before types are inferred, and an absent law is not compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -56,7 +56,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return guard(get_definition, code, variable)
 
         def type_of(source: Any) -> Any:
-            """Find the type of an argument, or of a part of one; None for other expressions."""
+            """Find the numba type of an argument or of its attribute; None for other expressions."""
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
             owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
@@ -108,7 +108,7 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function that other compiled functions call; Python runs an `inlined` one itself."""
+    """Compile a function for calls from other compiled functions; Python runs an `inlined` one uncompiled."""
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)
     return compile_kernel(function, fastmath, folder)

@@ -80,8 +80,8 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a signature; None if there is none or it is damaged.
 
-        Of numba's preparations for compiling, which take longer than loading, machine code needs only the reference
-        counts. A later compilation does the rest.
+        Only numba's reference counts are set up, which loaded code needs; the rest of its set-up takes longer than
+        loading and is left to a later compilation.
         """
         try:
             rtsys.initialize(target_context)
@@ -132,14 +132,14 @@ def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: P
     # numba reads this global setting when the cache is made. It is restored for other users of numba in the process;
     # the lock keeps two threads that import kernels from restoring each other's value.
     with _config_lock:
-        before = config.CACHE_DIR
+        previous_folder = config.CACHE_DIR
         config.CACHE_DIR = str(folder)
         try:
             dispatcher._cache = TolerantCache(function)  # as `cache=True` does
         except (OSError, RuntimeError) as error:  # the folder is gone
             _log.debug("cannot cache compiled code in %s: %s", folder, error)
         finally:
-            config.CACHE_DIR = before
+            config.CACHE_DIR = previous_folder
     return dispatcher
 
 
@@ -149,7 +149,7 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law for linking with kernels, without machine code, as nobody asks for its address.
+    """The code of a law for linking with kernels, without machine code, as it is never called by address.
 
     The law is optimised here once, not within each kernel, so that all kernels compute identical results.
     """
@@ -191,7 +191,7 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Call from Python."""
+        """Run the law for a call from Python."""
         return self._for_python(*arguments, **named)
 
 

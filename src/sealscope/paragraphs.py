@@ -1,4 +1,4 @@
-"""Text of messages and terminals: counts, lists of names, and paragraphs without what a terminal would obey."""
+"""Text of messages and terminals: counts, lists of names, and paragraphs without terminal control characters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WIDTH = 80
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
-    """Wrap a text after `head` to lines of at most `width` columns; longer words are not broken.
+    """Wrap `head` and text to lines of at most `width` columns; longer words are not broken.
 
     Lines after the first are indented by `indent` columns, by default the length of the head.
     """
@@ -39,7 +39,7 @@ def format_count(count: int, noun: str) -> str:
 
 
 def join_names(names: Iterable[str], most: int = 12) -> str:
-    """Join names for a message, at most so many of them; one of over 80 characters ends in three points."""
+    """Join at most `most` names, and the number of the rest; cut a name to `WIDTH` characters; "none" for no names."""
     names = list(names)
-    shown = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown or "none"
+    joined = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])
+    return f"{joined} and {len(names) - most} more" if len(names) > most else joined or "none"

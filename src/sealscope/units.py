@@ -69,7 +69,7 @@ def _build_unit(row: Mapping[str, Any]) -> Unit:
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Make the unit of an absolute pressure; its offset subtracts one atmosphere, as pressures inside are gauge."""
+    """Make the unit of an absolute pressure; its offset subtracts one atmosphere, as all pressures inside are gauge."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -151,7 +151,7 @@ def _tokenize(text: str) -> list[str]:
 def _parse_product(tokens: list[str]) -> Unit:
     """Parse a product with `/`, blanks and brackets, such as ``m^3/(s Pa)``, and remove its tokens from the list.
 
-    It ends at the end or before a closing bracket. Raises ValueError if there is none.
+    The product ends with the list or before a closing bracket. Raises ValueError if there is no valid product.
     """
     result: Unit | None = None
     divides = False
@@ -218,7 +218,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def _describe_dimension(si_unit: str) -> str:
-    """Describe the units of a dimension for messages: `a unit of pressure, such as Pa`."""
+    """Describe the valid units of a dimension in a message: `a unit of pressure, such as Pa`."""
     if parse_unit(si_unit).powers == ():
         return "no unit, or %"
     return f"a unit of {_KINDS[si_unit]}, such as {si_unit}" if si_unit in _KINDS else f"a unit such as {si_unit}"
@@ -332,8 +332,8 @@ def parse_quantity(
         text = repr(float(value))
     match = _NUMBER.fullmatch(text) if len(text) <= _MAX_TEXT else None
     if match is None:
-        shown = repr(value[:60] if isinstance(value, str) else value)
-        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {shown}{where}")
+        entry = repr(value[:60] if isinstance(value, str) else value)
+        raise InputError(f"{name} must be a number with or without a unit, such as 2[{si_unit}], got {entry}{where}")
     rest = match["rest"].strip()
     unit = (rest[1:-1] if rest.startswith("[") and rest.endswith("]") else rest) if rest else si_unit
     number = float(match["number"])

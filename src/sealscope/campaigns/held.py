@@ -94,8 +94,9 @@ def plan_hold(
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
-    `flow`: mean flow of the pump under the usual duty [m^3/s]; `find`: if None, a hold of `DEFAULT_DURATION` is
-    planned; `false_alarm`, `detection`: probabilities of `leak` without a leak, and with it.
+    Plans the longest of `HOLD_DURATIONS` if none detects it, and a hold of `DEFAULT_DURATION` if `find` is None.
+    `flow`: mean flow of the pump under the usual duty [m^3/s]; `false_alarm`, `detection`: probabilities of the verdict
+    `leak` without a leak, and with it. Raises InputError unless the load is > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -106,7 +107,7 @@ def plan_hold(
 
 
 class _HoldDraws:
-    """Draws of a hold of `duration` [s] with any leak; the other arguments as for `plan_hold`."""
+    """Simulates holds of one `duration` [s] to find their smallest detectable leak; other arguments: `plan_hold`."""
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
@@ -128,7 +129,7 @@ class _HoldDraws:
         return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
-        """Return True if a leak [m^3/(s Pa)] is detected in enough of `_N_DRAWS` holds."""
+        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the wanted fraction of simulated holds."""
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
@@ -138,7 +139,7 @@ class _HoldDraws:
         return True
 
     def with_smallest_leak(self) -> PlannedHold:
-        """Return the hold with the smallest conductance that it detects, infinite if it detects none."""
+        """Bisect for the smallest conductance that the hold detects; return the hold with it, or with inf for none."""
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
         if not self.detects(float(np.exp(high))):
@@ -157,7 +158,7 @@ def _decay_per_conductance(rig: Rig) -> float:
 
 
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
-    """Draw a hold with a leak of the piston and the noise of the rig's sensors; return the sums of its recording.
+    """Simulate a hold with a leak past the piston and sensor noise; return its sums as those of a recording.
 
     `conductance` [m^3/(s Pa)]; `flow`: mean flow of the pump under the usual duty [m^3/s].
     """

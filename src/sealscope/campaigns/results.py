@@ -36,8 +36,8 @@ class CampaignResult:
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors.
 
-    Scorers that compare two parts of a record are given the true onset of simulated records, which are split there;
-    recordings are split in the middle. Other detectors assume the plan's rig.
+    Scorers that compare two parts of a record know the true onset of simulated records, which are split there;
+    recordings are split in the middle. Detectors that are no scorers assume the plan's rig.
     """
     is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name

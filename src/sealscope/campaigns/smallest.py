@@ -45,7 +45,7 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """The texts of a command [V], such as '3 sin(4t)', and of a load, such as '2 kN' or "" for none."""
+    """A voltage command and a load as texts, such as '3 sin(4t)' [V] and '2 kN'; "" for no load."""
 
     command: str
     load: str = ""
@@ -80,8 +80,8 @@ class RecordingPlan(NamedTuple):
 
     `target`: conductance to detect [m^3/(s Pa)], None to detect the smallest; `for_detection`: the shortest recording
     that detects it, or the best that was tried; `for_separation`: the same for separating it from the pump's leakage;
-    `usual_pressure`: mean pressure difference of the usual duty [Pa], at which flows are stated; `hold`:
-    the locked hold that detects it, None if no valve shuts the cylinder in.
+    `usual_pressure`: mean pressure difference of the usual duty [Pa], at which flows are stated; `hold`: the locked
+    hold for the target, None if no valve shuts the cylinder in.
     """
 
     rig: str
@@ -178,7 +178,7 @@ def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0)
 def detectable_leak(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
 ) -> DetectableLeak:
-    """Compute the smallest leak that recordings of a duty detect, or note why it cannot be computed."""
+    """Compute the smallest leak detected in recordings of a duty of `duration` [s]; a failure gives inf and a note."""
     steps = []
     try:
         for seed in range(N_RECORDS):
@@ -220,7 +220,7 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 
 
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Compute by what factor the standard error of a leak's step at mid-record grows if the pump's step is unknown.
+    """Compute the factor by which an unknown step of the pump raises the standard error of a leak's step at mid-record.
 
     Infinite if the balance has no term of the pump, or the two steps cannot be separated.
     """

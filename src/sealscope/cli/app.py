@@ -76,10 +76,10 @@ def normalise_arguments(words: Sequence[str]) -> list[str]:
     """Bring the arguments of a call into the form that typer parses: `-v` first, and an option for each baseline."""
     end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
-    remaining = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
-    if remaining[:1] == ["monitor"] and len(remaining) > 1 and remaining[1] not in monitoring.COMMANDS:
-        remaining.insert(1, "run")  # `sealscope monitor FILE`
-    return [*verbose[:1], *spread_baselines(remaining)]
+    other_words = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
+    if other_words[:1] == ["monitor"] and len(other_words) > 1 and other_words[1] not in monitoring.COMMANDS:
+        other_words.insert(1, "run")  # `sealscope monitor FILE`
+    return [*verbose[:1], *spread_baselines(other_words)]
 
 
 def spread_baselines(words: Sequence[str]) -> list[str]:
@@ -91,7 +91,7 @@ def spread_baselines(words: Sequence[str]) -> list[str]:
         return list(words)
     end = list(words).index("--") if "--" in words else len(words)
     baselines: list[list[str]] = []  # the files after each `--baseline`
-    remaining: list[str] = []
+    other_words: list[str] = []
     in_baseline = False
     for word in words[1:end]:
         if word == "--baseline":
@@ -99,16 +99,16 @@ def spread_baselines(words: Sequence[str]) -> list[str]:
             in_baseline = True
             continue
         in_baseline = in_baseline and (word == "-" or not word.startswith("-"))
-        (baselines[-1] if in_baseline else remaining).append(word)
-    remaining += words[end:]
+        (baselines[-1] if in_baseline else other_words).append(word)
+    other_words += words[end:]
     if not all(baselines):
         raise InputError("--baseline must be followed by one file or more, got none")
     command = _click_command().commands[words[0]]
-    files = command.make_context(words[0], list(remaining), resilient_parsing=True).params["files"]
-    used = baselines if files else [group[:1] for group in baselines]
-    options = [word for group in used for name in group for word in ("--baseline", name)]
+    files = command.make_context(words[0], list(other_words), resilient_parsing=True).params["files"]
+    used_groups = baselines if files else [group[:1] for group in baselines]
+    options = [word for group in used_groups for name in group for word in ("--baseline", name)]
     moved_files = [] if files else [name for group in baselines for name in group[1:]]
-    return [words[0], *options, *moved_files, *remaining]
+    return [words[0], *options, *moved_files, *other_words]
 
 
 @cache

@@ -123,9 +123,9 @@ def _format_progress(state: CampaignProgress) -> str:
     if state.failed:
         text += f", {state.failed} of them failed"
     if state.seconds is not None:
-        remaining = (state.records - state.done) * state.seconds
+        remaining_s = (state.records - state.done) * state.seconds
         text += f"; {state.seconds:.2f} s of one core each"
-        text += f", about {opt.format_duration(remaining)} of one core left" if remaining else ""
+        text += f", about {opt.format_duration(remaining_s)} of one core left" if remaining_s else ""
     return text
 
 

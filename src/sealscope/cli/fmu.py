@@ -41,20 +41,20 @@ def fmu(
     from sealscope.units import parse_quantity
 
     check_folder(output)
-    common: dict[str, Any] = {"rig": load_rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
+    options: dict[str, Any] = {"rig": load_rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
     if sensor is None:
         if rate is not None:
             raise InputError("--rate is of a soft sensor, got it without --sensor")
         max_step = None if step is None else parse_quantity(step, "s", name="step")
         max_error = ERROR if error is None else parse_quantity(error, "Pa", name="error")
-        variables = write_fmu(output, **common, error=max_error, step=max_step)
+        variables = write_fmu(output, **options, error=max_error, step=max_step)
         timing = f"steps of at most {next(v.start for v in variables if v.name == 'step'):.3g} s"
     else:
         for name, value in (("--step", step), ("--error", error)):
             if value is not None:
                 raise InputError(f"{name} is of a rig's solver, got it with --sensor")
         rate_hz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
-        variables = write_sensor_fmu(output, **common, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
+        variables = write_sensor_fmu(output, **options, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
         timing = f"samples at {rate_hz:g} Hz"
     kinds = ("input", "parameter", "output")
     counts = ", ".join(f"{sum(v.causality == kind for v in variables)} {kind}s" for kind in kinds)

@@ -63,8 +63,8 @@ def commission(
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
             """Add the files to the healthy recordings, and forget those before the repair."""
             if repair is not None:
-                repaired = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
-                machine = replace(machine, alarms=(*machine.alarms, repaired))
+                repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
+                machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:
                 machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
             return machine if repair is None else machine.since(repair)

@@ -69,7 +69,10 @@ complete_rigs = make_completion(_rig_names)
 
 
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
-    """Build the option for an argument of `Experiment.of`, with the help text declared there."""
+    """Build the option for an argument of `Experiment.of`, with the help text declared there.
+
+    `option`: flag, by default from the name; `several`: it may be repeated; `settings`: further arguments of typer's.
+    """
     text = _argument_text(name) + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
 
@@ -166,16 +169,16 @@ class StatedMachine:
             for name, value in options.items():
                 if value:
                     raise InputError(f"{name} must not stand beside --machine, whose file states it")
-            known = read_machine(machine)
-            return cls(known, rig=known.rig, limit=known.limit)
-        stated = cls(
+            known_machine = read_machine(machine)
+            return cls(known_machine, rig=known_machine.rig, limit=known_machine.limit)
+        stated_machine = cls(
             rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps), rate=rate,
             limit=limit, baseline=tuple(baseline or ()),
         )  # fmt: skip
-        check_request(stated.channel_map, rate)
-        check_request(stated._rig_map, rate)
+        check_request(stated_machine.channel_map, rate)
+        check_request(stated_machine._rig_map, rate)
         RepairLimit.parse(limit)
-        return stated
+        return stated_machine
 
     @property
     def _rig_map(self) -> ChannelMap:
@@ -246,7 +249,7 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter `stated` by the options of `StatedMachine.of`, all or those in `names`."""
+    """Build a decorator that replaces a command's parameter `stated` by options of a machine, all or just `names`."""
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
@@ -282,7 +285,7 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter `name` by options, from which `make` builds its value."""
+    """Build a decorator that replaces a command's parameter `name` by `options`, from which `make` builds its value."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         """Wrap the command with a signature that has the options in place of the parameter."""
@@ -449,8 +452,8 @@ def _minute_reporter() -> Callable[[str, float], None]:
             start_fraction = fraction
         if now - last_print >= 60.0 and fraction > start_fraction:
             last_print = now
-            remaining = (now - start) / (fraction - start_fraction) * (1.0 - fraction)
-            echo(f"{task}, about {format_duration(remaining)} left", err=True)
+            remaining_s = (now - start) / (fraction - start_fraction) * (1.0 - fraction)
+            echo(f"{task}, about {format_duration(remaining_s)} left", err=True)
 
     return update
 

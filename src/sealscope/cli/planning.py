@@ -46,17 +46,17 @@ def plan(
         raise InputError(f"--hold must be a force > 0, got {hold}")
     planned_rig = opt.load_rig_with(rig, overrides)
     if machine is not None:
-        commissioned = read_machine(machine)
+        commissioned_machine = read_machine(machine)
         if overrides:
             raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
-        if commissioned.rig is None or not commissioned.rig.states("cylinder.M_eq"):
-            smallest = commissioned.summary.smallest
+        if commissioned_machine.rig is None or not commissioned_machine.rig.states("cylinder.M_eq"):
+            smallest = commissioned_machine.summary.smallest
             hint = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
             raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){hint}")
-        planned_rig = commissioned.rig
+        planned_rig = commissioned_machine.rig
     with opt.progress() as update:
-        planned = plan_recording(
+        recording_plan = plan_recording(
             planned_rig, leak_flow, usual=PlannedDuty(command, load), held=hold_force, false_alarm=false_alarm,
             detection=detection, progress=update,
         )  # fmt: skip
-    echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())
+    echo(json.dumps(recording_plan.as_dict(), allow_nan=False) if output == "json" else recording_plan.text())

@@ -82,9 +82,9 @@ def diagnose(
     results = [("", work(files))] if is_serial else _diagnose_in_parallel(work, files)
     is_complete, is_failure = True, False
     starts: list[float | None] = []
-    for messages, dated in results:
+    for messages, dated_diagnoses in results:
         echo(messages, err=True, nl=False)
-        for result in dated:
+        for result in dated_diagnoses:
             if result is None:
                 is_complete = False
                 continue
@@ -158,7 +158,8 @@ def _iter_diagnoses(
 ) -> Iterator[DiagnosedRecording | None]:
     """Yield the diagnosis of each file, None for an unreadable one; a file is never its own baseline.
 
-    `joined`: the files are parts of a single recording; `false_alarm`: probability.
+    `joined`: the files are parts of a single recording; `false_alarm`: probability. An unreadable baseline also yields
+    None. Raises InputError if a file is its only baseline, UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files if baseline else ():
@@ -200,8 +201,8 @@ def _run_collecting_messages(
 ) -> tuple[str, list[DatedDiagnosis | None]]:
     """Run `work` on files; return its messages on standard error, and its results."""
     with redirect_stderr(StringIO()) as messages:
-        dated = list(work(files))
-    return messages.getvalue(), dated
+        dated_diagnoses = list(work(files))
+    return messages.getvalue(), dated_diagnoses
 
 
 @opt.with_machine_options()
@@ -247,7 +248,7 @@ def report(
     else:
         opt.check_folder(parse_page_path(output))
     n_results, name = 0, None if stated.commissioned is None else stated.commissioned.name
-    written: list[tuple[Path, Diagnosis]] = []
+    written_pages: list[tuple[Path, Diagnosis]] = []
     for result in _iter_diagnoses(files, stated, joined=join, false_alarm=false_alarm):
         n_results += 1
         if result is None:
@@ -256,11 +257,11 @@ def report(
         page = output / f"{Path(diagnosis.file).stem}.html" if has_folder else output
         write = partial(write_report, recording, page, diagnosis, rig=stated.rig, title=name)
         if opt.attempt(page, write) is not None:
-            written.append((page, diagnosis))
+            written_pages.append((page, diagnosis))
             opt.say(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
-    if has_folder and written:
-        write_index(output / "index.html", written)
-    if len(written) < n_results:
+    if has_folder and written_pages:
+        write_index(output / "index.html", written_pages)
+    if len(written_pages) < n_results:
         raise Exit(1)
 
 
@@ -276,16 +277,16 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     if output.resolve() in {path.resolve() for path in paths}:
         raise InputError(f"a page must not replace a recording, got {output}")
     results = list(_iter_diagnoses(paths, machine, joined=False, false_alarm=false_alarm))
-    judged = [
+    entries = [
         Judged(result.diagnosis, _start_seconds(result), partial(machine.read, Path(result.diagnosis.file)))
         for result in results
         if result is not None
     ]
-    if not judged:
+    if not entries:
         raise UnreadableFile("no recording could be read, so there is no page")
-    n_left_out, name = len(results) - len(judged), "" if machine.commissioned is None else machine.commissioned.name
-    write_history_page(output, judged, title=name, left_out=n_left_out)
-    opt.say(f"{name}: {format_count(len(judged), 'recording')} -> {output}")
+    n_left_out, name = len(results) - len(entries), "" if machine.commissioned is None else machine.commissioned.name
+    write_history_page(output, entries, title=name, left_out=n_left_out)
+    opt.say(f"{name}: {format_count(len(entries), 'recording')} -> {output}")
     if n_left_out:
         raise Exit(1)
 
@@ -357,7 +358,7 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write the parts of a long recording into a new folder."""
+    """Write parts of length `every`, such as 1h, of a long recording into a new or empty folder."""
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

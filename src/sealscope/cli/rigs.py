@@ -113,12 +113,12 @@ def print_margins(
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
 
-    loaded, force = load_rig(rig), parse_quantity(load, "N", name="--load")
-    control = controller_named(controller, loaded)
-    echo(f"{loaded.name}, {controller}, {control.rate:g} Hz, late by {control.delay} samples, load {force:g} N")
+    loaded_rig, force = load_rig(rig), parse_quantity(load, "N", name="--load")
+    control = controller_named(controller, loaded_rig)
+    echo(f"{loaded_rig.name}, {controller}, {control.rate:g} Hz, late by {control.delay} samples, load {force:g} N")
     echo("speed [m/s]  gain [dB]  phase [deg]  crossover [Hz]  delay [ms]  peak 1/|1+L|")
     for speed in (0.0, 0.01, 0.02, 0.05):
-        loop = margins(loaded, control, speed, force)
+        loop = margins(loaded_rig, control, speed, force)
         gain = "inf" if math.isinf(loop.gain) else f"{20 * math.log10(loop.gain):.1f}"
         figures = (
             f"{math.degrees(loop.phase):11.0f}  {loop.crossover:14.2f}  {1e3 * loop.delay:10.1f}  {loop.peak:12.2f}"

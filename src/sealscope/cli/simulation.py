@@ -82,9 +82,9 @@ def parameters(
     """List a rig's parameters: symbol, name, value, unit and source."""
     from sealscope.storage.csv_file import guard_cell
 
-    loaded = opt.load_rig_with(rig, overrides)
+    loaded_rig = opt.load_rig_with(rig, overrides)
     columns = ("symbol", "name", "meaning", "value", "unit", "source")
-    rows = [{column: getattr(row, column) for column in columns} for row in loaded.table()]
+    rows = [{column: getattr(row, column) for column in columns} for row in loaded_rig.table()]
     if form == "json":
         echo(json.dumps(rows, indent=1))
     elif form == "csv":
@@ -94,7 +94,7 @@ def parameters(
     else:
         width = min(get_terminal_size((80, 24)).columns, 120)
         name_width = max(len(row["name"]) for row in rows) + 2
-        lines = [paragraph(f"{loaded.name}: {loaded.title}", width=width), ""]
+        lines = [paragraph(f"{loaded_rig.name}: {loaded_rig.title}", width=width), ""]
         for row in rows:
             value = f"{row['value']:.6g}" if isinstance(row["value"], float) else str(row["value"])
             line = f"{row['name']:<{name_width}}{value} {row['unit'] if row['unit'] != '1' else ''}".rstrip()

@@ -37,8 +37,8 @@ class CompiledLaw(NamedTuple):
     """A controller's law in machine code, for one run from its beginning.
 
     `address`: that of a function ``double law(double *memory, double *measured)``, from numba.cfunc or C, that returns
-    the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and its parameters, the first of which is
-    the compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law.
+    the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and parameters; memory[0] is the
+    compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law.
     """
 
     address: int
@@ -78,7 +78,7 @@ class _PythonLaw:
     """A controller written in Python, with an address at which compiled code calls it."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
-        """Make a function in C that calls `voltage`, and the law that states its address."""
+        """Make a C function that calls `voltage`, and the `CompiledLaw` with its address."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)

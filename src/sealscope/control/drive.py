@@ -31,10 +31,10 @@ DRIVE = record_dtype(
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
-    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against `dp` = p_A - p_B [Pa], sample by sample.
+    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    By the equation of `ValveDrive`, or of `Drive`, in which s/(s + corner) is a high-pass filter of the speed. `m`: a
-    record `DRIVE`, whose filter is advanced by one sample.
+    It solves the equation of `ValveDrive` for u, or that of `Drive`, in which s/(s + corner) is a high-pass filter of
+    the speed. `m`: a record `DRIVE`; each call advances its filter by one sample.
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
@@ -49,7 +49,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 @kernel
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
-    """Filter values (n,) by a first-order lag into `out` (n,), from `state` on; `decay`: factor within a sample."""
+    """Filter values (n,) by a first-order lag into `out` (n,), with out[0] = `state`; `decay`: exp(-interval/lag)."""
     for sample in range(values.size):
         out[sample] = state
         state = values[sample] + decay * (state - values[sample])
@@ -74,7 +74,7 @@ class _Invertible(ABC):
         """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` [V]: overlap of a valve."""
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build the function, called at `rate` [Hz], for the voltage [V] of a flow [m^3/s] against p_A - p_B [Pa]."""
+        """Build the function (flow [m^3/s], p_A - p_B [Pa]) that returns a voltage [V], for calls at `rate` [Hz]."""
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 
@@ -120,8 +120,8 @@ class Drive(_Invertible):
         """Compute the drive's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The class's equation solved for omega: omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), where y is
-        omega_d + droop dp after a first-order lag (`lag`). y starts at standstill under the first dp; with `settling`,
-        at the value that it has again after that many samples (a periodic command).
+        omega_d + droop dp after a first-order lag (`lag`). y starts at standstill under the first dp; for a periodic
+        command, whose period is `settling` samples, it starts in the periodic state.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -134,7 +134,7 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` is for valves only."""
+        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` is ignored."""
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
     def steady_voltage(self, flow: float) -> float:
@@ -173,7 +173,7 @@ class ValveDrive(_Invertible):
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE`; voltages in the overlap `dead_volts` [V] give no flow and are raised."""
+        """Make the record (1,) `DRIVE`; `dead_volts` [V]: width of the edges' overlap, which `drive_voltage` adds."""
         return make_record(DRIVE, self, dead_volts=dead_volts)
 
     def steady_voltage(self, flow: float) -> float:

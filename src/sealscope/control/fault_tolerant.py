@@ -43,7 +43,7 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _tolerant_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample: that of the inner controller, and that for the estimated leakage flow."""
+    """Compute the voltage [V] of a sample: the inner controller's, plus a voltage for the estimated leakage flow."""
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
     if math.isnan(m.mean_A):

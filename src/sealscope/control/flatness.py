@@ -32,7 +32,7 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _flatness_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample: that of the feedback, and the feed-forward of `Flatness`."""
+    """Compute the voltage [V] of a sample, the sum of feedback and feed-forward (`Flatness`)."""
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
     v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
@@ -55,11 +55,11 @@ class Flatness:
     """Feed-forward of the forces and flows that the target requires, and the feedback of a PI controller.
 
     The position is a flat output of the machine: with x = target, v and a its derivatives,
-    F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + dp'/(1/C), u = the drive's inverse of (Q, dp).
+    F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + C dp', u = the drive's inverse of (Q, dp).
     `feedback` gives A v and the correction of the error. The feed-forward adds the pump's leakage `G` [m^3/(s Pa)], the
     compliance `C` = V/(2 K) [m^3/Pa] of the oil, and the speed that the drive loses under the torque of dp. F_f(v) =
-    (`F_C` + `F_v` |v|) sign(v), smooth within `v_th` [m/s]; F_load is an average from the pressures. `M` [kg], `F_C`
-    [N], `F_v` [N s/m] are what the controller assumes of the machine.
+    (`F_C` + `F_v` |v|) sign(v), smooth within `v_th` [m/s]; F_load is the average of the pressures' force less
+    (M a + F_f). `M` [kg], `F_C` [N], `F_v` [N s/m] are what the controller assumes of the machine.
 
     A jump of the target has no derivative: a target's speed above `v_max` [m/s] is not fed forward.
 

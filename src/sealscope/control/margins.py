@@ -143,7 +143,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
 
 def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
-    """Compute the controller's response to a unit impulse of each measured state: (index of the state, response)."""
+    """Compute the controller's voltage response to a unit impulse of each measured state: (index, response).
+
+    Responses that are zero are left out. `state` (14,): the state at which the controller rests.
+    """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
     standstill = Measured(0.0, 0.0, 0.0, 0.0, float(state[P_A]), float(state[P_B]), 0.0)
@@ -169,8 +172,8 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Compute sum_n a_n z^-n of an impulse response a_n that stays at its last value, as an integrator's does."""
-    final = response[-1]
-    transient = response - final
+    last_value = response[-1]
+    transient = response - last_value
     is_relevant = np.abs(transient) > 1e-9 * np.abs(response).max()
     n = int(np.flatnonzero(is_relevant)[-1]) + 1 if np.any(transient) else 0
     blocks = np.zeros((math.ceil(n / _BLOCK), _BLOCK))
@@ -179,7 +182,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
     total = np.zeros(z.size, dtype=complex)
     for k in range(len(blocks) - 1, -1, -1):  # Horner's scheme, a block at a time
         total = total * z**-_BLOCK + block_sums[:, k]
-    return np.asarray(total + final / (1.0 - 1.0 / z))  # geometric series of the last value
+    return np.asarray(total + last_value / (1.0 - 1.0 / z))  # geometric series
 
 
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:

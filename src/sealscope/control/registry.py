@@ -61,11 +61,11 @@ def check_controller_name(name: str) -> None:
 
 
 def controller_named(name: str, rig: Rig) -> Controller:
-    """Make the controller of a name from a rig's parameters.
+    """Make the controller called `name` for a rig.
 
     `name`: that of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function.
-    Its method `from_rig` is called with the rig, or itself if it has none. Raises InputError for an unknown name, and
-    for a controller without `rate`, `delay` and `start`.
+    Its method `from_rig` is called with the rig, or the class or function itself if it has none. Raises InputError for
+    an unknown name, and for a controller without `rate`, `delay` and `start`.
 
     Examples
     --------
@@ -86,9 +86,9 @@ def controller_named(name: str, rig: Rig) -> Controller:
         raise
     except Exception as error:  # a user's code may raise anything
         raise InputError(f"controller {name} could not be made: {type(error).__name__}: {error}") from error
-    missing = [part for part in ("rate", "delay", "start") if not hasattr(controller, part)]
-    if missing:
-        raise InputError(f"a controller must have rate, delay and start, got {name} without {', '.join(missing)}")
+    missing_parts = [part for part in ("rate", "delay", "start") if not hasattr(controller, part)]
+    if missing_parts:
+        raise InputError(f"a controller must have rate, delay and start, got {name} without {', '.join(missing_parts)}")
     return controller  # type: ignore[no-any-return]
 
 

@@ -50,9 +50,9 @@ class Examination:
     """One recording, gaps bridged and without missing samples, judged by single detectors or by all.
 
     `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
-    pressures cannot be judged and no detector is run, or None; `refusal`: why it cannot be
-    compared with the healthy recordings given, or None; `share`: fraction of the whole recording's samples in this one;
-    `judged_until`: fraction of the whole recording up to its last sample.
+    pressures cannot be judged, so that no detector is run, or None; `refusal`: why no given baseline can be compared,
+    or None; `share`: fraction of the whole recording's samples in `recording`; `judged_until`: fraction of the whole
+    recording up to the last sample of `recording`.
     """
 
     recording: Recording
@@ -182,14 +182,14 @@ def diagnose(
     used_rig, machine = assumed_rig(rig, recording)
     with limit_threads():
         inspection = inspect_recording(recording)
-        compared = select_comparable(inspection, healthy)
+        comparable = select_comparable(inspection, healthy)
         examination = Examination(
             inspection.part,
-            compared.parts,
+            comparable.parts,
             false_alarm_probability=false_alarm_probability,
             rig=used_rig,
             distrust=inspection.distrust,
-            refusal=compared.refusal,
+            refusal=comparable.refusal,
             share=inspection.share,
             judged_until=inspection.judged_until,
         )
@@ -199,9 +199,9 @@ def diagnose(
         recording,
         machine,
         file=os.fspath(file) if file else None,
-        quality=(*inspection.findings, *compared.findings),
+        quality=(*inspection.findings, *comparable.findings),
         false_alarm_probability=false_alarm_probability,
-        baselines=len(compared.parts),
+        baselines=len(comparable.parts),
         limit=repair,
     )
 

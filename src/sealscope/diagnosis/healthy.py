@@ -19,7 +19,7 @@ class SummarisedRecording:
     `file`: its name; `digest`: hash of its chamber pressures in hexadecimal digits, equal for copies; `units` by
     channel; `rate` [Hz]; `seconds`: duration; `start_s`: time of its first sample [s since 1970], None if unknown;
     `summaries` by detector; `about`: pressure, oil temperature, noise and problems, for people to read; `statistics`:
-    finite numbers by name, of any shape.
+    finite numbers by name, the surprisals of its changes (`observation.healthy_surprisals`).
     """
 
     file: str

@@ -54,7 +54,7 @@ class Inspection:
 
     @property
     def file(self) -> str | None:
-        """Name of the recording's file, None if it is of none."""
+        """Name of the recording's file, None if it was not read from one."""
         file = self.part.provenance.get("file")
         return None if file is None else str(file)
 
@@ -91,7 +91,7 @@ class Baselines(NamedTuple):
     """Leak-free recordings that a recording can be compared with.
 
     `parts`: their samples that can be analysed, or their summaries; `findings`: which were left out, and why;
-    `refusal`: why all given ones were, else None.
+    `refusal`: why every given one was left out, None if one remains or none was given.
     """
 
     parts: tuple[Healthy, ...]

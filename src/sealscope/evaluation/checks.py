@@ -36,7 +36,7 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Convert `values` (True/False or 1/0) to n booleans; raise InputError for other values or another number."""
+    """Convert `values` (True/False or 1/0) to n booleans; raise InputError for other values or another length."""
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")

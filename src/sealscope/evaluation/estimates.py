@@ -84,7 +84,7 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
 def _interval_coverage(
     low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float
 ) -> Proportion:
-    """Compute the proportion of the stated intervals that contain the truth."""
+    """Compute the proportion of the intervals `low` to `high` that contain the truth; nan or None: no interval."""
     low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))
     covered = (low <= truth) & (truth <= high) & has_interval
@@ -92,7 +92,7 @@ def _interval_coverage(
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to n numbers, nan for None; raise InputError for another number of them."""
+    """Convert `values` to an array (n,), all nan for None; raise InputError for another shape."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")

@@ -46,10 +46,10 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Find the smallest size such that it and all larger tested sizes have a lower bound >= `detection`.
+    """Find the smallest tested size from which on all have a lower bound >= `detection`; infinite if there is none.
 
-    Infinite if there is none. For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The
-    confidence applies to each size alone. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The confidence applies to each
+    size alone. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -66,14 +66,17 @@ def _log_odds(p: float) -> float:
 
 
 def _information(design: Array, n: Array, eta: Array) -> Array:
-    """Compute the Fisher information of the coefficients at the log odds `eta` of `n` trials each."""
+    """Compute the Fisher information (2, 2) of the coefficients from `design` (m, 2), `n` trials, log odds `eta`."""
     odds = np.exp(-np.abs(eta))  # does not overflow; p (1 - p) is even in eta
     weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
     return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
 
 
 def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: bool) -> float:
-    """Compute ``sum of k eta - n ln(1 + exp eta)``; `firth` adds half the log determinant of the information."""
+    """Compute the log-likelihood of `k` hits in `n` trials at log odds `eta`: ``sum of k eta - n ln(1 + exp eta)``.
+
+    `firth`: add half the log determinant of the information.
+    """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
         return value
@@ -82,7 +85,7 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: boo
 
 
 def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Array:
-    """Maximise the log-likelihood, penalised if `firth`, over the coefficients (intercept, slope)."""
+    """Find the coefficients (intercept, slope) of the largest log-likelihood, penalised if `firth`."""
     from scipy.optimize import minimize
     from scipy.special import expit
 
@@ -169,7 +172,7 @@ class HitMiss:
             return math.inf
 
         def excess_drop(log_size: float) -> float:
-            """Compute by how much the profile log-likelihood at a size is below the maximum less `allowed_drop`."""
+            """Compute the drop of the profile log-likelihood below the maximum at a size, minus `allowed_drop`."""
             return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
         # bracket the root with growing steps from the estimate upwards
@@ -199,7 +202,7 @@ class HitMiss:
         return self.size_bound()
 
     def _profile_log_likelihood(self, log_odds: float, log_size: float) -> float:
-        """Maximise the log-likelihood over the slope of curves with `log_odds` at `log_size`."""
+        """Compute the largest log-likelihood of all curves that have `log_odds` at `log_size`."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)

@@ -48,12 +48,12 @@ def _as_scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, A
 
 
 def _count_exceeding(scores: Array, thresholds: Array) -> Array:
-    """Count the scores that are >= each threshold."""
+    """Count the scores at or above each threshold."""
     return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
 
 
 def kolmogorov_margin(n: int, confidence: float) -> float:
-    """Compute the half width of a band around the empirical distribution of n samples that contains the true one.
+    """Compute the half width of a confidence band around the empirical distribution of n samples.
 
     ``sqrt(ln(2/alpha) / (2n))``, for any n and any distribution. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi
     10.1214/aop/1176990746.
@@ -81,9 +81,9 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
-    """Compute the fraction of the other kind's scores that each score is correctly ordered with; ties count half.
+    """Compute for each score the fraction of the other kind's scores that it is ordered correctly with.
 
-    Returns the fractions of the leak-free scores (n,) and of the leaky scores (m,).
+    Ties count half. Returns the fractions of the leak-free scores (n,) and of the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
@@ -92,10 +92,11 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
 
 
 def _newcombe_interval(value: float, leak_free: int, leaky: int, z: float) -> tuple[float, float]:
-    """Compute the limits t of an area A, ``|t - A| = z SE(t)``, whose distance is positive even if A is 1.
+    """Compute the confidence limits of an area A = `value`: the solutions t of ``|t - A| = z SE(t)``.
 
-    `leak_free`, `leaky`: numbers of scores. SE is Hanley and McNeil's with both numbers replaced by their mean. Source:
-    Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
+    `leak_free`, `leaky`: numbers of scores; `z`: normal quantile. SE is Hanley and McNeil's with both numbers replaced
+    by their mean. The interval has a width even if A is 0 or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi
+    10.1002/sim.2324, method 5.
     """
     from scipy.optimize import brentq
 

@@ -53,7 +53,7 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
 
 
 def find_minimum(function: Callable[[float], float], low: float, high: float, tolerance: float) -> tuple[float, float]:
-    """Find the minimum of a function that has one between `low` and `high`; return its position and value.
+    """Find the only minimum of a function between `low` and `high`; return its position and value.
 
     Uses golden sections; `tolerance`: largest error of the position.
     """

@@ -60,8 +60,8 @@ def confusion_matrix(
 ) -> Confusion:
     """Count verdicts by true fault, with Clopper-Pearson's intervals for each row.
 
-    `truth`, `verdicts`: true fault and verdict of each record, `none` for no fault; `faults`: all faults, in the order
-    of rows and columns. Raises InputError for a name that is not in `faults`, or a true fault `cannot tell`.
+    `truth`, `verdicts`: true fault and verdict of each record; `faults`: all names, including that for no fault, in the
+    order of rows and columns. Raises InputError for a name that is not in `faults`, or a true fault `cannot tell`.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

@@ -100,9 +100,9 @@ def fmi_headers() -> Path:
 
 
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
-    """Choose the solver's step [s] for an rms error of the pressures of at most `error` [Pa]; return it and its error.
+    """Choose the solver's step [s] for an rms error of pressures of at most `error` [Pa]; return step and error.
 
-    It is the shorter of those that runs of 4 s under each of `STEP_COMMANDS`, from mid-stroke, choose.
+    It is the shortest step that `integrate_run` chooses in runs of 4 s from mid-stroke under each of `STEP_COMMANDS`.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -113,7 +113,7 @@ def choose_step(rig: Rig, error: float) -> tuple[float, float]:
 
 
 class MockUp(NamedTuple):
-    """A unit before it is built.
+    """The code and data of a functional mock-up unit, to be compiled and archived.
 
     `summary`: its description; `modules`: LLVM code by function; `variable_list`: its variables; `values`: initial
     values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: sizes of its arrays; `step`
@@ -339,7 +339,7 @@ def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
     """Choose the platforms of a unit, by default this one; check them, the file's name and the FMI version.
 
-    Raises InputError for a wrong one, or for a platform that the compiler cannot build for.
+    Raises InputError if one of these is invalid, or the compiler cannot build for a platform.
     """
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")

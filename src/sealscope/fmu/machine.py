@@ -99,7 +99,7 @@ class RigChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:
-        """Return the choice for a rig, with the laws of load and external leakage, which are inputs of every unit."""
+        """Choose the laws of a rig, always with load and external leakage, which are inputs of every unit."""
         laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
         implicit, euler = choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler"
         return cls(laws, *throttle_readings(rig), implicit=implicit, euler=euler)

@@ -120,7 +120,7 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Check that a unit can run an experiment; raise InputError for a target, machine fault or mean leak."""
+    """Raise InputError if a unit cannot run an experiment: a target, a fault of the machine, or a leak as a flow."""
     if experiment.target is not None:
         raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
     if experiment.effects():
@@ -134,7 +134,7 @@ def _check_experiment(experiment: Experiment) -> None:
 
 
 def _read_description(path: Path) -> Any:
-    """Read a unit's description by FMPy; raise InputError if that is not installed or cannot read it."""
+    """Read a unit's description by FMPy; raise InputError if FMPy is not installed or cannot read it."""
     try:
         import fmpy
     except ImportError:
@@ -147,7 +147,10 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Map each channel and input to the FMU's variable, if it has one: that in `names`, else that of the same name."""
+    """Map each channel and input to a variable of the FMU: the one in `names`, else that of the same name, if any.
+
+    Raises InputError if `names` has an unknown channel or variable.
+    """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
         if channel not in valid_names:

@@ -313,7 +313,7 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Find the sign of the angle's counts by which the pump's flow in memory m's first rows rises with p_A - p_B."""
+    """Set memory m's `angle_sign` to make the pump's flow rise with p_A - p_B over the first `n_rows` rows."""
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
         mean += m.rows[r, _LEAK] / n_rows
@@ -324,7 +324,7 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 
 @large_law
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
-    """Append the conductance of the block `model.block` to the history, unless it stands still and is imprecise.
+    """Append the conductance of the block in `m.model` to the history, unless it is imprecise and from a standstill.
 
     `m`: memory; `size_error`: relative uncertainty of the machine's size; `n_rows`, `pressure` [Pa]: number of rows and
     mean abs(p_A - p_B) of the block; `is_learned`: update the other coefficients with the block.
@@ -348,7 +348,7 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 
 @large_law
 def _fit_to_waiting(m: Any, size_error: float) -> None:
-    """Fit the coefficients to the blocks that wait in memory m, find the usual precision, and append their results."""
+    """Fit the coefficients to the waiting blocks of memory m, set the usual precision, and append their results."""
     model = m.model
     for k in range(LEARNED):
         load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
@@ -367,7 +367,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Clear all sums and results in memory m: those of a machine at standstill cannot be compared with later ones."""
+    """Clear all sums and results in memory m, as those from a standstill cannot be compared with later ones."""
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -379,7 +379,7 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate block b from `gram[b]` in memory m; the first `LEARNED` blocks wait until all can be fitted together.
 
-    After `N_WAKING` successive blocks of far larger motion than before, start again. Arguments: `_append_conductance`.
+    After `N_WAKING` successive blocks of far larger motion, start again. Other arguments: as `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:
@@ -404,14 +404,15 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
 
 def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the law that finishes a block."""
+    """Build the law that weights the rows of the open blocks and estimates their leakage."""
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
         """Weight the rows of memory m's open blocks, the newest of which is `block`, and estimate each of these blocks.
 
-        The first `SUPPORT` blocks are weighted together, all later ones as they end. `ends` has room for this block's.
+        The first `SUPPORT` blocks are weighted together, later ones as they end. `ends`: index past each block's last
+        row; that of the newest is set here.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows

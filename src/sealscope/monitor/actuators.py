@@ -51,7 +51,7 @@ _MIN_OIL_KELVIN, _MAX_OIL_KELVIN = 173.15, 573.15
 
 
 class AlarmEvent(NamedTuple):
-    """An event of an alarm: the alarm after it, its kind (as `AlarmJudge.update` returns it), and its time [s]."""
+    """A change of an alarm: the alarm after it, the event that `AlarmJudge.update` returns, and its time [s]."""
 
     alarm: Alarm
     kind: str
@@ -84,10 +84,10 @@ class _Actuator:
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[AlarmEvent]]:
-        """Judge samples and return their estimates and the events of the alarm; a repetition gives the same result.
+        """Judge new samples; return the estimate of each block of them, and the changes of the alarm.
 
-        A `verdict` on the whole recording that decides replaces the tests of the blocks. `follows`: False if the
-        samples do not continue those before.
+        `follows`: False if the samples do not continue those before; `verdict`: on the samples as a whole recording. If
+        it decides, it updates the alarm instead of the blocks. From one state, the same samples give the same result.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
@@ -129,7 +129,7 @@ class _Actuator:
                 self.oil_celsius = float(kelvin.mean()) - 273.15
 
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
-        """Append samples to those kept during an alarm; discard those before a gap or of another format."""
+        """Keep the last `_ALARM_SAMPLES_S` of samples of an open alarm; discard those before a gap or new format."""
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not follows or not same_format:
@@ -145,7 +145,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the watch and what it stated last from the `state` of this version, except the judge of alarms."""
+        """Restore watch, last estimate, oil temperature and verdict from a checkpoint, but not the judge of alarms."""
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -153,7 +153,7 @@ class _Actuator:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
 
     def _machine_state(self) -> MachineState:
-        """Return the state of NE 107 that follows from the samples."""
+        """Determine the NE 107 state from the active alarm, else the verdict, else the last block and the baseline."""
         alarm, baseline, ended_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
             return state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
@@ -173,7 +173,7 @@ class _Actuator:
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
         t = None if self.last is None else last.t
-        learned = None if baseline is None else {name: getattr(baseline, name) for name in ("version", "hours", "lpm")}
+        facts = None if baseline is None else {name: getattr(baseline, name) for name in ("version", "hours", "lpm")}
         return {
             "blocks": self.watch.blocks,
             "t": t if verdict is None else verdict.end_s,
@@ -188,7 +188,7 @@ class _Actuator:
             "recording": None if verdict is None else {name: getattr(verdict, name) for name in _VERDICT_TEXTS},
             "why_no_litres": self.watch.why_no_litres if verdict is None else "",
             "oil_celsius": self.oil_celsius,
-            "baseline": learned,
+            "baseline": facts,
             "alarm": None if alarm is None else alarm.id,
             "status_word": 0 if alarm is None else alarm.status_word,
             "counters": self.watch.counters,
@@ -204,7 +204,7 @@ def _parse_settings(stored: str) -> WatchSettings | None:
 
 
 def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
-    """Test whether a stored watch has the rig and learning settings of a fresh one, up to a remeasured displacement."""
+    """Test whether two watches learn with the same settings and rig, except for a remeasured pump displacement."""
     (rig, *conditions), (stored_rig, *stored_conditions) = fresh.learned_with, stored.learned_with
     return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
 
@@ -238,17 +238,17 @@ class WatchedActuators:
         )
         n_stored = self.store.last_number(self.store.tables.blocks, name)
         actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored)
-        stored = self.store.checkpoint(name)
-        if stored is None or self._load_checkpoint(actuator, stored):
+        checkpoint = self.store.checkpoint(name)
+        if checkpoint is None or self._load_checkpoint(actuator, checkpoint):
             rows = StoredRows()
             self._checkpoint(actuator, rows)
             self.store.commit_rows(rows)
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Resume a new actuator from its checkpoint and judge the pending samples; return True to have a new one saved.
+        """Restore an actuator from its checkpoint and pending samples; return True if a new checkpoint must be saved.
 
-        Its watch starts anew if the state is of another version, or was learned with another rig or learning time.
+        Its watch starts anew if the state has another version, or was learned with another rig or learning time.
         """
         settings, fresh, state, name = actuator.settings, actuator.watch, stored.state, actuator.settings.name
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
@@ -289,34 +289,34 @@ class WatchedActuators:
         Passes on errors of the database; the call can then be repeated.
         """
         with self._lock:
-            known = [block for block in blocks if block.actuator in self.settings]
-            for name in {block.actuator for block in known}:
+            known_blocks = [block for block in blocks if block.actuator in self.settings]
+            for name in {block.actuator for block in known_blocks}:
                 self._last_block_clock[name] = time.monotonic()
-            self._store_once(known)
-            self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known))
+            self._store_once(known_blocks)
+            self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known_blocks))
 
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge and store blocks of known actuators, without those stored already.
+        """Judge and store those blocks of known actuators that are not stored yet.
 
         Repeated blocks are rare: the database is asked for them only after it has refused one.
         """
         if not blocks:
             return
         by_identity = {(block.actuator, block.identity): block for block in reversed(blocks)}  # keeps the first of two
-        new = [block for block in blocks if by_identity[block.actuator, block.identity] is block]
+        new_blocks = [block for block in blocks if by_identity[block.actuator, block.identity] is block]
         try:
             try:
-                self._store_new(new)
+                self._store_new(new_blocks)
             except _AlreadyStored:
-                stored = self.store.select_stored(by_identity)
-                new = [block for block in new if (block.actuator, block.identity) not in stored]
-                self._store_new(new)
+                stored_keys = self.store.select_stored(by_identity)
+                new_blocks = [block for block in new_blocks if (block.actuator, block.identity) not in stored_keys]
+                self._store_new(new_blocks)
         except BaseException:
             # the detectors are ahead of the database: restore them with the next block
             for name in {block.actuator for block in blocks}:
                 self._actuators.pop(name, None)
             raise
-        self.count("blocks stored already", len(blocks) - len(new))
+        self.count("blocks stored already", len(blocks) - len(new_blocks))
         self._notify_change()
 
     def _store_new(self, blocks: Sequence[SourceBlock]) -> None:
@@ -326,15 +326,15 @@ class WatchedActuators:
         """
         rows = StoredRows()
         with self.store.writing() as connection:
-            assigned = [(block, self._actuator(block.actuator)) for block in blocks]
-            numbers = {actuator.settings.name: itertools.count(actuator.n_stored + 1) for _, actuator in assigned}
-            numbered = [(block.actuator, block.identity, next(numbers[block.actuator])) for block in blocks]
-            if numbered:
+            pairs = [(block, self._actuator(block.actuator)) for block in blocks]
+            numbers = {actuator.settings.name: itertools.count(actuator.n_stored + 1) for _, actuator in pairs}
+            identities = [(block.actuator, block.identity, next(numbers[block.actuator])) for block in blocks]
+            if identities:
                 try:
-                    self.store.insert_blocks(connection, numbered)
+                    self.store.insert_blocks(connection, identities)
                 except IntegrityError:
                     raise _AlreadyStored from None
-            for block, actuator in assigned:
+            for block, actuator in pairs:
                 actuator.n_stored += 1
                 if block.samples is not None:
                     self._add_samples(rows, actuator, block, block.samples)
@@ -383,9 +383,9 @@ class WatchedActuators:
     def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
         """Apply a person's mark to an actuator's alarm, and store it in one transaction.
 
-        `mark`: one of `MARKS`; ``invalid``, for the reason `text`, dismisses the leak, ``repaired`` also learns a new
-        baseline; ``shelved`` announces nothing for `hours`. The mark is also written to the file of a commissioned
-        machine (`record_mark`), and an event states the result. Raises InputError if there is no such alarm.
+        `mark`: one of `MARKS`. ``invalid`` withdraws the leak for the reason `text`; ``repaired`` withdraws it and
+        learns a new baseline; ``shelved`` silences the alarm for `hours`. The mark is also written to the file of a
+        commissioned machine (`record_mark`), and an event states the result. Raises InputError without an open alarm.
         """
         if len(text) > _MAX_COMMENT_LENGTH or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_MAX_COMMENT_LENGTH} characters, a name 80")
@@ -432,11 +432,11 @@ class WatchedActuators:
 
         Its state is "no data" if no block has come for `no_data_s` and no leak is announced.
         """
-        known, now = self.store.summaries(), time.monotonic()
+        stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}
         for name, settings in self.settings.items():
-            if name in known:
-                summary, state = known[name], known[name].get("state")
+            if name in stored_summaries:
+                summary, state = stored_summaries[name], stored_summaries[name].get("state")
                 is_silent = now - self._last_block_clock[name] > settings.no_data_s
                 if state is None or (is_silent and state["condition"] not in LEAKING):
                     state = state_of("no data", since_s=summary["t"]).as_dict()

@@ -80,7 +80,7 @@ class Alarm:
 
     @property
     def condition(self) -> str:
-        """The condition of NE 107 that the alarm stands for."""
+        """The NE 107 condition of the machine while the alarm is active, else "watched"."""
         return _CONDITIONS[self.level] if self.active else "watched"
 
     @property
@@ -92,8 +92,8 @@ class Alarm:
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain values, with the machine state and diagnostic number derived from them."""
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
-        derived = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
-        return {**vars(self), **derived, "machine_state": machine_state.as_dict()}
+        derived_values = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
+        return {**vars(self), **derived_values, "machine_state": machine_state.as_dict()}
 
 
 @dataclass
@@ -116,11 +116,12 @@ class AlarmJudge:
     def update(
         self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with a block; return it and its event, None if nothing changed.
+        """Update the alarm with a block; return (alarm, event), None if no alarm is active or the block is not judged.
 
-        The event is "raised", "error", "warning", "returned" or "". A leak without L/min is a warning; blocks that are
-        not judged change nothing. A leak that returns before anybody saw the alarm continues that alarm. `leak` is None
-        during an alarm if the detector was restarted; the alarm then stays, for the leak may last.
+        The event is "raised", "error", "warning", "returned" or "". `baseline`: version of the healthy baseline;
+        `leak`: the leak that the watch knows. It is None during an alarm if the detector was restarted; the alarm then
+        stays, for the leak may last. A leak without L/min is a warning. A leak that comes back before anybody has
+        acknowledged its alarm raises the same alarm again.
         """
         if not estimate.judged:
             return None
@@ -172,7 +173,7 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise a new alarm with these fields, or raise again the one whose cause had ended; return it."""
+        """Raise an alarm with the fields `findings`, or again the open one whose cause had ended; return the alarm."""
         self.raised += self.alarm is None
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
         id = f"{self.actuator}-{self.raised}"
@@ -182,10 +183,10 @@ class AlarmJudge:
     def update_from_verdict(
         self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with the verdict on a whole recording; return the same as `update`.
+        """Update the alarm with the verdict on a whole recording; return (alarm, event) as `update` does.
 
         A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the recording
-        before, of verdict `earlier`, leaks as well. The first recording without a leak ends the alarm.
+        before, of verdict `earlier`, leaks as well. `no leak`, or a leak below the warning threshold, ends it.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -221,7 +222,7 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Set the open alarm, None if it is closed or invalid, and the time at which its cause ended; return it."""
+        """Store the alarm as the open one, unless it is over, and the time at which its cause ended; return it."""
         if not alarm.active:
             self.over_s = alarm.updated_s
         self.alarm = None if alarm.is_over else alarm

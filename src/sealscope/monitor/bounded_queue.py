@@ -10,7 +10,7 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Blocks that wait to be stored, their bytes, and how often a source had to wait because the queue was full."""
+    """Numbers of blocks and of bytes waiting to be stored, and of times that a source waited for a full queue."""
 
     n_blocks: int = 0
     n_bytes: int = 0

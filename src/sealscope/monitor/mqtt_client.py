@@ -11,7 +11,7 @@ from sealscope.errors import MissingExtra
 from sealscope.monitor.settings import BrokerSettings
 
 _log = logging.getLogger(__name__)
-_log.setLevel(logging.WARNING)  # paho tells each packet
+_log.setLevel(logging.WARNING)  # paho logs each packet
 #: Silence after which the client pings the broker [s]; the connection counts as lost half of it later.
 KEEP_ALIVE_S = 20
 #: Topic and payload.
@@ -27,7 +27,7 @@ def check_mqtt() -> None:
 
 
 class MqttLink:
-    """A connection to a broker by MQTT 5; paho's `client` leaves acknowledging messages to its user.
+    """A connection to a broker by MQTT 5, through paho's `client`; its user must acknowledge the received messages.
 
     `will`: returns topic and payload of the last will, which the broker publishes when the connection is lost; called
     before each connection. `close` publishes the same. `retain`: whether the broker retains the will.
@@ -65,7 +65,7 @@ class MqttLink:
             client.will_set(*self._last_will, qos=1, retain=self._retain)
 
     def open(self, **options: Any) -> None:
-        """Connect in a background thread, which reconnects whenever the connection is lost."""
+        """Connect, with `options` of paho's `connect_async`, in a thread that reconnects after each lost connection."""
         self.client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, **options)
         self.client.loop_start()
         self.is_open = True
@@ -77,7 +77,7 @@ class MqttLink:
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message; return whether it was sent in time, and with a `qos` of 1 acknowledged by the broker."""
+        """Publish a message with paho's `options`; return True if it was sent, with `qos` 1 acknowledged, in time."""
         message = self.client.publish(topic, payload, **options)
         try:
             message.wait_for_publish(_PUBLISH_TIMEOUT_S)

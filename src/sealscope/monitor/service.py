@@ -95,7 +95,7 @@ class Service:
             raise
 
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
-        """Queue a block for storage, or log and count a refused message; block while the queue is full."""
+        """Queue a block or a refused message for storage, counting the latter; wait while the queue is full."""
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
             self._refused += 1
@@ -189,8 +189,8 @@ class Service:
                 self._unstored += self._queue.pop(_MAX_TRANSACTION_BLOCKS - len(self._unstored), 0.0)
         blocks = [block for block in self._unstored if isinstance(block, SourceBlock)]
         self._store(blocks, self.actuators.process_blocks)
-        refused = [block for block in self._unstored if isinstance(block, RefusedMessage)]
-        self._store(refused, lambda messages: self.store.write_refused([message.row() for message in messages]))
+        refusals = [block for block in self._unstored if isinstance(block, RefusedMessage)]
+        self._store(refusals, lambda messages: self.store.write_refused([message.row() for message in messages]))
         self._n_sources -= self._unstored.count(None)  # those that have ended
         self._unstored = []
 
@@ -227,8 +227,8 @@ class Service:
         else:
             self._is_database_blocked = False
             self._database.end_outage()
-        finished = set(map(id, blocks))  # stored or dropped
-        self._unstored = [block for block in self._unstored if id(block) not in finished]
+        finished_ids = set(map(id, blocks))  # stored or dropped
+        self._unstored = [block for block in self._unstored if id(block) not in finished_ids]
         for block in blocks:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 

@@ -39,7 +39,12 @@ class _Part(BaseModel):
 
 
 class WatchSettings(_Part):
-    """Settings of a watched actuator."""
+    """Settings of a watched actuator.
+
+    `debounce_blocks`: successive blocks beyond a threshold after which the alarm changes; `return_share`: fraction of a
+    threshold below which the leak counts as ended; `no_data_s`, `not_comparable_s`: time without a block, and without a
+    judged one, after which the state of the actuator says so.
+    """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
@@ -53,7 +58,7 @@ class WatchSettings(_Part):
 
     @property
     def watched_with(self) -> WatchSettings:
-        """The settings without name and source."""
+        """The settings of the watch alone, without the actuator's name and source of samples."""
         return WatchSettings(**{name: getattr(self, name) for name in WatchSettings.model_fields})
 
 
@@ -74,7 +79,11 @@ class SimulateSettings(_Part):
 
 
 class ActuatorSettings(WatchSettings):
-    """An actuator: its name, the source of its samples, and settings that differ from the defaults."""
+    """An actuator: its name, the source of its samples, and settings that differ from the defaults.
+
+    `map`: channel -> column of the files or metric of Sparkplug; `sparkplug`: "group/node" or "group/node/device";
+    `rate`: sampling rate [Hz]; `nodes`: channel -> OPC UA node; `units`: channel -> unit of values that state none.
+    """
 
     name: _Text
     folder: _File | None = None
@@ -111,9 +120,9 @@ class ActuatorSettings(WatchSettings):
         columns = {} if isinstance(watched.channel_map, str) else dict(watched.channel_map)
         units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
         needs_units = units and (values.get("nodes") or values.get("sparkplug"))
-        of_machine = {"map": columns or None, "rate": watched.rate, "error_lpm": watched.limit_lpm}
-        of_machine |= {"units": units if needs_units else None}
-        return {**{name: value for name, value in of_machine.items() if value is not None}, **values}
+        machine_values = {"map": columns or None, "rate": watched.rate, "error_lpm": watched.limit_lpm}
+        machine_values |= {"units": units if needs_units else None}
+        return {**{name: value for name, value in machine_values.items() if value is not None}, **values}
 
 
 class PageSettings(_Part):
@@ -126,7 +135,11 @@ class PageSettings(_Part):
 
 
 class BrokerSettings(_Part):
-    """The MQTT broker."""
+    """The MQTT broker.
+
+    `alarms_topic`: topic under which alarms and states are published, None for none; `host_id`: identity of
+    the monitor as a primary host of Sparkplug, None if it is not one.
+    """
 
     host: _Text = "localhost"
     port: int = Field(default=1883, ge=1, le=65535)
@@ -140,7 +153,7 @@ class BrokerSettings(_Part):
 
 
 class OpcUaSettings(_Part):
-    """The OPC UA server."""
+    """The OPC UA server; `security`: security string of asyncua, None for none; `block_s`: length of a block [s]."""
 
     url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
     user: str | None = None
@@ -151,7 +164,7 @@ class OpcUaSettings(_Part):
 
 
 class SparkplugSettings(_Part):
-    """The Sparkplug B edge node that publishes the alarms."""
+    """The Sparkplug B edge node that publishes the alarms, and changed values every `every_s` [s]."""
 
     group: _Level = "Sealscope"
     node: _Level = "monitor"
@@ -196,8 +209,8 @@ class MonitorSettings(_Part):
             if any(isinstance(part, dict) and rate in part for part in (defaults, *actuators)):
                 raise ValueError(f"state {rate} of actuators, or fleet_{rate}, which they share in equal parts")
             defaults = {**defaults, rate: budget / len(actuators)}
-        merged = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
-        return {**values, "actuator": merged}
+        merged_tables = [{**defaults, **actuator} if isinstance(actuator, dict) else actuator for actuator in actuators]
+        return {**values, "actuator": merged_tables}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> MonitorSettings:

@@ -54,7 +54,7 @@ class SparkplugMetric:
     unit: str | None = None
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
-        """Return the metric with its transmitted value converted from a data type, to None for unsupported types."""
+        """Convert the transmitted value to a data type; an array of an unsupported type becomes None."""
         value = self.value
         if isinstance(value, bytes):
             dtype = _ARRAYS.get(datatype)
@@ -170,5 +170,5 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Return the topic of a message; `kind`: such as ``NBIRTH``."""
+    """Build the topic of a message of `kind`, such as ``NBIRTH``, of a node or of one of its devices."""
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

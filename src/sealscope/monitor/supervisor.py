@@ -38,8 +38,8 @@ class PartAway(Exception):  # noqa: N818 (says what happened)
 class SupervisedPart:
     """A part of a monitor, or a service that it uses: its outages, and the pause after an error.
 
-    Several threads may report outages; one at a time calls `attempt`. `since`: start of the present outage [s since
-    1970], None if there is none; `count`: number of outages so far; `seconds`: total length of the past ones [s].
+    Several threads may report outages, but only one at a time may call `attempt`. `since`: start of the present outage
+    [s since 1970], None if there is none; `count`: number of outages so far; `seconds`: total length of past ones [s].
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
@@ -81,7 +81,7 @@ class SupervisedPart:
         return max(0.0, self._due - time.monotonic())
 
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
-        """Run work unless the part pauses; return whether it ran without an error.
+        """Run `work` unless the part pauses; return True if it ran without an error.
 
         An error begins an outage and a pause, twice as long as the one before. `at_once`: ignore the pause.
         """
@@ -135,16 +135,16 @@ class Supervisor:
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return the availability, the number of outages and their total length [s] of each part."""
+        """Return for each part whether it is reached, its number of outages, and their total length [s]."""
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
     def start(self, name: str, work: _Work, *, restart: bool = True, on_end: _Work = lambda: None) -> threading.Thread:
-        """Start a thread that runs work, if `restart` again after each error, and that finally calls `on_end`."""
+        """Start a thread that runs `work`, with `restart` again after each error, and finally calls `on_end`."""
         part = self.part(name)
 
         def work_with_timer() -> None:
-            """Run work; once it has run for `_WORKING_S` the part's outage has ended."""
+            """Run `work`, and end the outage of the part once it has run for `_WORKING_S`."""
             timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()

@@ -1,8 +1,8 @@
 """Verdicts on whole recordings: a watched folder's files are judged against their machine's healthy recordings.
 
 The verdict is that of `sealscope diagnose --machine`. Page, metrics and messages state it as the actuator's result; the
-chart shows the blocks. Compared with healthy recordings, a leak shows that is present from the first sample on; a watch
-that learns from the same samples cannot see it.
+chart shows the blocks. The comparison with healthy recordings finds leaks that are present from the first sample on; a
+watch that learns from the same samples cannot find them.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _FALSE_ALARM = VERDICT.false_alarm
 class RecordingVerdict:
     """The verdict on one recording, on the clock of the monitor, as plain values for the database.
 
-    `file`: name of the file; `summary`, `size`, `odds`: texts of `diagnose` for the verdict, for the leak's size or
-    bound, and for the fraction of healthy recordings that look like this; `reason`, `cause`: as in a Diagnosis;
+    `file`: name of the file; `summary`, `size`, `odds`: texts of `diagnose` for the verdict, the size or bound of the
+    leak, and the fraction of healthy recordings that look like it; `reason`, `cause`: as in a Diagnosis;
     `state`: of NE 107; `start_s`, `end_s`: times of the first and last sample [s]; `onset_s`, `onset_interval_s`: start
     of the leak [s], None if it leaks from the first sample, or not at all; `leak_lpm`, `total_lpm` with their 95 %
     intervals, `bound_lpm` [L/min]: None if not stated; `chance`: probability that a leak-free recording scores as high;
@@ -94,7 +94,7 @@ class RecordingVerdict:
 
     @property
     def clears(self) -> bool:
-        """Test whether the verdict is that nothing leaks."""
+        """Test whether the verdict is "no leak"."""
         return bool(self.verdict == NO_LEAK)
 
     @property
@@ -103,12 +103,13 @@ class RecordingVerdict:
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Test whether the chance is at most the number of false alarms allowed in this recording's time.
+        """Test whether a leak-free recording scores as high no more often than the allowed rate of false alarms.
 
-        `false_alarms_per_1000_h`: the allowed rate; `rarest` of `priors.toml` is the smallest chance that can be known.
+        The limit of `chance` is the rate times the length of the recording, but at least `rarest` of `priors.toml`, the
+        smallest chance that can be known. True if `chance` is None.
         """
-        allowed = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
-        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed)
+        allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
+        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
@@ -124,7 +125,7 @@ class RecordingVerdict:
         return RecordingVerdict(self.file, CANNOT_TELL, state=state, start_s=start_s, end_s=end_s, **texts)
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Replace the leak of a block's estimate by the recording's leak from its onset on, else by its bound."""
+        """Replace the leak of a block by the recording's; before its onset, or without a leak, by the bound alone."""
         lpm, interval = self.leak_lpm, self.leak_interval_lpm
         if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):
             lpm, interval = None, None if self.bound_lpm is None else (0.0, self.bound_lpm)

@@ -13,13 +13,13 @@ class HydraulicCircuit(NamedTuple):
     name : str
         Name in messages.
     valve_controlled : bool
-        A servo valve with a supply of constant pressure meters a flow into each chamber. Else the flow is the pump's.
+        A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
     pump_feeds_chambers : bool
-        The pump's delivery flows into A and what leaves B returns to the pump: one balance of volumes holds for both.
+        The pump delivers into chamber A and draws from B, or the reverse: one balance of volumes holds for both.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
-        Both chambers are shut while the command rests at zero, so that a load creeps by what leaks alone.
+        Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
     """
 
     name: str

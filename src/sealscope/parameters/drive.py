@@ -106,7 +106,7 @@ class MakeUp(Part):
     """Accumulator, with check and relief valves between it and each side; `check_valves = "absent"`: none.
 
     The accumulator holds the charge pressure at the start. Check valves feed the circuit; pilot-operated ones, which
-    the pressure of the other side opens, also let oil back: what the rod of a single-rod cylinder displaces.
+    the pressure of the other side opens, also let the oil back that the rod of a single-rod cylinder displaces.
     """
 
     check_valves: Literal["absent", "present", "pilot-operated"] = choice("make-up from an accumulator in the model")

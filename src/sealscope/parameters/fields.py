@@ -26,7 +26,7 @@ def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: flo
 
 
 def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a choice between readings of the source, or between laws; the annotation is a Literal of the values.
+    """Declare a choice, such as between laws, by its human `name`; the field's annotation is a Literal of its values.
 
     `absent`: the value for a rig whose file does not state the choice.
     """

@@ -56,7 +56,7 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
         Name of a packaged rig (`sealscope parameters` lists one), or path of a TOML file with value, unit and source
         for each parameter; a Rig is returned as it is. A file may say ``[rig] extends = "thesis"`` (or the path of
         another file) and then states only the values that differ; a table ``[map]`` names the columns of the machine's
-        logs (``p_A = "PG_1[psi]"``). The file of a commissioned machine is one, too.
+        logs (``p_A = "PG_1[psi]"``). The file of a commissioned machine is such a file, too.
 
     Returns
     -------
@@ -141,7 +141,7 @@ class _RigFile(NamedTuple):
 
 
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
-    """Read a rig's file over the rig that it extends, whose entries and columns it replaces.
+    """Read a rig's file and the files that it extends, whose entries and columns it replaces.
 
     `place` names the file in messages; `visited`: the files that led to it.
     """

@@ -137,11 +137,11 @@ class Rig(Part):
             )
         self._check_valve()
         self._check_lines()
-        displaced = abs(cylinder.A_A - cylinder.A_B) * cylinder.L
-        if makeup.check_valves == "pilot-operated" and makeup.V_gas <= displaced:
+        displaced_volume = abs(cylinder.A_A - cylinder.A_B) * cylinder.L
+        if makeup.check_valves == "pilot-operated" and makeup.V_gas <= displaced_volume:
             raise ValueError(
                 f"makeup.V_gas must be > the oil that the rod displaces over the stroke, |A_A - A_B| L = "
-                f"{with_unit(displaced, 'm^3')}, got {with_unit(makeup.V_gas, 'm^3')}"
+                f"{with_unit(displaced_volume, 'm^3')}, got {with_unit(makeup.V_gas, 'm^3')}"
             )
         if friction.law != "stribeck" and (friction.coulomb_pressure != "sum" or friction.F_pr <= 0):
             raise ValueError(
@@ -151,7 +151,7 @@ class Rig(Part):
         return self
 
     def _check_valve(self) -> None:
-        """Check that a servo valve has a supply, a supply a valve, and both a rig that suits them; else ValueError."""
+        """Check that servo valve and supply come together and suit the rest of the rig; raise ValueError otherwise."""
         valve, supply = self.valve, self.supply
         if self.circuit.valve_controlled != (supply.drive != "absent"):
             raise ValueError(
@@ -252,7 +252,7 @@ class Rig(Part):
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
-        """Return the same rig with all values marked as assumed, for a reason that their sources state."""
+        """Return the same rig with all values marked as assumed; `reason` becomes part of their sources."""
         entries = {name: entry._replace(source=f"{ASSUMED} {reason}") for name, entry in self._stated_entries().items()}
         rig = Rig.from_entries(entries, name=self._name, title=self._title, place=self._name)
         return rig.with_channel_map(self.channel_map)
@@ -453,7 +453,7 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Return the value and unit of an override: a number in SI, or a text with its unit or of a choice."""
+    """Parse an override, a number in SI or a text; return its SI value or choice, and its unit ("" for a choice)."""
     field = declared_fields()[full_name]
     if choices_of(field):
         return (value.strip() if isinstance(value, str) else value), ""

@@ -93,7 +93,7 @@ def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, valu
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the one type of lanes among argument types, all others being plain numbers; None for any other mixture."""
+    """Find the type of lanes in a mixture of lanes and plain numbers; None without lanes and for any other mixture."""
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
@@ -289,7 +289,7 @@ _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _is_array_of_lanes(array: Any) -> bool:
-    """Test whether the rows of an array of this type can be loaded as lanes."""
+    """Return True if the rows of an array of this type can be loaded as lanes."""
     return isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
 
 
@@ -332,7 +332,7 @@ def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def _stored_type(arg_types: Any) -> Any:
-    """Return the type of `store`'s result, which is none, or None if the array does not contain such lanes."""
+    """Return numba's type `none`, the result of `store`, or None if the array cannot contain such lanes."""
     return types.none if _loaded_type(arg_types) == arg_types[2] else None
 
 

@@ -82,8 +82,8 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Compute the flow Q [m^3/s] of a one-way throttle in an implicit stage, from d + g Q(d) = total.
 
-    d [Pa] is the throttle's pressure difference at the stage's end, `total` [Pa] that without the flow, and g Q
-    (`g` >= 0 [Pa s/m^3]) what the flow takes off it. The root is unique and has the sign of `total`.
+    d [Pa]: pressure difference of the throttle at the stage's end; `total` [Pa]: the same if nothing flowed; `g` >= 0
+    [Pa s/m^3]: its fall per flow. The root is unique and has the sign of `total`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)
@@ -126,5 +126,5 @@ def filtered_flow(
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute the magnitude [m^3/s] of the flow through a filter itself, out of Q through filter and bypass valve."""
+    """Compute the magnitude [m^3/s] of a filter's flow, if Q [m^3/s] divides between filter and bypass valve."""
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

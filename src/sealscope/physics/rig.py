@@ -114,9 +114,9 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
     """Compute the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "Closed" is a fraction of the area (`exponent` 1, eq. 4.8) or of the diameter (2, the text). Metering "meter-out":
-    free flow towards the cylinder and throttled return on both sides (the text and Appendix A); `literal`: as eqs.
-    (4.9)-(4.12) are printed, side B the other way round. Shut-off valves are in series (`series_coefficient`).
+    `exponent`: 1 if the closed fraction is of the area (eq. 4.8), 2 if of the diameter (the text). `literal` False: on
+    both sides the flow towards the cylinder is free and the return throttled (the text and Appendix A); True: side B is
+    the other way round, as eqs. (4.9)-(4.12) are printed. Shut-off valves are in series (`series_coefficient`).
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -190,7 +190,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the type of the record of `pack_numbers`; `lengths`: those of the tuples of `LAWS`."""
+    """Build the type of the record that `pack_numbers` returns; `lengths`: of the tuple of each law in `LAWS`."""
     truths = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
     return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
@@ -209,7 +209,7 @@ def pack_numbers(p: RigNumbers) -> Any:
 
 @contracted
 def limit_state(y: State, p: RigNumbers) -> State:
-    """Limit current and spool in the state after a step, and set the states that the rig does without.
+    """Limit motor current and spool in the state after a step, and overwrite the states that the rig does not use.
 
     Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's pressure. States that no law of the
     rig changes are set to 0, so that the compiler removes them.
@@ -249,7 +249,7 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's set speed, by the command u [V] or the supply's constant one, minus its speed [rad/s]."""
+    """Compute the motor's speed error [rad/s]: set speed, of the command u [V] or of a supply, minus actual speed."""
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -266,7 +266,7 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction [N] on the piston by the rig's law, and the rate [m/s] of LuGre's bristles, else 0.
+    """Compute the friction [N] on the piston by the rig's law, and LuGre's bristle rate [m/s], 0 for other laws.
 
     `applied` [N]: sum of all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
     """
@@ -300,9 +300,10 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 def implicit_flows(
     total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
 ) -> tuple[float, float]:
-    """Compute the flows Q_A, Q_B [m^3/s] of throttles and filters in an implicit stage, d + g Q(d) = total each.
+    """Compute the flows Q_A, Q_B [m^3/s] through throttles and filters from d + g Q(d) = total on each side.
 
-    A filter in series with its throttle, p_1 - p_A = d + R Q, adds R to g.
+    `total` [Pa], `g` [Pa s/m^3], d: see `implicit_orifice_flow`. A filter in series with its throttle, p_1 - p_A =
+    d + R Q, adds R to g.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -371,10 +372,10 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
 
 @contracted
 def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the volume flows [m^3/s] out of the source and into the sink, at their pressures `source`, `sink` [Pa].
+    """Compute the volume flows [m^3/s] out of a source and into a sink at the pressures `source` and `sink` [Pa].
 
-    `Q` [m^3/s] is the flow at the pressure it comes from (the sink's for Q < 0); at the other end it is that of the
-    same mass, rho_in Q_in = rho_out Q_out. If the rig balances volumes, both flows are Q.
+    `Q` [m^3/s] is the flow at the upstream end, which is the sink for Q < 0. The flow at the other end carries the same
+    mass, rho_in Q_in = rho_out Q_out. If the rig balances volumes, both flows are Q.
     """
     if len(p.conserving) == 0:
         return Q, Q
@@ -431,9 +432,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the part of the pressure rates due to external leakage and make-up, and the make-up's flow.
+    """Compute the part of dp_A/dt .. dp_2/dt [Pa/s] due to external leakage and make-up, and the make-up's flow.
 
-    Rates of p_A, p_B, p_1, p_2 [Pa/s]; flow out of the accumulator [m^3/s] at its pressure.
+    The flow [m^3/s] is that out of the accumulator, at its pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -576,7 +577,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Compute the outputs (`OUTPUTS`) of a state into `row`; arguments as in `rates_without_throttles`."""
+    """Write the outputs (`OUTPUTS`) of a state to `row` (21,); arguments as in `rates_without_throttles`."""
     for m in range(len(y)):
         row[m] = y[m]
     row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)

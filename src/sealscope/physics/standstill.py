@@ -33,8 +33,8 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
 
-    With a make-up the lower one is the charge pressure. Without one the circuit contains as much oil as with the charge
-    pressure throughout: the mean of both pressures, weighted by the volumes of the sides, is the charge pressure.
+    With a make-up the lower pressure is the charge pressure. Without one the circuit contains as much oil as with the
+    charge pressure throughout: the mean of both pressures, weighted by the sides' volumes, is the charge pressure.
     """
     if p.made_up:
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
@@ -52,8 +52,8 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     """Write the standstill of a pump-controlled rig at x [m] under `force` [N] against +x into a state `y` of zeros.
 
-    The motor holds the pump with the current i = T_load/C_m, eq. (4.5), which the speed controller's integral R_c i/K_i
-    gives, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`, `BEYOND_DRIVE`.
+    The motor holds the pump with the current i = T_load/C_m, eq. (4.5), for which the integral of the speed controller
+    is R_c i/K_i, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`, `BEYOND_DRIVE`.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -99,7 +99,7 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """Compute the state (14,) at standstill with the piston at x_0 [m] from mid-stroke, under its load and `push` [N].
+    """Compute the state (14,) at standstill with the piston at x_0 [m], under the rig's load and `push` [N] against +x.
 
     The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`).
     Without load and with equal areas all pressures are the charge pressure and all else is 0. With a servo valve at

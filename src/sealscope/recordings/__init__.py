@@ -40,7 +40,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Import a module with heavy dependencies when its name is first used."""
+    """Import a public name from its module when it is first used, as these modules have heavy dependencies."""
     from importlib import import_module
 
     if name in _HOMES:

@@ -61,16 +61,16 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     if negative.size == 0:
         return None
     first = int(negative[0])  # peaks are searched for after the first negative value
-    later = correlation[first + 1 : max_lag - 1]
-    peaks = np.flatnonzero((later >= correlation[first : max_lag - 2]) & (later > correlation[first + 2 : max_lag]))
-    peaks = peaks[later[peaks] >= _CYCLE.correlation]
+    tail = correlation[first + 1 : max_lag - 1]
+    peaks = np.flatnonzero((tail >= correlation[first : max_lag - 2]) & (tail > correlation[first + 2 : max_lag]))
+    peaks = peaks[tail[peaks] >= _CYCLE.correlation]
     if peaks.size == 0:
         return None
     # the first of the nearly highest peaks: later ones are at multiples of the period
-    first_high = peaks[later[peaks] >= later[peaks].max() - _EQUAL_PEAKS][0]
+    first_high = peaks[tail[peaks] >= tail[peaks].max() - _EQUAL_PEAKS][0]
     k = int(first + 1 + first_high)
-    before, peak, after = correlation[k - 1 : k + 2]  # the vertex of the parabola through them
-    lag = (k + 0.5 * (before - after) / (before - 2 * peak + after)) * stride / rate
+    left, peak, right = correlation[k - 1 : k + 2]  # the vertex of the parabola through them
+    lag = (k + 0.5 * (left - right) / (left - 2 * peak + right)) * stride / rate
     return float(lag) if lag >= _MIN_PERIOD else None
 
 

@@ -49,7 +49,7 @@ _MAX_NESTING = 3
 
 
 def _detect_format(path: Path) -> str:
-    """Detect the format of a file, or its kind of archive, from its content; raise UnreadableFile if it is not read."""
+    """Detect the format, or kind of archive, of a file from its content; raise UnreadableFile if it cannot be read."""
     try:
         with open_regular(path, "a recording") as file:
             head = file.read(SNIFF)
@@ -77,7 +77,7 @@ def _detect_format(path: Path) -> str:
 
 
 def _format_function(kind: str, verb: str) -> Callable[..., Any]:
-    """Return the function ``read_KIND`` or ``write_KIND`` of a format; this imports its library."""
+    """Import ``read_KIND`` or ``write_KIND`` from the module of the format `kind`; `verb`: "read" or "write"."""
     module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind]['module']}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
@@ -100,11 +100,11 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     path : str or path
         The file. Its content tells the format.
     map : mapping of str to str or "auto", optional
-        Channel (or ``t``) -> name of the file's column, or name and unit, as in ``{"p_A": "PG_1[psi]"}``, or number,
-        as in ``{"p_A": "#2"}``, or a constant plus columns times factors and the unit, as in
-        ``{"p_A": "ch2*0.0625-0.625 bar"}``. A unit at the end of the column's name is read, as in ``p_bottom_bar``; a
-        column without one is raw counts. ``"auto"`` chooses by the columns' names and units, in several languages;
-        the history lists the choice. ``{"*": "auto", ...}`` does so for the channels that the mapping does not name.
+        Channel (or ``t``) -> column of the file: its name (``{"p_A": "PG_1"}``), its name and unit (``"PG_1[psi]"``),
+        its number (``"#2"``), or a constant plus columns times factors and their unit (``"ch2*0.0625-0.625 bar"``).
+        A unit at the end of the column's name is read, as in ``p_bottom_bar``; a column without one is raw counts.
+        ``"auto"`` chooses by the columns' names and units, in several languages; the history lists the choice.
+        ``{"*": "auto", ...}`` does so for the channels that the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
 
@@ -161,7 +161,7 @@ def read_parts(
     Yields
     ------
     Recording
-        The next part. If the file has time stamps it has its own start; other times continue from part to part.
+        The next part. Time stamps give each part its own start; other times continue from part to part.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the file, or the file packed in it, and its format; errors in a packed file name the archive, too."""
+    """Yield path and format of a file, or of the file in an archive, whose errors also name the archive."""
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0

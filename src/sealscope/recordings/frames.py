@@ -63,7 +63,7 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
 
 
 def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
-    """Convert a column to datetime64, timedelta64, doubles or texts; raise InputError for other types."""
+    """Convert a column to datetime64, timedelta64, doubles or texts; `dtypes`: the module pandas.api.types."""
     if dtypes.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)

@@ -54,7 +54,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array) -> bool:
-    """Test whether the mean square third difference is near 20 times the variance, its value for white noise."""
+    """Test whether the mean square third difference exceeds `noise` (prior) times 20 variances; white noise has 20."""
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
 

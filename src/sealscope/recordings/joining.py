@@ -41,9 +41,9 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Return the time of the first sample of a file's recording [s since 1970], for all commands by the same rule.
+    """Find the time of the first sample of a file's recording [s since 1970].
 
-    Taken from the file, else from its name, else from its modification time, taken as the time of the last sample.
+    Taken from the provenance, else from the file's name, else from its modification time, as that of the last sample.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -68,7 +68,7 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Return the time of t = 0 [s] on the clock of the provenance; None if it is not known."""
+    """Return the time of t = 0 [s since 1970] that the provenance states; None if it states none."""
     epoch = recording.provenance.get("start_epoch_s")
     return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
 
@@ -91,8 +91,8 @@ def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> 
 def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None) -> Recording:
     """Join recordings of one run to a single recording.
 
-    Each recording must begin after the previous one has ended, according to the start times of the files or, if these
-    are not known, to times that continue. Time that was not recorded in between stays a gap, which `inspect` reports.
+    Each recording must begin after the previous one has ended: by the start times of the files or, if these are not
+    all known or are equal, by the times `t`. Time between recordings stays a gap, which `inspect` reports.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ def is_moving(values: Array) -> bool:
 class Holds(NamedTuple):
     """The held samples of a pressure.
 
-    `flags` (n,): True for held samples; `pending`: index of the first sample that may yet become held.
+    `flags` (n,): True for held samples; `pending`: index of the first sample that later samples may show to be held.
     """
 
     flags: NDArray[np.bool_]
@@ -128,7 +128,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Compute the fraction of unchanged samples from `begin` to `end` (k,), one of each kind added."""
+        """Compute the fraction of unchanged samples from `begin` to `end` (k,), estimated as (m + 1) / (n + 2)."""
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

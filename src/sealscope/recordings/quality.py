@@ -62,7 +62,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
     Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
     ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
-    ``clipped``, ``stuck``, ``mains_hum``, ``raw_counts``; of both chambers: ``creeping_pressures``.
+    ``impossible``, ``clipped``, ``stuck``, ``mains_hum``, ``raw_counts``; of both chambers: ``creeping_pressures``.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     Raises
     ------
     InputError
-        If the call has another argument.
+        If the argument is missing, or there is another one.
 
     Examples
     --------
@@ -268,7 +268,7 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Return k >= 2 if only every k-th row has a value, as for a slower channel, else 0; `present`: row indices."""
+    """Return k >= 2 if only every k-th row has a value, else 0; `present`: indices of the rows with a value."""
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
     is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
@@ -309,7 +309,7 @@ def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
 class Rail(NamedTuple):
     """Samples at one end of a clipped channel.
 
-    `side`: `low` or `high`; `value` at that end; `samples`: how many have it; `first`: index of the first.
+    `side`: `low` or `high`; `value`: at that end; `samples`: number with this value; `first`: index of the first.
     """
 
     side: str

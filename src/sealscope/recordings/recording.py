@@ -40,7 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Convert values to read-only doubles; a read-only array of doubles that is no view is not copied."""
+    """Copy values to a read-only array of doubles, unless they are one that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -50,7 +50,7 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A result that the first thread computes and others wait for."""
+    """A result that the first thread computes and other threads wait for; `known`: it is computed."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -188,13 +188,13 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the measured pressures, positions, speeds and flows in its file that are in no channel."""
+        """Names of the file's columns of measured pressures, positions, speeds and flows that no channel uses."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
     @property
     def remarks(self) -> dict[str, str]:
-        """Entries in the header of its file, such as operator, machine and oil temperature."""
+        """Entries in the header of the recording's file, such as operator, machine and oil temperature."""
         return clean_remarks(self.provenance)
 
     def unit_in_log(self, name: str) -> str | None:
@@ -238,7 +238,7 @@ class Recording:
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
-        """Return values and units of the time, `t`, and the channels, and a description in JSON values.
+        """Return the values and the units of the time, `t`, and the channels by name, and a description of JSON values.
 
         The description contains rate, provenance and history. Raises InputError for values that JSON does not have.
         """
@@ -248,7 +248,7 @@ class Recording:
         return {"t": self.t, **self.channels}, {"t": "s", **self.units}, description
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return a data frame of copies: index ``t [s]``, columns such as ``p_A [Pa]``.
+        """Copy the recording to a data frame with the index ``t [s]`` and columns such as ``p_A [Pa]``.
 
         Its ``attrs`` contain the units by column, the rate, the provenance and the history, which `from_pandas` reads.
         Raises MissingExtra without pandas, and InputError if the provenance has values that JSON does not have.
@@ -258,7 +258,7 @@ class Recording:
         return to_pandas(*self.series())
 
     def to_xarray(self) -> xarray.Dataset:
-        """Return a data set of copies over the coordinate ``t``, with the variables and attributes of NetCDF files.
+        """Copy the recording to a data set over the coordinate ``t``, with variables and attributes as in NetCDF files.
 
         Raises MissingExtra without xarray, and InputError if the provenance has values that JSON does not have.
         """

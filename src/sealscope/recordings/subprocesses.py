@@ -154,7 +154,7 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit time [s], memory and disk [bytes] of this process, which then ends even if its parent is dead."""
+    """Limit this process's time [s] (0: none), memory and files [bytes]; it then ends even if its parent is dead."""
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
         import resource

@@ -79,13 +79,13 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """Text of the level in the chart's key, with a remark if it lies above the frame."""
+        """Text of the repair limit in the chart's legend, with a remark if the limit lies above the frame."""
         is_above = self.level is not None and self.limits is not None and self.level > self.limits[1]
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if is_above else "")
 
     @property
     def is_cut(self) -> bool:
-        """True if values lie beyond the limits."""
+        """True if values lie beyond the limits of the axis."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
@@ -93,7 +93,8 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel (n,) to its display unit; return the unit and the values.
 
-    It is `pressure_unit` for pressures, counts for raw counts, otherwise that of the log, and degC for temperatures.
+    Pressures are in `pressure_unit`, raw counts in counts; other channels are in the unit of the log, or if it states
+    none, in degC, mm, rpm, L/min or SI.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -105,7 +106,7 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 
 
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Return the display unit of a channel in `unit`, and the value of one display unit in `unit`.
+    """Return the display unit of values in `unit`, and the scale by which to divide them.
 
     `detail`: for a wavelet detail. Raises InputError for an unknown pressure unit.
     """
@@ -119,7 +120,7 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Return the display unit of a detail, squared for d3d4, and its value in the channel's unit (squared)."""
+    """Return the display unit of a detail and the scale by which to divide its values; both are squared for d3d4."""
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
@@ -211,21 +212,21 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
     """Compute the limits of the axis, which include zero, all estimates and all intervals.
 
-    If that doubles the range or more, only 90 % of the intervals' ends are included, as a few wide intervals would
+    If the intervals more than double the range, only 90 % of their ends are included, as a few wide intervals would
     flatten the curve.
     """
-    required = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
+    required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
-    with_all, with_most = [*required, *low_ends, *high_ends], [*required]
+    with_all, with_most = [*required_values, *low_ends, *high_ends], [*required_values]
     with_most += [np.quantile(low_ends, 0.1)] if low_ends.size else []
     with_most += [np.quantile(high_ends, 0.9)] if high_ends.size else []
-    included = with_all if max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most)) else with_most
-    margin = 0.06 * (max(included) - min(included)) or 0.5
-    return float(min(included) - margin), float(max(included) + margin)
+    levels = with_all if max(with_all) - min(with_all) <= 2.0 * (max(with_most) - min(with_most)) else with_most
+    margin = 0.06 * (max(levels) - min(levels)) or 0.5
+    return float(min(levels) - margin), float(max(levels) + margin)
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each detail of each chamber; the chambers are next to each other."""
+    """Build a chart for each detail of each chamber; those of the same detail follow each other."""
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -264,7 +265,7 @@ def draw(
 ) -> DrawnCharts:
     """Decimate and encode the lines of all charts, and draw the still picture of each.
 
-    Peaks are preserved, as each bucket contributes its minimum and its maximum.
+    Peaks are preserved, as each bucket of samples contributes its minimum and its maximum.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle

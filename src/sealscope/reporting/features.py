@@ -19,7 +19,7 @@ HALF_WINDOWS = 10
 
 
 class ChamberDetails(NamedTuple):
-    """d1..d4 and d3d4 of one chamber's pressure.
+    """Wavelet details d1..d4 of one chamber's pressure, and d3d4, the product of d3 and d4.
 
     `values`: name -> (n,) over the whole recording, NaN if the transform reaches an end or a defect of the data;
     `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,), NaN between two parts. d1..d4 are in
@@ -34,7 +34,7 @@ class ChamberDetails(NamedTuple):
 
 
 class DetailChange(NamedTuple):
-    """RMS of one detail before and after, in the channel's unit (d3d4: its square); `percent` as in the thesis."""
+    """RMS of one detail in two parts of a recording, in the channel's unit (d3d4: its square); None if not known."""
 
     channel: str
     name: str
@@ -43,7 +43,7 @@ class DetailChange(NamedTuple):
 
     @property
     def percent(self) -> float | None:
-        """``100 (after - before) / before`` [%]; None if one of the two is missing or `before` is 0."""
+        """Change as in the thesis, ``100 (after - before) / before`` [%]; None if one is missing or `before` is 0."""
         if self.before is None or self.after is None or self.before <= 0:
             return None
         return 100 * (self.after - self.before) / self.before
@@ -60,32 +60,32 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
     t = ordered_time(recording.t, recording.rate)[0]
     n_needed = min_samples()
     parts = uniform_segments(recording, [channel])
-    usable = [part for part in parts if part.stop - part.start >= n_needed]
-    if not usable:
+    usable_parts = [part for part in parts if part.stop - part.start >= n_needed]
+    if not usable_parts:
         n_longest = max((part.stop - part.start for part in parts), default=0)
         need = f"they need {n_needed} samples without a fault, the most there are is {n_longest}"
         return None, f"No details of {channel}: {need}."
     values = {name: np.full(n, np.nan) for name in QUANTITIES}
     windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each part
-    for part in usable:
+    for part in usable_parts:
         try:
-            transformed = details(signal[part])
-            rows, inside = transformed.quantities(), transformed.inside()
+            transform = details(signal[part])
+            rows, inside = transform.quantities(), transform.inside()
             ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
         for name, row, level in zip(QUANTITIES, rows, (1, 2, 3, 4, 4), strict=True):  # d3d4 reaches as far as d4
-            unaffected = transformed.inside(level)
-            values[name][part][unaffected] = row[unaffected]
+            unaffected_samples = transform.inside(level)
+            values[name][part][unaffected_samples] = row[unaffected_samples]
         if ends.size:
             centres = t[part.start] + (ends - WINDOW_SIZE / 2) / recording.rate
             if windows:  # NaN breaks the drawn line between two parts
                 windows.append((centres[:1], np.full((len(QUANTITIES), 1), np.nan)))
             windows.append((centres, window_rows))
     notes = []
-    n_left_out = n - sum(part.stop - part.start for part in usable)
+    n_left_out = n - sum(part.stop - part.start for part in usable_parts)
     if n_left_out:
-        parts_text = f"{len(usable)} stretch{'es' if len(usable) > 1 else ''} without a fault"
+        parts_text = f"{len(usable_parts)} stretch{'es' if len(usable_parts) > 1 else ''} without a fault"
         notes.append(f"{channel}: the details are of {parts_text}; {n_left_out} of {n} samples are left out.")
     if not windows:
         notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW_SIZE} samples.")
@@ -96,7 +96,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
 
 class Parts(NamedTuple):
-    """The two parts of a recording that are compared, t < `end` and t >= `start` [s]; `text`: reason for the choice."""
+    """Two parts of a recording to compare, t < `end` and t >= `start` [s], their `heads`, and the reason (`text`)."""
 
     end: float
     start: float

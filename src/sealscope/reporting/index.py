@@ -26,7 +26,7 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
     """Write the index of pages in its folder, given the path and the diagnosis of each page."""
-    ordered = sorted(pages, key=lambda page: severity_key(page[1]))
+    ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     rows = [
@@ -40,7 +40,7 @@ def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagno
             "cause": messages.cause(diagnosis) if diagnosis.verdict == "leak" else None,
             "action": messages.what_to_do(diagnosis),
         }
-        for page, diagnosis in ordered
+        for page, diagnosis in ordered_pages
     ]
     title = f"{format_count(len(pages), 'recording')}: {summary}"
     return template.write(path, template.render("index.html.j2", title=title, rows=rows))

@@ -102,7 +102,7 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Format the leak flow [L/min], or its upper bound if no leak was found; None if nothing is known."""
+    """Format the leak flow [L/min] or why it is not stated; without a leak its upper bound, None if not known."""
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
         if diagnosis.bound_lpm is not None:
@@ -180,7 +180,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow and as a creep; None if none is known."""
+    """Format the leak in mL/min, relative to the pump's flow, and as a speed of creep; None if none is known."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -273,7 +273,7 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def _odds(diagnosis: Diagnosis) -> str | None:
-    """Format the odds that a healthy recording looks like this one, or if nothing changed, shows as much change."""
+    """Format the odds that a healthy recording looks like this one, or after `no leak`, shows as much change."""
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
         return odds
@@ -293,10 +293,10 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """List the next checks, most useful first."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""
-    confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
+    step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":
-        steps = [diagnosis.next_check, say("next.repeat" if has_named_cause else "next.creep"), confirmed]
+        steps = [diagnosis.next_check, say("next.repeat" if has_named_cause else "next.creep"), step_once_confirmed]
     elif has_named_cause:
         steps = [diagnosis.next_check, say("next.resolved")]
     elif diagnosis.verdict == "no leak":

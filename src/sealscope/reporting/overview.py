@@ -52,8 +52,8 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     clock = f"{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}"
     lines = [paragraph(f"{name}: {kind}{clock}", indent=2)]
     for channel, values in recording.channels.items():
-        unit, converted = display_values(recording, channel, recording.pressure_unit)
-        finite = converted[np.isfinite(converted)]
+        unit, display_samples = display_values(recording, channel, recording.pressure_unit)
+        finite = display_samples[np.isfinite(display_samples)]
         ends = f"{_format_short(finite.min())} to {_format_short(finite.max())} {unit}" if finite.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
         lines.append(line + draw_curve(values, max(CURVE_WIDTH // 2, WIDTH - len(line))))

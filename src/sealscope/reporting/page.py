@@ -106,15 +106,15 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 
 
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Return the rig that is shown: `rig` if given, else the packaged rig of the diagnosis.
+    """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    None if `rig` states no dimensions, or the diagnosis has no packaged rig.
+    None if `rig` states no dimensions, or no packaged rig was stated.
     """
     from sealscope.parameters import load_rig, rig_names
 
     if rig is not None:
-        loaded = load_rig(rig)
-        return loaded if states_rig(loaded) else None
+        loaded_rig = load_rig(rig)
+        return loaded_rig if states_rig(loaded_rig) else None
     machine = diagnosis.machine
     if machine is None or machine.stated_by == "nobody" or machine.rig not in rig_names():
         return None
@@ -215,7 +215,7 @@ def render_page(
 def _change_rows(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    """Build the values for the table of changes: RMS of each detail in both parts, and the end of the bars [%]."""
+    """Build the values for the table of changes: RMS of each detail in both parts, and the limit of the bars [%]."""
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
     for change in features.changes(recording, chambers, parts):

@@ -17,15 +17,15 @@ def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[st
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    known: dict[str, str] = {}
+    facts: dict[str, str] = {}
     start = recording.provenance.get("start")
     if isinstance(start, str):
-        known["Date"] = re.sub(r"\.\d+", "", start).replace("T", " ")
+        facts["Date"] = re.sub(r"\.\d+", "", start).replace("T", " ")
     if rig is not None:
-        known["Machine"] = (rig.title or rig.name).partition(":")[0]
+        facts["Machine"] = (rig.title or rig.name).partition(":")[0]
     for label, patterns in patterns_by_label.items():
         matches = (name for pattern in patterns for name in remarks if re.fullmatch(pattern, name, re.IGNORECASE))
         name = next(matches, None)
         if name is not None:
-            known[label] = remarks.pop(name)
-    return {label: known[label] for label in patterns_by_label if label in known}
+            facts[label] = remarks.pop(name)
+    return {label: facts[label] for label in patterns_by_label if label in facts}

@@ -68,13 +68,13 @@ class Picture:
         return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
-        """Convert values to distances from the left."""
+        """Convert values of the x axis to distances from the left of the frame."""
         start, stop = self.x_ends
         positions = np.log10(values) if self.log else np.asarray(values)
         return np.asarray((positions - start) / (stop - start) * self.width)
 
     def y(self, values: Array | float) -> Array:
-        """Convert values to distances from the top."""
+        """Convert values of the y axis to distances from the top of the frame."""
         low, high = self.y_ends
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 

@@ -78,9 +78,9 @@ def _inline_styles(page: str) -> str:
     values: dict[str, str] = {}
     for block in re.findall(r"(?:^|@media print\{)\s*:root\{([^}]*)\}", sheet[1], re.MULTILINE):
         values |= dict(re.findall(r"(--[\w-]+):([^;]+)", block))
-    resolved = re.sub(r"var\((--[\w-]+)\)", lambda match: values.get(match[1], match[0]), sheet[1])
-    page = page.replace(sheet[1], resolved, 1)
-    return re.sub(r"<svg\b[^>]*>", lambda match: f"{match[0]}<style>{resolved}</style>", page)
+    resolved_sheet = re.sub(r"var\((--[\w-]+)\)", lambda match: values.get(match[1], match[0]), sheet[1])
+    page = page.replace(sheet[1], resolved_sheet, 1)
+    return re.sub(r"<svg\b[^>]*>", lambda match: f"{match[0]}<style>{resolved_sheet}</style>", page)
 
 
 def _find_browser() -> str | None:

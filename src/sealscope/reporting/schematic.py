@@ -48,7 +48,8 @@ class Circuit(NamedTuple):
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
     """Choose the parts to draw; without a rig only the parts of every pump-controlled actuator are drawn.
 
-    `machine`: stated areas and displacement of a machine without a rig. A bypass is drawn if its flow is recorded.
+    `recorded`: the recorded channels; with `q_leak` a bypass is drawn. `machine`: areas and displacement of a machine
+    without a rig.
     """
     bypass, values = "q_leak" in recorded, dict.fromkeys(_VALUES, "")
     if rig is None:

@@ -60,7 +60,7 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file that a page includes unchanged, from a package, or from this one if the package lacks it."""
+    """Read a file of `package`, or of this package if that one lacks it, as text that templates do not escape."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -83,7 +83,7 @@ def _script_json(value: Any) -> Markup:
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Return the path of a page, or if `card` also of its picture; raise InputError for another suffix."""
+    """Convert the path of a page, or with `card` of its picture, to a Path; raise InputError for another suffix."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")

@@ -47,7 +47,7 @@ class Details:
         return int(self.values.shape[0])
 
     def __getitem__(self, level: int) -> Array:
-        """Return the detail of a level (n,), with the samples at either end that the edges distort."""
+        """Return the detail of a level, (n,), including the samples at either end that depend on padding."""
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
         return np.asarray(self.values[level - 1])
@@ -61,7 +61,7 @@ class Details:
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the samples that do not depend on padding at a level, by default the deepest, and so at any."""
+        """Return the slice of samples that do not depend on padding at a level; None: at any level."""
         before, after = self.edges[(level or self.levels) - 1]
         return slice(int(before), self.values.shape[1] - int(after))
 
@@ -86,7 +86,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Return the fewest samples of a signal that leave one free of padding in each level; 226 for db8 to level 4."""
+    """Compute the length of the shortest signal with a sample free of padding in each level; 226 for db8 to level 4."""
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 
 
@@ -187,7 +187,7 @@ def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[A
 
     def reconstruct_level(index: int) -> Array:
         """Invert the transform with all coefficients but those at `index` set to zero."""
-        one_level = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
-        return np.asarray(pywt.waverec(one_level, wavelet, mode=edge), dtype=np.float64)[: x.size]
+        level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
+        return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
 
     return np.array([reconstruct_level(index) for index in range(levels, 0, -1)]), reconstruct_level(0)

@@ -24,8 +24,8 @@ def discrete_wavelet(name: str) -> Any:
     import pywt
 
     if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
-        near = difflib.get_close_matches(str(name), pywt.wavelist(kind="discrete"), n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        matches = difflib.get_close_matches(str(name), pywt.wavelist(kind="discrete"), n=1)
+        hint = f"; did you mean {matches[0]}?" if matches else ""
         raise InputError(f"wavelet must be a discrete wavelet such as db8, got {name!r}{hint}")
     return pywt.Wavelet(name)
 

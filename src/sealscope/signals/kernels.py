@@ -60,10 +60,11 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Filter new rows of a channel's first buffer, `n` from row start + first on, through all levels to `details`.
+    """Compute the details (levels, CHUNK, WIDTH) of `n` new rows of a channel, which has a buffer for each level.
 
-    `details`: (levels, CHUNK, WIDTH). Shallower levels are delayed like the deepest, so that a row belongs to one
-    sample. The low-pass of each level is the input of the next, in the next buffer of `capacity` rows.
+    The first buffer begins at row `start` of `buffers`, its new rows at start + `first`; each has `capacity` rows, and
+    the low-pass of a level goes to the next buffer. Shallower levels are delayed like the deepest, so that a row of
+    `details` belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -102,8 +103,8 @@ def advance_details(
     """Filter `block` (channels, actuators, n) into `out` (channels, actuators, levels, n); return the new fill.
 
     `groups`: first and last + 1 of the groups of lanes to filter; `buffers`: (groups, channels, levels, capacity,
-    WIDTH), of whose rows `fill` are in use and the last `history` are needed again; `details`: (levels, CHUNK, WIDTH),
-    workspace.
+    WIDTH), whose first `fill` rows of the capacity are in use; the last `history` of them are inputs of later outputs;
+    `details`: (levels, CHUNK, WIDTH), workspace.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]

@@ -52,7 +52,7 @@ def windowed_rms(
     """Compute the RMS of each window of `size` samples, every `step` samples, over the last axis of (..., n).
 
     `first`: sample number of the first value, which is added to `ends`. Of `Details` all levels are used, without
-    samples that depend on padding, and `ends` are samples of the signal. A series shorter than one window has none.
+    samples that depend on padding, and `ends` are samples of the signal. A series shorter than `size` gives no window.
 
     Raises InputError for a series that is not finite, and for a size or a step below 1.
     """

@@ -48,7 +48,7 @@ _INSTRUMENT_SYMBOLS = {"noise", "hum", "offset", "gain_error", "scale_error", "c
 
 @dataclass(frozen=True)
 class Effect:
-    """The change of one number over time; several make (number + sum of additive changes) x product of the factors.
+    """The change of one number over time; several effects on it give (number + sum of addends) x product of factors.
 
     `field`: a number of the compiled laws, or the dotted name of an instrument's parameter. `change(t)` at times t [s]:
     addend if `additive`, else factor; `max_change`: its largest step from one block to the next; `breakpoints`: times
@@ -69,7 +69,7 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute a parameter at times t [s] from its value in the rig and the effects on it."""
+    """Compute the parameter `field` at times t [s] from its value in the rig and all `effects` on that field."""
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
         if effect.field == field:
@@ -78,7 +78,7 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute the model's parameters that the effects change, by name, at times t [s]; `base`: all without effects."""
+    """Compute each model parameter that an effect changes, by name, at times t [s]; `base`: all without effects."""
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
@@ -111,10 +111,10 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
 
     Only fast effects (valves), with a `min_block` below `SHORTEST_BLOCK`, matter; all others change too little.
     """
-    fast = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
-    times = np.array(sorted({t for effect in fast for t in effect.breakpoints if math.isfinite(t)}))
+    fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
+    times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
     before_and_after = np.concatenate([times - 1e-9, times + 1e-9])  # a nanosecond from each switch
-    values = changing_values(fast, base, before_and_after) if times.size else {}
+    values = changing_values(fast_effects, base, before_and_after) if times.size else {}
     rows = np.unique(np.array(list(values.values())).T, axis=0) if values else ()
     return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in rows)
 
@@ -231,7 +231,7 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the path so that its range (highest less lowest value within the duration) is `size`."""
+        """Scale the path to a range (highest less lowest value within the duration) of `size`; keep a constant path."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self
@@ -290,7 +290,7 @@ class ParameterDrift:
         return f"{self.parameter} drifts"
 
     def _is_instrument(self) -> bool:
-        """Test whether the parameter is one of an instrument that can drift."""
+        """Return True if the parameter is an instrument's and can drift."""
         return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _INSTRUMENT_SYMBOLS
 
     def check(self, t: Array) -> None:

@@ -19,9 +19,10 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the solver outputs per sample, at least `min_outputs`, of which a controller's samples are a subset.
+    """Find the fewest solver outputs per recorded sample for which a controller samples at outputs only.
 
-    `rate`, `controller_rate` [Hz] of recording and controller. Raises InputError if no number of outputs suits both.
+    At least `min_outputs`. `rate`, `controller_rate` [Hz]: of recording and controller. Raises InputError if no number
+    of outputs suits both.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate

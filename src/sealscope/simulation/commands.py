@@ -96,7 +96,7 @@ class Trapezoid:
 
 @dataclass(frozen=True)
 class Alternating:
-    """A repeated sequence of sines, each from its zero crossing for a whole number of its periods: (periods, sine)."""
+    """A sequence of sines that repeats; each part (periods, sine) starts at zero and lasts whole periods."""
 
     parts: tuple[tuple[int, Sine], ...]
 
@@ -141,7 +141,7 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps; () for a table of very many points."""
+        """Return the times [s] at which the slope changes or the value jumps; () for a table of 1000 points or more."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
@@ -172,13 +172,16 @@ _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the polyline through points (t, y)."""
+    """Make the polyline through points (t [s], y); `words`: its text, as parsers read it."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
 
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Make the polyline through the points of a table; raise InputError for falling times or values not finite."""
+    """Make the polyline through the points of a table, called `what` in messages.
+
+    Raises InputError if the times fall, a number is not finite, or the sizes differ.
+    """
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
@@ -234,8 +237,8 @@ GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x
 class PseudoRandom:
     """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
 
-    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), which is computed
-    without those before it.
+    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), computed directly,
+    without the earlier states.
     """
 
     amplitude: float

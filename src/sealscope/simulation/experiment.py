@@ -87,9 +87,9 @@ def check_circuit(rig: Rig) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Experiment:
-    """Everything a run depends on; equal experiments give equal bytes.
+    """All inputs of a simulated run; equal experiments give recordings that are equal byte for byte.
 
-    `Experiment.of` makes one of texts with units. The sampling rate is the rig's `daq.sample_rate`.
+    `Experiment.of` makes one from texts with units. The sampling rate is the rig's `daq.sample_rate`.
 
     Parameters
     ----------
@@ -270,9 +270,9 @@ class Experiment:
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Scale the openings of laminar leaks with the viscosity of the run's oil: warmer oil leaks more.
+        """Divide the openings of laminar leaks by the oil's relative viscosity, because warmer oil leaks more.
 
-        Coefficients are those at the rig's viscosity.
+        The leaks' coefficients hold at the rig's viscosity.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -313,7 +313,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Convert the experiment to plain values, without what a diagnosis must find (leaks, faults, drifts)."""
+        """Convert the experiment to plain values, without leaks, faults and drifts, which a diagnosis must find."""
         overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
             "rig": self.rig.name,

@@ -101,7 +101,7 @@ class FaultRow:
         return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
 
     def _parse_value(self, groups: Groups) -> float:
-        """Parse a fault's value from the groups of its text: a size in SI units, a factor or a fraction."""
+        """Parse a fault's value from the groups of its match: a size in SI units, a factor or a fraction."""
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
             return parse_quantity(groups["size"] or "", unit, name=self.what)
@@ -148,7 +148,7 @@ class Fault:
 
     @property
     def kind(self) -> str:
-        """One name for all faults of a kind, for tables and confusion matrices."""
+        """Name of the class of the fault in tables and confusion matrices, such as "pump leakage"."""
         return self.row.kind
 
     def onset(self) -> float:
@@ -195,7 +195,7 @@ class Fault:
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the function of time [s] for the oil's viscosity relative to the rig's; None if it is constant."""
+        """Build the function from times [s] to the oil's viscosity over the rig's; None unless this is an oil fault."""
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
@@ -322,8 +322,8 @@ FAULTS: Mapping[str, FaultRow] = {
 def parse_fault(text: str) -> Fault | None:
     """Parse a fault; return None for ``none``.
 
-    A rod seal's flow is that at the charge pressure. Operations of the rig, such as `circulation`, are stated in the
-    same way. Raises InputError, which lists the forms, if the text has none of them.
+    The flow stated for a rod seal is that at the charge pressure. Operations of the rig, such as `circulation`, are
+    stated in the same way. Raises InputError, which lists the forms, if the text has none of them.
     """
     stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):

@@ -34,8 +34,8 @@ class Outputs(Protocol):
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     """Compute the taps (2 FILTER_REACH factor + 1,) of the anti-alias filter, a Kaiser-windowed sinc of unit gain.
 
-    `factor`: the signal's rate over the recording's; `delay`: lag of the filter as a fraction of a tap, otherwise it
-    has zero phase. A single tap of 1 if there is nothing to filter.
+    `factor`: the signal's rate over the recording's; `delay`: lag of the filter, a fraction of the interval between
+    taps. Without it the filter has zero phase; with a factor of 1, too, it is a single tap of 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -76,12 +76,12 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     decay = math.exp(-1.0 / (lag * rate))
     mean_decay = (1.0 - decay) * lag * rate  # mean of exp(-t/lag) over one interval
     b_0 = 1.0 - mean_decay
-    filtered, _ = lfilter([b_0, mean_decay - decay], [1.0, -decay], values, zi=[(1.0 - b_0) * values[0]])
-    return np.asarray(filtered)
+    output, _ = lfilter([b_0, mean_decay - decay], [1.0, -decay], values, zi=[(1.0 - b_0) * values[0]])
+    return np.asarray(output)
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Sample `values` with a clock that is late by `lateness` (n,), a fraction -1 .. 1 of their interval; None: 0.
+    """Sample `values` with a clock that is late by `lateness` (n,), -1 .. 1 intervals of `values`; None: no jitter.
 
     `sample(values)`: the samples (n,) of a clock without jitter. Values are interpolated by a parabola through three.
     """
@@ -121,7 +121,7 @@ def read_pressure(
     """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
     In this order: gain, offset, drift, hum, noise of the channel and `common_noise` [Pa], saturation, conversion, stuck
-    and lost samples. `parameter(symbol, value)` is a parameter of the sensor over time, `value` that of the rig.
+    and lost samples. `parameter(symbol, value)` returns the sensor's parameter over time from its `value` in the rig.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -174,7 +174,7 @@ def record(
     readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
-        """Make the function (symbol, rig's value) for a parameter of a channel's sensor over time."""
+        """Make the function (symbol, value in the rig) that returns a parameter of a channel's sensor over time."""
         return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
     jitter_steps = None
@@ -203,8 +203,8 @@ def record(
     }
     for name in PRESSURES:
         sensor = getattr(sensors, name)
-        lagged = filter_first_order(trajectory[name], sensor.lag, rate * factor)
-        pressure = read_filtered(lagged, sensor.delay * rate * factor)
+        lagged_pressure = filter_first_order(trajectory[name], sensor.lag, rate * factor)
+        pressure = read_filtered(lagged_pressure, sensor.delay * rate * factor)
         channels[name] = read_pressure(pressure, common_noise, sensor, rig.daq, rate, random[name], parameters_of(name))
     meter, q_parameter = sensors.q_leak, parameters_of("q_leak")
     q = (1.0 + q_parameter("gain_error", 0.0)) * read_filtered(trajectory["q_leak"]) + q_parameter("offset", 0.0)

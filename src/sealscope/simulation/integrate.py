@@ -57,8 +57,8 @@ class Trajectory:
     """Result of an integration: (n,) times [s] and (n, 21) outputs in the order of `sealscope.physics.state.OUTPUTS`.
 
     `step` [s]; `error`: estimated rms error [Pa] of the pressures, NaN if it was not checked. Under a controller:
-    `volts` (n,), its voltages [V], and `compensated` (n,), the leakage flow [m^3/s] that it reports to compensate, or
-    None; without a controller both are None.
+    `volts` (n,), its voltages [V], and `compensated` (n,), the leakage flow [m^3/s] that it compensates, None if it
+    reports none; without a controller both are None.
     """
 
     t: Array
@@ -79,7 +79,7 @@ class RunInputs:
     """The inputs of a run over time: the experiment's command, and leakage by `leaks` with known coefficients."""
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Take the command of the experiment, and `leaks`, given as coefficients, instead of its own leaks."""
+        """Prepare the inputs from the experiment's command, with `leaks` in place of the experiment's leaks."""
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the voltage is that of the controller (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
@@ -106,9 +106,9 @@ class RunInputs:
         return G, C
 
     def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Raise InputError if the command u(t) [V] exceeds the limit during the run; clip it after the run's end.
+        """Check that the command u(t) [V] is within its limit during the run, and clip it after the end.
 
-        Only the look-ahead of the anti-alias filter reads the command after the end.
+        Raises InputError if it is not. Only the look-ahead of the anti-alias filter reads the command after the end.
         """
         if np.abs(u).max(initial=0.0) <= self._limit:
             return u
@@ -117,7 +117,7 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the solver outputs per sample of an experiment's recording, which its controller's rate must suit."""
+    """Compute the solver outputs per recorded sample, so many that a controller's samples fall on outputs, too."""
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
     controller = experiment.active_controller
@@ -125,12 +125,12 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the outputs per sample at `rate` [Hz]: enough for the anti-alias filter, at most one a step [s]."""
+    """Compute the outputs per sample at `rate` [Hz]: 4 for the anti-alias filter, but at most one per `step` [s]."""
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Compute the fewest steps between outputs at `rate` [Hz] that are no longer than `step` [s]."""
+    """Compute the number of solver steps from one output to the next at `rate` [Hz], each at most `step` [s] long."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
@@ -145,8 +145,9 @@ def integrate_run(
 ) -> Trajectory:
     """Integrate an experiment, with outputs at the rate that its instruments need.
 
-    `leaks`, all with coefficients, replace those of the experiment, as do `step` [s], which is then not checked,
-    `error` [Pa] and `duration` [s] if stated; the default duration includes the anti-alias filter's reach.
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s], `error` [Pa] and `duration` [s] replace
+    the experiment's unless None; the error of a `step` stated here is not checked. The default duration includes the
+    anti-alias filter's reach.
     """
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
@@ -190,7 +191,8 @@ def run_with_sized_leaks(
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Find the coefficients of the experiment's leaks, and integrate its run with them; return both.
 
-    `progress` is called while leaks are sized; if there are none to size, `report_time` with the time reached [s].
+    `progress(task, fraction)` is called while leaks are sized, `report_time(t)` with the time reached [s] if there are
+    none to size.
 
     Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
     if the search does not converge.
@@ -202,7 +204,7 @@ def run_with_sized_leaks(
     is_first_run = True
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate the leaks with these coefficients; return mean flows [m^3/s] per unit of them, leaks and run."""
+        """Simulate leaks with coefficients (n,); return mean flows [m^3/s] for a coefficient of 1, leaks and run."""
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
         sized_leaks = tuple(replace(leak, coefficient=float(coefficient)) for leak, coefficient in pairs)
@@ -325,7 +327,7 @@ def integrate(
 
 @dataclass
 class _Integration:
-    """The integration of one run of a rig; `euler`: literal integrator of the motor; `reached` [s]: time reported."""
+    """The integration of one run; `euler`: eq. (4.2) as printed (`rk4_step`); `reached` [s]: time last reported."""
 
     inputs: RunInputs
     schedule: Schedule
@@ -345,7 +347,10 @@ class _Integration:
                 refuse_unresolved(p, 1.0 / (self.rate * n_steps), self.method)
 
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
-        """Integrate the state `y` in place over outputs start <= k < stop, `n_steps` each, into rows[k - origin]."""
+        """Integrate the state `y` (14,) in place from output `start` to `stop`; write output k to rows[k - origin].
+
+        `n_steps`: number of steps from one output to the next.
+        """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -382,7 +387,11 @@ class _Integration:
                 self.progress(self.reached)
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Check outputs from the output `first` on; raise SimulationFailed if the run diverged or left the model."""
+        """Check the outputs `rows` of steps of h [s]; rows[0] is output `first` of the run.
+
+        Raises SimulationFailed if one is not finite or, unless the run may be unresolved, if a pressure is below vacuum
+        or the step is too long for an end stop that was hit.
+        """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
 
@@ -407,13 +416,13 @@ class _Integration:
 
 
 def refuse_long(h: float, limit: float, what: str) -> None:
-    """Raise SimulationFailed if the step h [s] is above the `limit` [s] that resolves `what`."""
+    """Raise SimulationFailed if the step h [s] is longer than `limit` [s]; `what`: the part of the rig to resolve."""
     if h > limit * (1.0 + 1e-9):
         raise SimulationFailed(f"step must be <= {limit:.2g} s to resolve {what}, got {h:.3g} s; take a smaller step")
 
 
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
-    """Raise SimulationFailed if a step h [s] cannot resolve the rig by the method."""
+    """Raise SimulationFailed if `method`, rk4 or imex, cannot resolve the rig, leaks excepted, by steps of h [s]."""
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
     refuse_long(
@@ -481,7 +490,7 @@ class StepErrorCheck:
         return f"the RMS of a detail by {error:.3g} %, which must be <= {tolerance:.3g} %"
 
     def _add_detail_squares(self, coarse: Array, fine: Array) -> None:
-        """Add the squares of a window's details to the sums, without those whose filters reach beyond the window."""
+        """Add the squares of a window's details to the sums, except near its ends: the filters reach beyond them."""
         import pywt
 
         from sealscope.signals.filters import reach

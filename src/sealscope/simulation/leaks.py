@@ -56,7 +56,7 @@ def growing_opening(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """The opening of a laminar gap divided by the oil's `viscosity`, a function of time relative to the rig's oil."""
+    """The opening of a laminar leak divided by `viscosity(t)`, the oil's viscosity over the rig's at times t [s]."""
 
     opening: Opening
     viscosity: Callable[[Array], Array]
@@ -67,7 +67,7 @@ class Thinned:
         return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:
-        """Return the onset [s] of the gap."""
+        """Return the time [s] at which the leak begins to open."""
         return self.opening.onset()
 
     def __str__(self) -> str:
@@ -95,11 +95,11 @@ class Leak:
     def __post_init__(self) -> None:
         if self.law not in ("laminar", "orifice"):
             raise InputError(f"leak law must be laminar or orifice, got {self.law!r}")
-        stated = [value for value in (self.coefficient, self.mean) if value is not None]
-        if len(stated) != 1:
+        sizes = [value for value in (self.coefficient, self.mean) if value is not None]
+        if len(sizes) != 1:
             raise InputError("a leak needs either a coefficient or a mean flow, and not both")
-        if not (math.isfinite(stated[0]) and stated[0] >= 0):
-            raise InputError(f"a leak must be >= 0 and finite, got {stated[0]}")
+        if not (math.isfinite(sizes[0]) and sizes[0] >= 0):
+            raise InputError(f"a leak must be >= 0 and finite, got {sizes[0]}")
         if isinstance(self.opening, Polyline) and not np.all((self.opening.y >= 0) & (self.opening.y <= 1)):
             raise InputError(f"openings of a leak must be in 0..1, got {self.opening}")
 
@@ -111,7 +111,7 @@ class Leak:
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening stated by the groups of a text (`WHEN`); without a time it is open from the start."""
+    """Build the opening from the times in a match's groups (such as of `WHEN`); without times it is open from t = 0."""
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))
     until = groups.get("until")
@@ -125,8 +125,8 @@ def parse_opening(groups: Groups) -> Polyline:
 def parse_leak(text: str) -> Leak | None:
     """Parse a leak; return None for ``none``.
 
-    The columns of a table are `t [s]` and `q_leak [L/min]`, the mean flow at each time. Raises InputError, which lists
-    the forms, if the text has none of them.
+    The file of ``table FILE`` has the columns `t [s]` and `q_leak [L/min]`, the mean flow at each time. Raises
+    InputError, which lists the forms, if the text has none of them.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):

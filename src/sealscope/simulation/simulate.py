@@ -50,7 +50,8 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 class Truth:
     """The truth of a run, which a recording does not show: leaks, faults, drifts, and outputs without noise.
 
-    `outputs` are at the samples `t` [s]; `onset_s` and `mean_leak_lpm` are those of the leaks across the piston.
+    `outputs`: values at the samples `t` [s]. Of the leaks across the piston, `onset_s` is the time at which the first
+    one opens, None if none does, and `mean_leak_lpm` the sum of their mean flows while open.
     """
 
     leaks: tuple[Leak, ...]
@@ -64,7 +65,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """The change of one quantity at half the step: `difference` and `tolerance` (None: not limited) in `unit`."""
+    """The change of a quantity when the step is halved; `difference`, `tolerance` (None: not limited) in `unit`."""
 
     name: str
     difference: float
@@ -101,9 +102,9 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the largest difference relative to its tolerance."""
-        limited = [row for row in self.differences if row.tolerance]
-        return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))
+        """Find the difference that is largest relative to its tolerance."""
+        limited_rows = [row for row in self.differences if row.tolerance]
+        return max(limited_rows, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     n, factor = round(experiment.duration * experiment.rate), oversampling(experiment)
     at_samples, times = slice(0, n * factor, factor), experiment.sample_times()
     volts = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
-    recorded = record(experiment.rig, run, volts, factor, experiment.seed, experiment.readings())
+    readings = record(experiment.rig, run, volts, factor, experiment.seed, experiment.readings())
     solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed
@@ -192,11 +193,11 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         "solver": solver | {"error_found_pa": run.error},
     }
     history = (f"simulated with {run.method}, h = {run.step:.4g} s; sampled at {experiment.rate:g} Hz",)
-    channels = dict(recorded.channels)
+    channels = dict(readings.channels)
     if run.compensated is not None:
         channels["q_comp"] = run.compensated[at_samples]
     units = {name: CHANNEL_UNITS[name] for name in channels}
-    recording = replace(recorded, channels=channels, units=units, provenance=provenance, history=history)
+    recording = replace(readings, channels=channels, units=units, provenance=provenance, history=history)
     outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
         # a rig with clogging filters has no servo valve: the spool's states are the oil that passed the filters

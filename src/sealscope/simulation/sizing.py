@@ -75,11 +75,11 @@ def size_leaks(
     for attempt in range(MAX_RUNS):
         if progress is not None:
             progress("sizing the leak", 1.0 - 0.5**attempt)
-        unit_flows, measured = measure(coefficients)
+        unit_flows, measurement = measure(coefficients)
         flows = unit_flows * coefficients
         error = float(np.abs(flows[indices] / means[indices] - 1.0).max(initial=0.0))
         if error < best_error:
-            best, best_error = (coefficients, measured), error
+            best, best_error = (coefficients, measurement), error
         if best and (error <= TOLERANCE or attempt == MAX_RUNS - 1):
             if progress is not None:
                 progress("sizing the leak", 1.0)

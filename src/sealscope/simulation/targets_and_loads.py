@@ -66,11 +66,11 @@ class Force:
     over_v: Breakpoints = ()
 
     def value_at(self, t: Array) -> Array:
-        """Compute the force [N] at times t [s], without its part over the piston's position and velocity."""
+        """Compute signal(t), the part of the force [N] that depends on time t [s] alone."""
         return self.signal.volts(t)
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the tables of `piecewise_linear_force` over position and velocity; None if it depends on neither."""
+        """Build the breakpoints over x and over v for `piecewise_linear_force`; None if the load depends on neither."""
         if not (self.over_x or self.over_v):
             return None
         x, v = (np.array(breakpoints or ((0.0, 0.0),), dtype=np.float64) for breakpoints in (self.over_x, self.over_v))
@@ -81,7 +81,7 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the compiled model's parameters of a rig under a load."""
+    """Build the compiled model's parameters of a rig under an additional load; None: without one."""
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
@@ -90,7 +90,7 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the state of a rig at t = 0: its piston is at standstill at x [m] under a load."""
+    """Compute the state (14,) of a rig at t = 0, with the piston at standstill at x [m] under an additional load."""
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
@@ -109,7 +109,7 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
 
 
 def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
-    """Parse a signal in the form of a command, with sizes in one of `units` (unit -> factor), to SI units.
+    """Parse a signal, written as a command with units; `units` maps each allowed unit to its factor to SI units.
 
     `what`: name of the quantity in messages. Raises InputError for another form or a missing unit.
     """
@@ -165,8 +165,8 @@ class _Column(NamedTuple):
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
 
-    The load is linear between the rows and constant beyond them. A column of times takes precedence over the others;
-    the first of them becomes t = 0.
+    The load is linear between the rows and constant beyond them. With a column of times, columns of x and v are
+    ignored, and the first time becomes t = 0.
     """
     with open_regular(path, "a recorded load") as file:
         head = file.readline(4096).decode("utf-8-sig", "replace")
@@ -204,12 +204,15 @@ _NO_FORCE = Sine(0.0, 0.0)
 
 
 def _unit_pattern(units: Mapping[str, float]) -> str:
-    """Return the pattern of any of the units, the longest first, with or without their blanks."""
+    """Build the regular expression that matches any of the units, with or without their blanks."""
     return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
 
 
 def _term_pattern(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
-    """Compile the pattern of a term such as ``- 5 kN/mm over x from 50 mm``: sign, slope, unit, place, its unit."""
+    """Compile the pattern of a load's term over x or v (`letter`), such as ``- 5 kN/mm over x from 50 mm``.
+
+    Groups: sign, slope, unit of slope, start, unit of start. `slopes`, `places`: units of slope and start.
+    """
     start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(places)})\b\]?)?"
     return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_unit_pattern(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
 
@@ -245,5 +248,5 @@ def parse_force(text: str) -> Force:
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Find the unit that is spelled as `unit` up to blanks."""
+    """Find the key of `units` that equals `unit` if blanks are ignored."""
     return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

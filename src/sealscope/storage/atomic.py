@@ -64,7 +64,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _file_mode(target: Path) -> int:
-    """Return the mode of the file, or the default mode of a new file."""
+    """Return the permission bits of `target`, or those of a new file if it does not exist."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -73,7 +73,7 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Sync a file, or the names in a folder, to the disk."""
+    """Sync a file, or the names in a folder, to the disk; `flags`: to open it."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
@@ -82,10 +82,10 @@ def _sync(path: Path, flags: int) -> None:
 
 
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
-    """Remove temporary files that killed processes left in `folder`, of the file `target` or of all files.
+    """Remove the temporary files that killed processes have left in a folder.
 
-    Files of this machine are removed if their process has ended, those of another machine after a day. Links to folders
-    are not followed.
+    `target`: name of the file that they were to become; None: any file, in subfolders too. A file is removed if its
+    process ran on this machine and has ended, others after a day. Links to folders are not followed.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
         match = _TEMPORARY.fullmatch(path.name)

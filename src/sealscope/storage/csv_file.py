@@ -29,7 +29,7 @@ def guard_cell(value: Any) -> Any:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows with all digits, texts safe for spreadsheets (`guard_cell`); raise ValueError for an unknown key."""
+    """Write `rows`, column -> value, as CSV, texts escaped (`guard_cell`); raise ValueError for an unknown column."""
     with (
         atomic_write(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,

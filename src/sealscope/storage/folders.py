@@ -54,13 +54,13 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Split a name into its numbers and the texts between, a sort key by which day_2 comes before day_10."""
+    """Split a name into its texts and numbers, as a sort key by which day_2 comes before day_10."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 
 @contextmanager
 def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
-    """Lock the lock file of a folder of results while the block runs; the end of the process releases it, too.
+    """Hold the lock file of a folder of results while the block runs; the end of the process releases it, too.
 
     `busy`: message of the InputError if another process has the lock for longer than `wait` [s]; None: wait without
     limit. The file is created if necessary, and never emptied. Raises InputError if it is a link or cannot be created.

@@ -114,7 +114,7 @@ def _to_plain_value(value: Any) -> Any:
 def restore_attributes(
     owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
-    """Set attributes to the values from `save_attributes`; null leaves a number unchanged, or means None.
+    """Set attributes of `owner` to the values from `save_attributes`; null leaves an attribute unchanged.
 
     `kinds`: types of attributes that may be None or of another type. Raises InputError if one is missing or differs
     from the present one in type, or in the shape of an array except for empty axes.

@@ -55,7 +55,7 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass or model `kind`; raise ValueError if they do not fit.
 
-    The error is one line without a place. `entry_name`: entry of `value` -> its name in the error; `context`: passed
+    The error is one line and names no file. `entry_name`: entry of `value` -> its name in the error; `context`: passed
     to the validators of `kind`.
     """
     from pydantic import ValidationError
@@ -93,7 +93,7 @@ def format_error(error: ValidationError, entry_name: Callable[[str], str] = str,
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a value for JSON: records to objects, tuples to lists, numbers that are not finite to null."""
+    """Convert a value for JSON: dataclasses and named tuples to dicts, tuples to lists, non-finite numbers to None."""
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):

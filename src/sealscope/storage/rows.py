@@ -37,7 +37,7 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Read the rows of a folder by id, the last one for each id; a truncated last line is ignored.
+    """Read the rows of a folder, id -> its last row; a truncated last line is ignored.
 
     `row_of`: makes a row of a line's JSON value, or None for a row to be ignored; `what`: the folder's name in errors.
     Raises UnreadableFile for a line that is no row, with its place.
@@ -66,7 +66,7 @@ def read_rows(
 
 
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
-    """Yield rows as their jobs end, after appending each to the folder's file; `rows` is closed at the end.
+    """Append each row to the folder's file as its job ends, then yield it; close `rows` at the end.
 
     Raises ValueError for a row with a number that is not finite, unless `allow_nan`.
     """

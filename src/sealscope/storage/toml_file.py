@@ -93,7 +93,7 @@ class PriorTable:
 def read_priors(package: str, kind: type[_T]) -> _T:
     """Read a package's `priors.toml` as the `PriorTable` of its tables.
 
-    A field of `kind` is a `PriorTable` of numbers and tuples, or a mapping to them. Each row of the file has value,
+    A field of `kind` is a `PriorTable` or mapping with numbers and tuples as values. Each row of the file has value,
     unit and source. Raises InputError that names file, table, key and rule.
     """
     place = f"{package.replace('.', '/')}/priors.toml"

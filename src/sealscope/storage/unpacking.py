@@ -15,7 +15,8 @@ _MIN_LIMIT, _MAX_EXPANSION = 2**26, 200
 def max_unpacked_size(path: Path) -> int:
     """Compute the largest size [bytes] that a packed file may unpack to.
 
-    Logs shrink to a tenth, those of constant channels to a hundredth. The holes of a sparse file do not count.
+    It is 200 times the size on the disk, without the holes of a sparse file, but at least 64 MiB and at most 8 GiB.
+    Logs shrink to a tenth, those of constant channels to a hundredth.
     """
     status = path.stat()
     disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say

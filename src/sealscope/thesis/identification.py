@@ -46,7 +46,7 @@ def noise_free_mean_squares(
 ) -> Array:
     """Simulate a condition and compute the noise-free mean squares of d1..d4 [psi^2] and d3d4 [psi^4], (chambers, 5).
 
-    The pressures are sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after the start.
+    The pressures are sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`.
     `leak`: leak as text, sized on the rig; `values`: parameters that override those of the condition; `x_0` [m]: start
     of the piston. Raises the errors of the simulation.
     """
@@ -100,9 +100,9 @@ class Hypothesis:
 
     The identified model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C, however, d3 of
     p_A falls with the leak while d4 of p_B rises. `overrides`: parameters in both halves of a test; `factors`: factors
-    of parameters in both halves; `leaking_factors`: in the half with the leak only; `x_0`, `x_0_leaking` [m]: start of
-    the piston in the two halves; `extra_closing_B`: fraction by which throttle B is closed further than A; `gain_B`:
-    gain of sensor B for changes; `law`: law of the leak.
+    of parameters in both halves; `leaking_factors`: further factors in the half with the leak; `x_0`, `x_0_leaking`
+    [m]: start of the piston in the two halves; `extra_closing_B`: fraction by which throttle B is closed further than
+    A; `gain_B`: gain of the pressure sensor B; `law`: law of the leak.
     """
 
     name: str
@@ -181,7 +181,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate for each hypothesis the leak-free RMS relative to the sheet's, the leak's changes, and the right signs.
+    """Tabulate how well each hypothesis predicts the sheet: leak-free RMS, mean change with the leak, and its sign.
 
     A sign is right if the change with the leak has the sign of the sheet's change in the same test.
     """

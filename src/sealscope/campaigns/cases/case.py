@@ -37,10 +37,11 @@ _NOT_IN_ROWS = (
 
 @dataclass(frozen=True, kw_only=True)
 class CaseInputs:
-    """The inputs and the use of a case's record.
+    """The inputs of one record of a campaign.
 
-    `levels`: factor -> level; `leak_lpm`: mean flow [L/min] of the leak that opens at the plan's onset, with its `law`;
-    `fault`: another fault, as text; `replicate`: number of the record within its cell of the factors.
+    `use`: `calibrate` or `judge` (`RecordGroup`); `leak_lpm`: mean flow [L/min] of the leak from the plan's onset on, 0
+    for none, with its `law`; `fault`: another fault as text, "" for none; `levels`: factor -> level; `replicate`:
+    number of the record within its cell, which is one combination of levels.
     """
 
     id: str
@@ -54,14 +55,14 @@ class CaseInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignCase(CaseInputs):
-    """One record to make and judge; `id` and seeds derive from its content alone, so they are the same anywhere."""
+    """One record to simulate and judge; `id` and the seeds are hashes of its inputs and those shared by the plan."""
 
     machine_seed: int
     noise_seed: int
 
 
 def digest(value: Any) -> str:
-    """Compute the SHA-256 of a value's JSON text."""
+    """Compute the SHA-256 (hex) of a value's JSON text; objects that JSON cannot hold enter by their `repr`."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -85,9 +86,9 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 
 
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Compute digests of the families and controller files that levels name: factor -> level -> digest.
+    """Hash the families and controller files that are levels of a plan: factor -> level -> digest.
 
-    With them in its id, a case changes with its own family or control law, and not with those of other cases.
+    A case's id depends on those of its levels only, so that edits to others leave its stored row valid.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
@@ -99,7 +100,7 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 
 
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
-    """List all cases of a plan; the records of each group are dealt to the cells of the factors in turn."""
+    """List all cases of a plan; the records of each group go in turn to the cells, the combinations of levels."""
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = shared_inputs(plan)
     digests_by_factor = _level_digests(plan)

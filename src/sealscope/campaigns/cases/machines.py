@@ -36,10 +36,10 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case, with its leak as a mean flow, not yet as a coefficient.
+    """Build the experiment of a case; the coefficient of its leak remains to be solved for the mean flow.
 
-    The case's seed draws the machine from the plan's profile; without a profile it is the plan's rig. The case's levels
-    then override parameters, command, controller and load. `profile`: the plan's, if already loaded.
+    The machine is drawn from the plan's profile by the case's seed, or is the plan's rig if there is no profile. The
+    levels of the case override parameters, command, controller and load. `profile`: the plan's, if already loaded.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -75,12 +75,12 @@ def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
 
 
 def _expand_names(values: Mapping[str, str | float]) -> dict[str, str | float]:
-    """Replace short parameter names by full ones; of two entries for one parameter the later counts."""
+    """Replace short parameter names by full ones; a later entry for the same parameter overrides an earlier one."""
     return {resolve_name(name, declared_names()): value for name, value in values.items()}
 
 
 def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Build the short run that sizes an experiment's leaks, which are open from its start."""
+    """Shorten an experiment to `SIZING_SECONDS` with leaks open from the start, to solve for their coefficients."""
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
@@ -89,9 +89,9 @@ def sizing_experiment(experiment: Experiment) -> Experiment:
 
 
 def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
-    """Solve the coefficients of an experiment's leaks that give their mean flows over a short run.
+    """Solve the leak coefficients that give the planned mean flows over a short run (`sizing_experiment`).
 
-    Sizing on the whole record would simulate it two or three times. The mean flow over the record is in its row.
+    Solving on the whole record would simulate it two or three times. The row states the record's true mean flow.
     """
     if not experiment.leaks:
         return ()

@@ -60,7 +60,7 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as a stroke `out` or `in` by the mean of p_A - p_B over its RMS; `both` otherwise."""
+    """Classify a recording as a stroke `out` or `in` by the mean of p_A - p_B over its RMS; `both` if neither."""
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]

@@ -43,8 +43,8 @@ class Statement:
         """Copy the stored fields of evidence, with None for numbers that are not finite."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
-            ends = value if isinstance(value, tuple) else (value,)
-            if any(isinstance(end, float) and not math.isfinite(end) for end in ends):
+            numbers = value if isinstance(value, tuple) else (value,)
+            if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 values[name] = None
         return cls(**values)
 
@@ -75,9 +75,9 @@ def finite_or_none(value: float | None) -> float | None:
 
 
 def named_cause(evidence: Evidence | Statement) -> str:
-    """Infer the named cause from verdict and cause of evidence; a leak counts only under the verdict `leak`.
+    """Return the cause that evidence names: a leak, only with the verdict `leak`; a fault; `none`; or `cannot tell`.
 
-    A verdict `leak` without a cause means a piston leak; without leak and cause the result is `none` or `cannot tell`.
+    The verdict `leak` without a leak as its cause means a piston leak.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK

@@ -24,7 +24,7 @@ INSPECTED = ("u", "x", "p_A", "p_B")
 def judge_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Run each detector of a plan on a recording; return all scores with onsets, and statements except for scorers.
+    """Run each detector of a plan on a recording; return scores with onsets, and the statements of non-scorers.
 
     `split_s` [s]: time on the recording's axis at which scorers split it, None for its middle; `rig`: the rig that
     detectors may assume. Raises InputError if the inspection finds a defect that rules out any verdict.
@@ -62,7 +62,7 @@ def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
 def score_details(
     split_rms: SplitRms, names: Sequence[str], views: Views
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Compute the scores of the scorers among the detectors `names`; their onsets are None."""
+    """Compute (score, None) of each scorer among the detectors `names`; a scorer estimates no onset."""
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
         detector = parse_detector_name(name)
@@ -73,9 +73,9 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Compute the score of a fused verdict relative to its threshold.
+    """Divide the score of `diagnose` by its threshold, or subtract a threshold <= 0; None if either is missing.
 
-    Another detector may decide each record, so that the scores themselves are not comparable.
+    A different detector may decide each record, so that the scores themselves are not comparable.
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:
@@ -84,7 +84,7 @@ def _score_over_threshold(statement: Statement) -> float | None:
 
 
 def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Run the watch of a machine over a recording; return its evidence at the end, which keeps a raised alarm.
+    """Run the watch of a machine over a recording; return its evidence at the end; a raised alarm stays.
 
     `false_alarm`: bound on the probability that a healthy machine raises an alarm within the recording.
     """

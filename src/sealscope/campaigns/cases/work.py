@@ -19,12 +19,12 @@ def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None
 
     The recording is written into `folder`, or discarded if that is None.
     """
-    started = time.process_time()
+    start_time = time.process_time()
     try:
         row = _simulate_and_judge(plan, case, folder)
     except Exception as error:  # a program defect in one case must not end the campaign; its row carries the error
         row = CaseRow.from_case(case, error=error_text(error))
-    return replace(row, seconds=round(time.process_time() - started, 4))
+    return replace(row, seconds=round(time.process_time() - start_time, 4))
 
 
 def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:

@@ -45,7 +45,7 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute first and last (exclusive) sample, (2, 2), of the two parts of a record that scorers compare."""
+    """Compute the samples [begin, end) of the two parts of a record that scorers compare, in rows (2, 2)."""
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
@@ -65,8 +65,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     if plan.keep_recordings:
         raise refusal("keep_recordings = false, got true")
     if np.diff(scored_bounds(plan)).min() < 1:
-        got = f"{plan.duration_s:g} s with {plan.onset_s:g} s"
-        raise refusal(f"records with details on both sides of the onset, got {got}")
+        lengths = f"{plan.duration_s:g} s with {plan.onset_s:g} s"
+        raise refusal(f"records with details on both sides of the onset, got {lengths}")
     for group in plan.records:
         if group.law == "mixture":
             raise refusal("leaks of one law each, got a mixture")
@@ -95,7 +95,7 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
     profile = load_profile(plan.profile) if plan.profile else None
     choose_step = make_step_chooser(plan, profile)
     for start in range(0, len(cases), BATCH_SIZE):
-        started, batch = time.process_time(), cases[start : start + BATCH_SIZE]
+        start_time, batch = time.process_time(), cases[start : start + BATCH_SIZE]
         pairs: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in batch:
@@ -105,7 +105,7 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
             except Exception as error:
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
         rows += _run_batch(plan, pairs, threads)
-        seconds = round((time.process_time() - started) / len(batch), 4)
+        seconds = round((time.process_time() - start_time) / len(batch), 4)
         yield from (replace(row, seconds=seconds) for row in rows)
 
 
@@ -131,7 +131,7 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 
 
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
-    """Solve the leak coefficients of a batch as `size_leaks_on_short_run` does, and shorten steps to resolve them."""
+    """Solve the leak coefficients of a batch on short runs, and shorten steps that are too long for the leak."""
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
     if not leaky:
@@ -156,7 +156,7 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
 def make_step_chooser(
     plan: SimulatedPlan, profile: Profile | None = None
 ) -> Callable[[CampaignCase, Experiment], float]:
-    """Build the function that chooses a case's step [s] independent of all other cases.
+    """Build the function that chooses the solver's step [s] of a case, independently of all other cases.
 
     `integrate` chooses a step by its error on `N_SCOUT_MACHINES` machines drawn for the case's cell. The result is the
     shortest of these steps with the case's method, limited to the longest step that the case's machine allows.
@@ -179,7 +179,7 @@ def make_step_chooser(
         return steps
 
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
-        """Choose the step [s] found for the case's cell and method, else one for this case; at most the stable one."""
+        """Choose the step [s] of the case's cell and method, or else of the case itself, limited to stable steps."""
         method = choose_method(experiment.rig, experiment.method)
         step = cell_steps(*case.levels.items()).get(method)
         if step is None:  # no scout machine has this method

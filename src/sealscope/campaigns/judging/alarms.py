@@ -51,7 +51,7 @@ class AlarmFractions:
 
     @property
     def informedness(self) -> float:
-        """Fraction of alarms minus that of false alarms (Youden's J), 0 for a detector that guesses."""
+        """Fraction of alarms minus that of false alarms (Youden's J), 0 for a guess; nan without false-alarm rate."""
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
@@ -72,17 +72,17 @@ class Alarms:
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
         """Yield alarms for each size of leak, or `pooled` over all sizes; the reference detectors come last.
 
-        `hours`: operating time of a record, for false alarms per hour. Without leaky records, a detector has one row of
-        size 0 with no detections.
+        `hours`: operating time of a record, None to omit false alarms per hour. Without leaky records, a detector has
+        one row of size 0 with alarms in 0 of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():
-            free = [record for record in records if not record.size]
+            leak_free = [record for record in records if not record.size]
             leaky = [record for record in records if record.size]
-            false_alarm = self._proportion(record.alarm for record in free) if free else None
+            false_alarm = self._proportion(record.alarm for record in leak_free) if leak_free else None
             per_hour = None
             if false_alarm and hours:
                 per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, self.confidence)
-            for size, group in group_by(leaky or free, lambda record: math.nan if pooled else record.size).items():
+            for size, group in group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size).items():
                 fractions = self._summarise(name, group, leak_lpm=size)
                 detected = fractions.alarms if leaky else self._proportion(())
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
@@ -95,7 +95,7 @@ class Alarms:
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms for each fault other than a piston leak."""
+        """Yield the alarms for each fault other than a piston leak, on records without a leak."""
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
             for fault, group in group_by(faulty, lambda record: record.row.fault).items():
@@ -123,19 +123,21 @@ class Alarms:
 
     def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
         """Compute the fractions of a group of records; `group_fields` are the fields that define the group."""
-        stating = [(record, record.statement) for record in group if record.statement is not None]
-        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in stating]
+        statements = [(record, record.statement) for record in group if record.statement is not None]
+        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
         names_cause = [
             record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
-            for record, statement in stating
+            for record, statement in statements
         ]
-        without_statement = [False] * (len(group) - len(stating))
+        without_statement = [False] * (len(group) - len(statements))
         return AlarmFractions(
             detector=detector,
             alarms=self._proportion(record.alarm for record in group),
             cannot_tell=self._proportion(record.verdict == CANNOT_TELL for record in group),
-            coverage=self._proportion(ends[0] <= flow <= ends[1] for flow, ends in intervals if ends is not None),
-            named=self._proportion(names_cause + without_statement) if stating else None,
+            coverage=self._proportion(
+                interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None
+            ),
+            named=self._proportion(names_cause + without_statement) if statements else None,
             failed=sum(record.row.error is not None for record in group),
             **group_fields,
         )

@@ -34,7 +34,7 @@ class DetectorPod:
 
 @dataclass(frozen=True)
 class SizeRoc:
-    """One detector's ROC between the judged leak-free records and those with one size of leak (nan: all sizes)."""
+    """One detector's ROC on the judged leak-free records and the records with one size of leak (nan: all sizes)."""
 
     detector: str
     leak_lpm: float
@@ -68,8 +68,8 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
         by_leak: dict[float, list[float]] = {}
         for record, score in zip(records, scores, strict=True):
             by_leak.setdefault(record.size, []).append(min_score - 1.0 if score is None else score)
-        free = by_leak.pop(0.0, [])
+        leak_free = by_leak.pop(0.0, [])
         all_scores = [score for leaky in by_leak.values() for score in leaky]
         for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes
-            if min(len(free), len(leaky)) > 1:
-                yield SizeRoc(name, size, roc_curve(free, leaky, confidence), auc(free, leaky, confidence))
+            if min(len(leak_free), len(leaky)) > 1:
+                yield SizeRoc(name, size, roc_curve(leak_free, leaky, confidence), auc(leak_free, leaky, confidence))

@@ -20,7 +20,7 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 class StatedErrors:
     """Errors of one detector's estimates at one size of leak (0: leak-free records).
 
-    They are errors of the onset [s] in its alarms, or of the flow in all records.
+    The estimates are onsets [s] in its alarms, or leak flows [L/min] in all records.
     """
 
     detector: str
@@ -30,9 +30,9 @@ class StatedErrors:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """Confusion matrix of the true causes and those that one detector names; `none`: neither leak nor fault.
+    """Confusion matrix of the true causes and the causes that one detector names; `none`: neither leak nor fault.
 
-    `covered`: fraction of records for which it names the true cause, also as part of an ambiguous one.
+    `covered`: fraction of records in which it names the true cause, or an ambiguous cause that includes it.
     """
 
     detector: str
@@ -76,13 +76,15 @@ def _iter_errors(
     """Yield the errors of the `stated` (estimate, truth, interval), or nothing if all estimates are missing."""
     estimates = [math.nan if value is None else value for value, _, _ in stated]
     if np.isfinite(estimates).any():
-        low, high = zip(*((math.nan, math.nan) if ends is None else ends for _, _, ends in stated), strict=True)
+        low, high = zip(
+            *((math.nan, math.nan) if interval is None else interval for _, _, interval in stated), strict=True
+        )
         truth = [value for _, value, _ in stated]
         yield StatedErrors(detector, leak_lpm, estimate_errors(estimates, truth, low, high, confidence))
 
 
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
-    """Yield the confusion of true and named causes of each detector that names any, if the records have faults.
+    """Yield the confusion matrix of true and named causes of each detector with statements, if any record has a fault.
 
     A record with a leak and another fault has two true causes and is left out; a failed one counts as `cannot tell`.
     """

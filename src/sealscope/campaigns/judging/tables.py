@@ -25,7 +25,7 @@ _PROPORTION = ("count", "of", "fraction", "low", "high")
 class PriorKnowledge:
     """The information that a detector is given.
 
-    `onset`: whether it is given the true onset of the leak; `channels`: the channels it sees; `rig`: the rig that it
+    `onset`: whether it knows the true onset of the leak; `channels`: the channels it sees; `rig`: the rig that it
     assumes, "" for none.
     """
 
@@ -57,10 +57,10 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the cells of one column of `tables.toml`; a proportion and the levels take several cells.
+    """Build the cells of one entry of `tables.toml`, several for a proportion or the levels of the `factors`.
 
-    `content`: flags, and the path of the value. Flags: "share" for a proportion, with "stated" empty if it counts no
-    records; "size" for a size of leak, nan for any size.
+    `content`: flags, and the path of the value in `row`. "share": a proportion, left empty with "stated" if it counts
+    no records; "size": a size of leak, where nan becomes "any".
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)
@@ -104,7 +104,7 @@ def build_tables(
     }
 
     def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
-        """Build one row; without `knowledge`, columns on what a detector knows (content "known ...") are left out."""
+        """Build one row; columns of prior knowledge (content "known ...") are left out if `knowledge` is empty."""
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and knowledge:
@@ -120,7 +120,7 @@ def build_tables(
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
-    """Build the table of all records in the order of their ids, without run times, as reruns must give equal tables."""
+    """Build the table of all records in the order of their ids; run times are omitted, so that reruns agree."""
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
     stating_detectors = sorted({name for row in ordered for name in row.statements})

@@ -17,7 +17,7 @@ Thresholds = Mapping[tuple[str, str], Threshold]
 
 
 class JudgedRow(NamedTuple):
-    """A row with one detector's verdict, and its statement; None for a scorer or a failed record."""
+    """A row with one detector's verdict and `statement`, which is None for a scorer or a failed record."""
 
     row: CaseRow
     verdict: str
@@ -77,9 +77,10 @@ def compute_thresholds(
 def collect_verdicts(
     rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
-    """Collect each detector's verdicts.
+    """Collect each detector's verdicts on the rows, by detector.
 
-    A scorer's verdict is `leak` if its score exceeds its entry in `limits`, else the threshold of the record's duty.
+    A scorer's verdict is `leak` if its score exceeds a limit: that in `limits`, or that of the record's duty in
+    `thresholds`. It is `cannot tell` without a score or a limit.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:

@@ -49,7 +49,7 @@ class PlanDetector:
 
 @cache
 def parse_detector_name(name: str) -> PlanDetector:
-    """Split a plan's detector name into base and view; the base need not exist (`check_detector`)."""
+    """Split a plan's detector name into base and view, without a check that they exist (`check_detector`)."""
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
         return PlanDetector(name, base, view, SCORERS[base])

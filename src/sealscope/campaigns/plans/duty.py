@@ -61,12 +61,15 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
 
 
 def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
-    """Find the first command that is a voltage and no target for the piston; None if all are targets."""
+    """Find the first command that is a voltage; None if all are targets for the piston's position."""
     return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Return the rig's parameters for both throttles closed by a fraction; 0 leaves `line.orifices` unchanged."""
+    """Return the rig's parameters for both throttles closed by `level`, such as 0.25 or '25 %'.
+
+    A level of 0 leaves `line.orifices` unchanged. Raises InputError for a level below 0, or from 100 % on.
+    """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")

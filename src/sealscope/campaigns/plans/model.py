@@ -124,10 +124,11 @@ class _Plan(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class _JudgedPlan(_Plan):
-    """The fields of plans over records of a machine.
+    """The fields that plans over simulated and over recorded records share.
 
-    `unit`: unit of the leaks' sizes; `views`: sets of channels by the names that `detectors` may use; `channels`: the
-    channels of all other detectors; `assume`: the rig that detectors may assume, with the values `assume_set`.
+    `false_alarm`, `promise`: as in `quantile_threshold`; `unit`: unit of the leaks' sizes; `views`: sets of channels by
+    the names that `detectors` may use; `channels`: the channels of detectors without a view; `assume`: the rig that
+    detectors may assume, with the values `assume_set`.
     """
 
     false_alarm: Fraction = 0.01
@@ -140,7 +141,10 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, rig: Rig | None) -> Rig | None:
-        """Load the rig to assume, by default `rig`, and apply `assume_set` to it."""
+        """Load the rig that detectors may assume, by default `rig`; None if neither is given.
+
+        The values `assume_set` are applied to it, or to the rig `thesis` in place of None.
+        """
         rig = rig if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
             return rig
@@ -151,8 +155,8 @@ class _JudgedPlan(_Plan):
 class SimulatedPlan(_JudgedPlan):
     """A simulated campaign.
 
-    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench from whose nuisances
-    each record is drawn, "" for the rig as it is; `onset_s`: start [s] of the leaks, nan for half of the duration;
+    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench profile from which each
+    record's machine is drawn, "" for the rig as it is; `onset_s`: start [s] of the leaks, nan for half of the duration;
     `factors`: name -> levels, every combination is a cell. The factors `command`, `controller`, `load` and `closed` set
     the duty, `family` selects families of the profile, other names are parameters of the rig. `seed`: base of every
     case's seed; `part`: purpose of the plan, such as development or judging.
@@ -192,8 +196,8 @@ class SimulatedPlan(_JudgedPlan):
 class RecordingSet(_TomlTable):
     """Recordings of one kind.
 
-    `files`: pattern of the files, which are ordered by the numbers in their names; those from `first` up to, but
-    without, `end` belong to the set, counted from 1; `size`: 0 for healthy recordings, else the grade of the leak.
+    `files`: pattern of the files, which are ordered by the numbers in their names; the set is numbers `first` to `end`
+    - 1 of them, counted from 1; `size`: 0 for healthy recordings, else the size of the leak in the plan's `unit`.
     """
 
     files: Annotated[Text, AfterValidator(_validate_pattern)]

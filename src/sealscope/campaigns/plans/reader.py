@@ -56,7 +56,7 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
-    """Build and check the plan in a TOML file's tables; [records] or [recordings] determines its class."""
+    """Build and check a plan from the parsed tables of a TOML file; [records] or [recordings] determines its class."""
     plan = _parse_tables(tree, place)
     plan = replace(plan, title=plan.title or plan.name)
     without_view = {} if plan.channels is None else {"": plan.channels}
@@ -107,7 +107,7 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 
 
 def _path_in_plan_folder(name: str, place: str) -> str:
-    """Return a TOML file's path relative to the plan's folder; return the name of a packaged file unchanged."""
+    """Prefix the name of a TOML file with the plan's folder; return other names, of packaged files, unchanged."""
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
 
@@ -132,7 +132,7 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 
 
 def _check_factors(plan: SimulatedPlan) -> None:
-    """Raise InputError for a repeated or invalid level, too many cells, or a controller without targets."""
+    """Raise InputError for a repeated or invalid level, too many cells, or a controller with a voltage command."""
     for name, levels in plan.factors.items():
         if len({repr(level) for level in levels}) < len(levels):
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
@@ -147,7 +147,7 @@ def _check_factors(plan: SimulatedPlan) -> None:
 
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
-    """Return the commands of a plan: those of its factor, else of its families, else of its profile."""
+    """List the commands of a plan: the levels of its factor, else those of its families, else those of its profile."""
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
     profile = load_profile(plan.profile)

@@ -129,9 +129,9 @@ class Scorer:
 
 
 def _iter_scorers() -> Iterator[Scorer]:
-    """Yield threshold rules on one wavelet detail of one chamber, the thesis's rule on both, and their sign rules.
+    """Yield rules on one wavelet detail of one chamber and the thesis's rule on both, with their sign rules.
 
-    A sign rule fires at any change in its direction, however small.
+    A sign rule has the threshold 0: it fires at any change in its direction.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))

@@ -23,11 +23,11 @@ def cross_check(
     judge: Callable[[SummarisedRecording, tuple[SummarisedRecording, ...]], Diagnosis],
     keep: bool = False,
 ) -> tuple[tuple[SummarisedRecording, ...], tuple[str, ...]]:
-    """Judge each healthy recording by the others; return those that remain, and why each other one is left out.
+    """Diagnose each healthy recording against the others; return those to keep and a reason for each one left out.
 
-    `judge`: diagnoses the recording of the first argument by those of the second; `keep`: leave none out. A recording
-    is left out if it is called leaking, unless half of all are, as then no majority is healthy. If a leak or another
-    event was found in one that remains, the verdict is added to its problems.
+    `judge(recording, reference)` diagnoses a recording against healthy ones. A recording judged leaking is left out,
+    unless `keep`, or unless half or more leak, as then no majority is healthy. If a kept one shows a leak or another
+    event, the verdict is added to its problems. Fewer than `MIN_RECORDINGS` are not judged.
     """
     verdicts, leaking = dict[str, str](), dict[str, str]()
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():

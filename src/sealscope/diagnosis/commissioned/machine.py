@@ -56,8 +56,8 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 class JudgedAlarm(NamedTuple):
     """A person's judgement of an alarm of the monitor.
 
-    `alarm`: its name, "" for a repair without one; `mark`: the judgement, made at `date_s`, on a leak that began at
-    `onset_s` [s since 1970]; `leak_lpm` [L/min] and `reason`, if they are known.
+    `alarm`: name of the alarm, "" for a repair without one; `mark`: "valid", "invalid" or "repaired"; `date_s`: time of
+    the judgement, `onset_s`: begin of the leak, [s since 1970]; `leak_lpm`: its flow [L/min], None if unknown.
     """
 
     alarm: str
@@ -75,7 +75,7 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """The file of a loaded machine, and hashes of its parts, to notice changes by others."""
+    """Path of a loaded machine's file, and hashes of its parts that reveal changes by other processes."""
 
     path: Path
     parts: frozenset[bytes]
@@ -136,7 +136,7 @@ class CommissionedMachine:
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log of the machine by its map; a recording of Sealscope's own is read as it is."""
+        """Read a log of the machine by its channel map, or without the map if the log lacks the map's columns."""
         return read_by_map(path, self.channel_map, self.rate)
 
     def diagnose(
@@ -174,7 +174,7 @@ class CommissionedMachine:
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Return the machine with one more healthy recording, untested for a leak; raise InputError for a copy."""
+        """Add a healthy recording without testing it for a leak; raise InputError for a copy of a known one."""
         summarised = summarise_healthy(recording, assumed_rig(self.rig, recording)[0], file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
@@ -182,10 +182,10 @@ class CommissionedMachine:
         return replace(self, healthy=tuple(healthy))
 
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
-        """Find a leak that a person confirmed, from before `end_s` and not repaired before `start_s` [s since 1970].
+        """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        A judgement is revoked by a later one that calls the alarm invalid, unless that is of a new alarm of the same
-        name: the onset of a new alarm is after the first judgement.
+        A leak is open from its onset until a repair. A later judgement "invalid" of the same alarm revokes it, but not
+        one of a new alarm of the same name, whose onset is after the first judgement.
         """
         for number, leak in enumerate(self.alarms, 1):
             is_revoked = any(
@@ -200,7 +200,10 @@ class CommissionedMachine:
         return None
 
     def since(self, start_s: float) -> CommissionedMachine:
-        """Drop recordings and alarms from before `start_s` [s since 1970]; raise InputError if no recording is left."""
+        """Return the machine without the recordings and alarms from before `start_s` [s since 1970].
+
+        Recordings of an unknown time are dropped, too. Raises InputError if no recording is left.
+        """
         healthy = tuple(
             recording for recording in self.healthy if recording.start_s is not None and recording.start_s >= start_s
         )

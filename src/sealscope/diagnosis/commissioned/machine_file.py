@@ -1,11 +1,11 @@
 """The file of a commissioned machine: TOML that people read and edit, with its summaries in a file next to it.
 
-It is a rig's file, too: `[rig]`, `[motor]` and so on state what is known of it, `[map]` its channels. Beside them
-`[machine]` names it, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]` names a
+It is also a rig's file: `[rig]`, `[motor]` and so on state the machine's parameters, `[map]` its channels. `[machine]`
+names the machine, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]` names a
 recording and the checksum of its summary in that file (`healthy_file`). `[[alarms]]` are judgements of persons.
 
-The summaries are written before the text, with those of the present text and of its backup, `.bak`,
-so that each text finds its summaries whenever a writer is killed.
+The summaries are written before the text. They include those that the present text and its backup, `.bak`, name: no
+text lacks a summary, even if the writer is killed.
 """
 
 from __future__ import annotations
@@ -192,10 +192,10 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
-    """Write the file of summaries, the backup, and the machine's text, so that an interruption leaves no text without.
+    """Write a machine's summaries, then the backup of its present text, then its new text, safe from interruption.
 
-    The file of summaries has those of the machine, those that the present text and its backup name, and further
-    present ones, while it is small. Raises InputError if the text would not be read again.
+    Written are the summaries of the machine, those named by the present text or its backup, and other present ones as
+    long as the file stays below `_SPARE` bytes. Raises InputError if the new text could not be read again.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
@@ -237,7 +237,7 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Hash each part of a machine's text that another process may change; return a description of each by its hash."""
+    """Describe each part of a machine's text that another process may change, by the hash of the part."""
 
     def hash_value(value: Any) -> bytes:
         """Hash a plain value."""
@@ -251,10 +251,10 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Find a part added to, or removed from, a machine's file since it was read, which writing would undo.
+    """Describe a change of a machine's file since it was read that writing would undo; None if there is none.
 
-    `present`, `written`: parts (`_hash_parts`) of the present file, and of the machine to be written, which was read
-    with those of `origin`.
+    The change is a part of the `present` file that is neither in `origin` nor `written`, or a `written` part of
+    `origin` that is no longer present. `present`, `written`: parts by hash (`_hash_parts`).
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -269,7 +269,7 @@ def _read_checked(path: Path) -> dict[str, Any]:
 
 
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
-    """Read the tables of a machine's text at `place` without a check, keys from before version 0.1 renamed."""
+    """Read a machine's text without checks, keys from before version 0.1 renamed; `place`: its path for messages."""
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
     for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
@@ -280,7 +280,7 @@ def _read_tree(path: Path, place: str) -> dict[str, Any]:
 
 
 def _read_if_valid(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's text; none if it cannot be read."""
+    """Read the tables of a machine's text; return an empty mapping if it cannot be read."""
     try:
         return _read_tree(path, str(path))
     except InputError:
@@ -295,7 +295,7 @@ def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return a machine's file of healthy summaries: the one of the same name if it exists, else that its text names."""
+    """Return the path of a machine's summaries: the file of the same name or, if that is absent, one its text names."""
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
     candidates = [path.with_suffix(SUFFIX), path.with_suffix(OLD_SUFFIX)]
@@ -345,7 +345,7 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
     """Format a table as lines of TOML: values and inline tables of plain values first, then the inner tables.
 
-    `path`: its dotted name, "" for the whole file, in which lists are of tables; `heading`: its first line.
+    `path`: dotted name of the table, "" for the whole file, whose lists are arrays of tables; `heading`: first line.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():

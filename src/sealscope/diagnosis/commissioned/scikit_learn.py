@@ -27,7 +27,7 @@ Paths = Sequence[str | os.PathLike[str]]
 
 
 class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
-    """Outlier detector of recordings, in files.
+    """Outlier detector for files of recordings, whose outliers are leaking recordings.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
     Attributes
     ----------
     machine_ : CommissionedMachine
-        What was learnt; set by `fit`.
+        The machine that `fit` commissioned.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ _PRIORS = COMMISSIONED.smallest
 
 
 class TermEstimate(NamedTuple):
-    """A coefficient of the balance: value, standard error, standard deviation between recordings (or None), unit."""
+    """Coefficient of the balance: value, standard error, scatter between recordings (None for a single one), unit."""
 
     value: float
     deviation: float
@@ -47,7 +47,7 @@ class SmallestLeak(NamedTuple):
     """The smallest leak that the next recording detects with the stated probability.
 
     `lpm` [L/min], None if the machine's size is not stated, and `share`, a fraction of the pump's flow; `halved_by`:
-    factor of healthy recordings, and days, that halves it; None if the largest factor tried does not.
+    multiple of healthy recordings and days that halves this leak, None if no multiple tried does.
     """
 
     lpm: float | None
@@ -100,7 +100,7 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, 16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Format the smallest leak, and what halves it, for `n_healthy` recordings, with days if they `are_dated`."""
+        """Format table rows of the smallest leak and of the recordings, and days if they `are_dated`, that halve it."""
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
@@ -219,15 +219,15 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
-    """Estimate the smallest leak that a recording on a later day, of a duty like the healthy ones, detects.
+    """Estimate the smallest leak that is detected in a recording of a later day under the usual duty.
 
-    A leak is detected with the probability `power` if it exceeds the threshold (Student's t) by that quantile. More
-    healthy days lower the threshold and the error of their mean, but not the scatter between recordings.
+    A leak is detected with the probability `power` if it exceeds the threshold of Student's t by the normal quantile of
+    `power`. More healthy days lower the threshold and the error of their mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
     def smallest_rise(n_repeats: int) -> float:
-        """Estimate the smallest rise that is detected, given `n_repeats` times as many healthy days."""
+        """Estimate the smallest detectable rise of the conductance, given `n_repeats` times as many healthy days."""
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 

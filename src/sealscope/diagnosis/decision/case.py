@@ -27,7 +27,7 @@ LEVEL = "against the rig's file"
 
 
 class LeakTest(NamedTuple):
-    """A test of a leak: its score and threshold, its `chance` in a healthy recording, and the allowed `probability`."""
+    """A test of a leak: score, threshold, `chance` of the score without a leak, allowed false-alarm `probability`."""
 
     name: str
     score: float
@@ -37,7 +37,7 @@ class LeakTest(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """An event other than a leak, with its probability, the rarest observable that it explains, and its chance."""
+    """An event other than a leak: its `probability`, the rarest `observable` it explains, and that one's `chance`."""
 
     cause: Cause
     description: str
@@ -78,12 +78,13 @@ class Case:
     def leak_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that a leak past piston or pump caused an alarm.
 
-        A level above the rig's file is a leak, unless another alarm, of a change within the recording, raised it.
+        If rivals are not weighed it is 1. For a level above the rig's limit it is that of an alarm of a step within the
+        recording, which may have raised the level, or 1 without such an alarm.
         """
         if not self.weigh_rivals:
             return 1.0
         if alarm.name == LEVEL:
-            step_alarm = next((other for other in self.alarms if other.name == WITHIN), None)
+            step_alarm = next((test for test in self.alarms if test.name == WITHIN), None)
             return 1.0 if step_alarm is None else self.leak_probability(step_alarm)
         data = RISE if alarm.name == AGAINST and self.leak is not None else self.judge.observables[0].data
         return probability_of(self.explanations, *LEAK_EVENTS, data_kind=data)
@@ -128,8 +129,8 @@ class Case:
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     """Make the tests of a measured leak: a step within the recording, a rise over healthy ones, a level too high.
 
-    The tests share the allowed false-alarm probability. If a step and another test are possible, the fraction
-    `questions.within` is reserved: for the step if the other is a rise, for the level if there is none.
+    The tests share the allowed false-alarm probability. If a step and a rise are tested, the fraction
+    `questions.within` goes to the step; if a step and a level are tested, it goes to the level.
     """
     from scipy.special import ndtr, ndtri
 
@@ -151,7 +152,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key of the null distribution of the leak's step within a recording, as a provider measures it."""
+    """Return the null distribution's key of a step of the leak within a recording, as measured by a provider."""
     return f"{provider}: step"
 
 

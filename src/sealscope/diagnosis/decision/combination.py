@@ -65,7 +65,7 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """State why no detector has a verdict: by the first usable one, else by the one that needs the fewest channels."""
+    """State `cannot tell`, with the reason of the first usable detector, else of the one needing fewest channels."""
     if usable:
         undecided = usable[0]
         needs = next((decision.reason for decision in ranked if decision.detector == ORDER[0]), "")

@@ -143,9 +143,10 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 
 
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
-    """Return a 95 % bound and the largest one that allows `no leak`, [m^3/s], or of the ringing if no flow is measured.
+    """Return the 95 % bound of a leak, and the largest bound that allows `no leak`, both [m^3/s].
 
-    The bound of the ringing's fall is infinite if it cannot exclude a leak: after an alarm, or at a low sampling rate.
+    If no leak is measured, both are changes of the ringing's log RMS. The bound is then infinite after an alarm, or at
+    a sampling rate too low for the ringing to exclude a leak.
     """
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
@@ -165,9 +166,9 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to the evidence what its provider judged, the result of the judging test, and all tests as `parts`.
+    """Add the provider's name and shares, the result of the `judging` test, and all tests as `parts` to the evidence.
 
-    A single test is not repeated as a part. Without a judging test only the provider's figures are added.
+    A single test is not repeated as a part. If `judging` is None, no results of tests are added.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

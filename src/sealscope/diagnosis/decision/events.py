@@ -17,8 +17,8 @@ from sealscope.diagnosis.verdict.evidence import Cause
 class Event:
     """An event of `events.toml`, with its prior probability in a recording.
 
-    `cause`: heading under which it is named, None if it never is; `affected`, `disturbed`: patterns "data: name" of the
-    observables that it changes, and of those that it may change as a side effect; `description` in a reason.
+    `cause`: heading under which a verdict names it, None if none does; `affected`, `disturbed`: patterns "data: name"
+    of observables that it changes, and of those it may change as a side effect; `description`: its words in a reason.
     """
 
     name: str

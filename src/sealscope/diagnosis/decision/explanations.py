@@ -114,9 +114,9 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 def _possible_gains(
     event: Event, factors: Sequence[tuple[Observable, float]], rise: LeakRise | None
 ) -> Sequence[_Gains]:
-    """Compute the log evidence that an event accounts for, by kind of data: one mapping for each possible onset.
+    """Compute the log Bayes factors of an event by kind of data, one mapping for each possible time of its onset.
 
-    The first onset is within the recording; a leak that began before it accounts for the rise alone.
+    The first is for an onset within the recording. A leak may also have begun before: it then explains the rise alone.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -127,9 +127,9 @@ def _possible_gains(
 
 
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
-    """Compute the log Bayes factors that an event explains within the recording, by kind of data.
+    """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    It begins with the observable that it explains best, and explains those that may have changed at the same time.
+    The event begins when the observable that it explains best changes. Others count if they may coincide with it.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -154,8 +154,8 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of an observable against no change.
 
-    That of an alternative to the leak is at most the leak's own plus its log likelihood ratio to the leak: where the
-    leakage of healthy recordings rises, the alternative seems to rise as well.
+    For an alternative to the leak the factor is at most that of the leak's rise plus their log likelihood ratio, as a
+    rise of the leakage makes the alternative seem to rise as well.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:

@@ -46,7 +46,7 @@ class HealthyNull:
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
-        """Compute the chance by the provider's law that has the predictive chance `chance`: invert `calibrate`."""
+        """Invert `calibrate`: compute the chance by the provider's law whose predictive chance is `chance`."""
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
@@ -78,7 +78,7 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 
 
 def null_key(observable: Observable) -> str:
-    """Return the key of an observable's null distribution: of each change, or of all comparisons of a kind of data."""
+    """Return the key of an observable's null distribution: data and name, or the data alone if it is a comparison."""
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 
 

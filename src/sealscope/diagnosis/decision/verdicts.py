@@ -9,7 +9,7 @@ from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, NO_LEAK, Verdict
 
 
 def decide_without_leak(bound: float, max_bound: float) -> Verdict:
-    """Decide on `no leak`, which needs a 95 % upper bound of a leak of at most `max_bound`, or on `cannot tell`."""
+    """Decide `no leak` if the 95 % upper bound of a leak is at most `max_bound`, else `cannot tell`."""
     verdict: Verdict = NO_LEAK if math.isfinite(bound) and bound <= max_bound else CANNOT_TELL
     return verdict
 

@@ -39,10 +39,10 @@ class Detector(Protocol):
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Observe a `usable` recording: numbers, no verdict.
+        """Estimate the observables of a `usable` recording, and test them for changes.
 
-        `baseline`: leak-free recordings of the same machine, at any duty, without copies; if there is none, changes
-        within the recording are looked for.
+        `baseline`: leak-free recordings of the same machine, at any duty, without copies; if empty, only changes within
+        the recording are tested.
         """
         ...
 
@@ -64,7 +64,7 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make the observable of a user's own detector from its chance alone; a piston leak is taken to move it.
+    """Make an observable of a user's own detector from its chance; a piston leak is assumed to change it.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ def limit_threads() -> AbstractContextManager[object]:
 
 
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
-    """Observe rivals of a leak, changes of duty, noise, hum and mean pressures, in the recording and over healthy ones.
+    """Test a recording for rivals of a leak: changes of duty, noise, hum and pressures, also over healthy recordings.
 
     `distrust`: reason why the pressures cannot be judged, or None.
     """
@@ -78,7 +78,7 @@ def run_detector(
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
-    """Run a detector on what it can use, or report why it cannot use the recording or any baseline."""
+    """Run a detector with the baselines it can use, or report why it cannot use the recording or any baseline."""
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
         lack = describe_hold(recording)

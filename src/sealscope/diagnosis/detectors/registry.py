@@ -33,7 +33,7 @@ _RESERVED = ("diagnose", "always fire", "never fire")
 
 @dataclass(frozen=True)
 class PlugIn:
-    """A detector of another distribution: called with a rig it gives the detector made for it."""
+    """Factory of a detector of another distribution: a call with a rig makes the detector for that rig."""
 
     name: str
     distribution: str

@@ -66,7 +66,7 @@ BATCH_SAMPLES = 8192
 
 
 class BlockStream:
-    """Close blocks from a stream of samples, identically for pieces of any size.
+    """Divide a stream of samples into blocks, the same ones however the samples are divided into pushes.
 
     `balances`: of the machine (`terms.equations`); `rate` [Hz]; `block_s`: length of a block [s], rounded to whole
     strides of the weak form; `n_first`: number of first blocks that are weighted together, None for all of the first
@@ -218,7 +218,7 @@ class BlockStream:
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
     def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate the pressures' absolute offsets from the first `n_samples`, and the limits of rests, both once."""
+        """Estimate absolute minus gauge pressure from the first `n_samples`, and limits of rests, once a stream."""
         if self._absolute_offsets is None:
             self._absolute_offsets = {
                 name: _absolute_offset(samples[name][:n_samples]) for name in ("p_A", "p_B") if name in samples
@@ -299,7 +299,7 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float) -> float:
-    """Compute the maximum mean rate at rest from increments (n,): a fraction of the rate in motion, or its noise."""
+    """Compute the rate below which `increments` (n,) are at rest: a fraction of that in motion, or noise if larger."""
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
@@ -342,8 +342,8 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add the decay of the drive's initial state (`START`) to samples, and the pump's speed if only a command is known.
 
-    The speed is the drive's response to the command; a missing command is held, and the speed is NaN there. `loaded`:
-    with the load p_A - p_B; otherwise the speed is that without load, and its droop counts as leakage.
+    The speed is the drive's response to the command, NaN where the command is missing. `loaded`: under the load
+    p_A - p_B; otherwise the speed is that without load, and its droop under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -431,12 +431,12 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         assert blocks is not None  # as many samples as for `recorded`
         return apply_regime(blocks, columns, shut) if may_shut else blocks
 
-    opened = _build_regime(balances, partial(regime_blocks_about, False))
+    open_regime = _build_regime(balances, partial(regime_blocks_about, False))
     if not may_shut or not has_rests(recorded, columns):
-        return RecordedBlocks(opened, None, 0.0)
+        return RecordedBlocks(open_regime, None, 0.0)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut = _build_regime(shut_balances, partial(regime_blocks_about, True))._replace(shut=True)
-    return RecordedBlocks(opened, shut, shut_odds(recorded, columns))
+    shut_regime = _build_regime(shut_balances, partial(regime_blocks_about, True))._replace(shut=True)
+    return RecordedBlocks(open_regime, shut_regime, shut_odds(recorded, columns))
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:

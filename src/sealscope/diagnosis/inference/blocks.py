@@ -111,7 +111,7 @@ class Blocks:
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags of the blocks with motion (K,), in which the pump's mean flow is not that of holding a load."""
+        """Flags (K,) of the blocks in motion, whose mean flow exceeds the one that holds a load."""
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
@@ -153,10 +153,10 @@ class Blocks:
 class ColumnRoles:
     """Indices of one equation's columns in its Gram matrices, by role, and the priors on their coefficients.
 
-    `left`: the left side; `nuisance`: coefficients unknown in any machine; `compared`: these, and those that are fitted
-    only where recordings are compared; `motion`: of the piston; `fast`: free in each block while rows are weighted;
-    `slow`: the same in all blocks. Standard deviations (m - 1,): `drift_rate` [1/min] and `between_deviation` between
-    recordings, infinite if they differ freely, both relative; `level_deviation`. `drivers`: `Term.driver`.
+    `left`: left side; `nuisance`: coefficients unknown in any machine; `compared`: nuisances, and columns fitted if
+    recordings are compared; `motion`: of the piston or the valve's edges; `fast`: coefficients free in each block while
+    rows are weighted; `slow`: common to all blocks. Prior standard deviations (m - 1,): `drift_rate`, relative [1/min];
+    `between_deviation` between recordings, relative, may be infinite; `level_deviation`. `drivers`: `Term.driver`.
     """
 
     def __init__(self, equation: Equation) -> None:
@@ -182,7 +182,7 @@ class ColumnRoles:
         self.healthy_conductance = equation.healthy
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return the roles of the same columns with another one tested in place of the leak, which is compared."""
+        """Return the roles with the column `name` tested in place of the leak, whose changes then have a prior."""
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
         roles.between_deviation[self.leak] = INFERENCE.between.pump
@@ -211,7 +211,7 @@ class ColumnRoles:
 
 
 class Weighting:
-    """Weights of the rows of blocks by their residuals in a fit to these and earlier blocks, and sums of products."""
+    """Huber's weights of the rows of blocks, and the weighted sums over earlier blocks that the fit depends on."""
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
         self._columns = columns
@@ -282,8 +282,8 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
     """Compute the likelihood of one column's coefficient in each block, with all other coefficients eliminated.
 
-    `test`: index of the column; that of the left side tests a change of scale. `replaces`: index of a column to omit.
-    `columns`: of each equation; their likelihoods are multiplied.
+    `test`: index of the column, or of the left side to test a change of scale; `replaces`: index of a column to omit;
+    `columns`: roles in each equation, whose likelihoods are multiplied.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -328,7 +328,7 @@ class _NormalEquations(NamedTuple):
 def _build_normal_equations(
     gram: Array, polynomials: Array, nuisance: list[int], test: int, left: int
 ) -> _NormalEquations:
-    """Sum the blocks' Gram matrices (K, m, m), the nuisance columns times the drift `polynomials` (K, degrees)."""
+    """Build the normal equations from Gram matrices (K, m, m), nuisances times drift `polynomials` (K, degrees)."""
     n, degrees = len(nuisance), polynomials.shape[1]
     size = n * degrees
     # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
@@ -345,9 +345,9 @@ def _build_normal_equations(
 
 
 class _Prior(NamedTuple):
-    """Standard deviations of the nuisance coefficients' `level` and `drift` (c,) and of the last one, the `offset`.
+    """Prior standard deviations of the nuisance coefficients' `level` and `drift` (c,), and of the sensor `offset`.
 
-    `current_offset`: the offset about which the sums were taken; its correction has the mean -`current_offset`.
+    `current_offset`: offset subtracted in the sums; the last coefficient, its error, has the mean -`current_offset`.
     """
 
     level: Array

@@ -67,7 +67,7 @@ def law_priors() -> Array:
 
 
 def _growth_priors() -> list[tuple[float, float]]:
-    """Return pairs of a growth from onset to end, relative to the step, and its prior probability."""
+    """Return the possible growths of a step from onset to end, relative to it, each with its prior probability."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     return [(0.0, prior.steady), *((float(growth), (1.0 - prior.steady) / N_GROWTHS) for growth in growths)]
@@ -110,11 +110,11 @@ class LawWeight(NamedTuple):
 def estimate_rise_flow(
     leak: Information, test: StepTest | None, value: float, deviation: float, laws: Sequence[LawWeight], max_flow: float
 ) -> Flow:
-    """Estimate the mean flow after the onset of a leak that healthy recordings do not have.
+    """Estimate the mean flow of a leak after its onset from the rise of its coefficient over healthy recordings.
 
     The value is that of the most probable law; the other laws contribute to its standard deviation. `leak`: likelihood
-    of the leak's coefficient in the blocks, and `test` of its step; `value`, `deviation`: rise of the coefficient over
-    the whole recording and its standard deviation; `laws`: of `EXPONENTS`; `max_flow`: mean flow of the pump [m^3/s].
+    of the coefficient in the blocks; `test`: of its step, or None; `value`, `deviation`: mean rise over the whole
+    recording and its standard deviation; `laws`: of `EXPONENTS`; `max_flow`: mean flow of the pump [m^3/s].
     """
     log_weights, fractions = _weigh_rise_onsets(leak, test, value)
     unit_flows, law_log_weights = np.array(laws).T
@@ -132,19 +132,19 @@ def estimate_rise_flow(
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
     """Compute log weight and fraction of information after each possible onset of a rise, the recording's start first.
 
-    The rise of the coefficient over the whole recording, `value`, is that fraction of the step after the onset. The
-    weight is the likelihood of such a step, relative to none, over the number of onsets.
+    `value`: rise of the coefficient over the whole recording, which is that fraction of the step after the onset. The
+    weight is the likelihood of such a step, relative to no step, over the number of onsets.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
     positions = _onset_positions(leak, np.arange(len(test.onsets)))
     information = np.maximum(leak.precision.sum(axis=0), 0.0)
-    after = information @ step_shapes(len(information), positions) / max(float(information.sum()), _TINY)
-    step = value / np.maximum(after, MIN_FRACTION)
+    fraction_after = information @ step_shapes(len(information), positions) / max(float(information.sum()), _TINY)
+    step = value / np.maximum(fraction_after, MIN_FRACTION)
     precision = 1.0 / np.maximum(test.deviation, _TINY) ** 2
     log_likelihood = precision * step * (test.size - 0.5 * step) - np.log(len(positions))
-    is_used = after > MIN_FRACTION
-    return np.append(0.0, log_likelihood[is_used]), np.append(1.0, after[is_used])
+    is_used = fraction_after > MIN_FRACTION
+    return np.append(0.0, log_likelihood[is_used]), np.append(1.0, fraction_after[is_used])
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:

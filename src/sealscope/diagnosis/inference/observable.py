@@ -92,7 +92,7 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Rise of the leakage over healthy recordings.
 
-    `step_log_ratio`: log likelihood ratio of the contribution of the step within the recording to no rise.
+    `step_log_ratio`: log likelihood ratio of the rise that the step within the recording would cause to no rise.
     """
 
     rise: Rise
@@ -177,7 +177,7 @@ class LeakMeasure(Protocol):
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Rise over healthy recordings, with the step's contribution; None without recordings."""
+        """Rise over healthy recordings, with the step's contribution; None without healthy recordings."""
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -189,7 +189,7 @@ class LeakMeasure(Protocol):
 
     @property
     def ratio(self) -> Interval | None:
-        """Displacement over area as measured, over the assumed one."""
+        """Measured ratio of displacement to area, relative to the assumed one; None if it is not measured."""
 
     @property
     def remarks(self) -> Sequence[Remark]:

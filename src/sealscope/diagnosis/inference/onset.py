@@ -153,7 +153,7 @@ class StepTest:
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the step that is exceeded with the probability 1 - `probability`, given that there is a step > 0."""
+        """Return the quantile of the step's size at a `probability`, given that the size is > 0."""
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
@@ -172,7 +172,7 @@ class StepTest:
 
 
 def bound_steps(weights: Array, size: Array, deviation: Array, probability: float) -> float:
-    """Compute the step that is exceeded with the probability 1 - `probability`, given that there is a step > 0.
+    """Compute the quantile of a step's size at a `probability`, given that the size is > 0.
 
     `weights`, `size`, `deviation` (k,): probability, step and its standard error for each onset.
     """
@@ -185,7 +185,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
         return max(max_step, 0.0)
 
     def excess_chance(fraction: float) -> float:
-        """Compute the probability of a step above a fraction of `max_step`, minus that wanted."""
+        """Compute the probability of a step above `fraction` of `max_step`, minus the required probability."""
         return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
 
     return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
@@ -422,7 +422,7 @@ def two_sided_step_test(information: Information) -> StepTest | None:
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return time, precision and vector of the blocks, with the prior on the level as one more before the first."""
+    """Return time, precision and vector of the blocks, preceded by a block that stands for the prior on the level."""
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
@@ -442,9 +442,10 @@ def _onset_times(time: Array, positions: Array) -> Array:
 
 
 def _test_step_up(whitened: _Whitened, steps: Array) -> StepTest:
-    """Test readings z (n,) for one of the whitened unit steps (n, o), upwards, by the likelihood ratio to no step.
+    """Test whitened readings z (n,) for a step up at any of o onsets, by the likelihood ratio to no step.
 
-    Both likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
+    `steps` (n, o): whitened unit steps. Both likelihoods are maximised over the variances of walk and noise, with the
+    prior on the walk.
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
     weight, total, moments, energies, residual_squares = _fit_steps(whitened.z, steps, whitened.eigen)

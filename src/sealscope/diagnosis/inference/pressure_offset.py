@@ -87,7 +87,7 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
 
 
 class _WhitenedSteps(NamedTuple):
-    """Effects (n, K) of a unit step from each of K blocks on, of the leak and of the flow's offset; residuals z (n,).
+    """Whitened residuals z (n,), and effects (n, K) on z of unit steps of leak and flow offset from each block on.
 
     The effect of the leak's step includes the recorded mean pressure difference.
     """
@@ -118,9 +118,9 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
         return None
     root = np.sqrt(values[is_informative])
     design = (vectors[:, is_informative] * root).T * scale
-    removed = design @ trend_and_drift
-    removed /= np.maximum(np.linalg.norm(removed, axis=0), np.finfo(float).tiny)
-    complement = np.linalg.qr(removed, mode="complete")[0][:, removed.shape[1] :].T  # orthogonal to trend and drift
+    fixed = design @ trend_and_drift
+    fixed /= np.maximum(np.linalg.norm(fixed, axis=0), np.finfo(float).tiny)
+    complement = np.linalg.qr(fixed, mode="complete")[0][:, fixed.shape[1] :].T  # orthogonal to trend and drift
     z = complement @ ((vectors[:, is_informative].T @ (vector / scale)) / root)
     unit_steps = np.tril(np.ones((count, count)))
     flow_offset = complement @ design[:, count:]

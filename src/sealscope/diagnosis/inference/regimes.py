@@ -78,10 +78,10 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     at_rest, bias = (roles.names.index(name) for name in RESTS)
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
-    fitted = [*roles.nuisance, at_rest, bias]
-    grams, moments = gram[:, fitted][:, :, fitted], gram[:, fitted, roles.left]
+    columns = [*roles.nuisance, at_rest, bias]
+    grams, moments = gram[:, columns][:, :, columns], gram[:, columns, roles.left]
     coefficients, covariance = _fit_with_robust_covariance(grams, moments)
-    leaks = [fitted.index(roles.leak), fitted.index(at_rest)]
+    leaks = [columns.index(roles.leak), columns.index(at_rest)]
     motion, extra_at_rest = coefficients[leaks]  # the columns add up: the leak at rest is the sum of both
     rest_variance, extra_variance = float(covariance[np.ix_(leaks, leaks)].sum()), float(covariance[leaks[1], leaks[1]])
     if not (rest_variance > 0.0 and extra_variance > 0.0):

@@ -135,7 +135,7 @@ class Signals:
         return np.asarray(self.speed >= 0.0)
 
     def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Return 1 for each interval in which the pump, by its volume, or the piston stands still, else 0."""
+        """Return 1 for each interval (n - 1,) in which the piston, or the pump by its volume, stands still, else 0."""
         limits = self._rest_limits
         if limits is None:
             return np.zeros_like(self.time_step)
@@ -390,8 +390,8 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
 def _chamber_equation(side: str, rig: Rig) -> Equation:
     """Make the balance of one chamber behind a valve: the piston displaces the flow of its edges.
 
-    An overlap of the edges reduces the flow in both directions like a leak driven by the friction's pressure; only the
-    prior on a healthy piston separates the two, and a change of friction from a leak.
+    An overlap of the edges reduces the flow in both directions like a leak under the pressure of friction. Only the
+    prior on a healthy piston separates the two, and a leak from a change of friction.
     """
     area, is_A = (rig.cylinder.A_A, True) if side == "A" else (rig.cylinder.A_B, False)
     sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return

@@ -58,10 +58,10 @@ N_WAKING: int = _PRIORS.wakes
 class BlockConductance(NamedTuple):
     """State of the machine in one block.
 
-    `begin`, `end` of its samples [s]; `g`, `sd`: conductance of pump and piston and its standard error [m^3/(s Pa)], to
-    compare between blocks: better estimates of the other coefficients do not shift it; `total`: the conductance by the
-    present estimates of these, with the further standard error `offset`; `pressure`: mean of abs(p_A - p_B) [Pa];
-    `pump_flow`: mean magnitude of the flow that moves the piston [m^3/s].
+    `begin`, `end` of its samples [s]; `g`, `sd`: conductance of pump and piston and its standard error [m^3/(s Pa)],
+    comparable between blocks, as later estimates of the other coefficients do not shift it; `total`: conductance by the
+    latest estimates of the other coefficients, whose errors and that of the machine's size add the standard error
+    `offset`; `pressure`: mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean abs of the flow that moves the piston [m^3/s].
     """
 
     begin: float
@@ -97,7 +97,7 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Make the reason for a block that is counted under its status."""
+        """Make a reason whose status also names the counter to raise."""
         return cls(end, status, f"blocks: {status}", restarts)
 
 
@@ -199,7 +199,7 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process the blocks that a batch of samples completed, with their samples; yield the result of each."""
+        """Process completed blocks, each with its stored samples; yield the result of each."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
@@ -246,7 +246,7 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the motion of a block (a mean square) over the usual one."""
+        """Compute the mean square of a block's left side, relative to that of earlier blocks."""
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
@@ -271,7 +271,7 @@ class LiveBalance:
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop all coefficients, after a repair or an exchange; learn anew from the blocks `since` a clock [s]."""
+        """Drop all coefficients, as after a repair, and learn them anew from the blocks begun `since` a time [s]."""
         for model in self._models:
             for values in model:
                 values[:] = 0.0

@@ -39,7 +39,8 @@ class Coefficients(NamedTuple):
     """Coefficients of n nuisances with the sums that they rest on, and arrays to work in.
 
     `sums` (n + 2, n + 2); `values` (n,); `leak_products` (n,), products of the leak's column with the nuisances;
-    `numbers` (6,). To work in: `block` (n + 2, n + 2), sums of one block; `matrix` (n, n + 3), normal equations.
+    `numbers` (6,), by `ROWS` to `MISFIT`. To work in: `block` (n + 2, n + 2), sums of one block; `matrix` (n, n + 3),
+    normal equations.
     """
 
     sums: Any

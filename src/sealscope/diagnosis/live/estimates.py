@@ -97,7 +97,7 @@ class HealthyLevel:
     """Leakage conductance of a healthy machine in `count` recordings, or means of successive blocks.
 
     `level`, `low`, `high`, `deviation`: mean, minimum, maximum and standard deviation of these [m^3/(s Pa)]; `known_s`:
-    clock up to which it is known [s], of recordings the start of the last one.
+    time until which the machine is known to be healthy [s], with recordings the start of the last one.
     """
 
     level: float
@@ -127,11 +127,11 @@ class WatchBaseline(HealthyLevel):
 def find_level_rise(
     healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
 ) -> LiveRise | None:
-    """Estimate the rise of a mean conductance over a healthy level, or return None if none is shown.
+    """Estimate the rise of a mean conductance `g` over a healthy level, or return None if it is not significant.
 
-    Two tests must show it at the false-alarm `probability`: against the least healthy mean with the warmest oil, and
-    against the mean of the healthy means by their scatter (Student's t, B. L. Welch's degrees of freedom). `g`: the
-    mean, with its standard `deviation`; `onset`: of the rise, if there is one.
+    Both tests must be significant at the false-alarm `probability`: of g against the minimum of the healthy means with
+    the warmest oil, and against their average by their scatter (Student's t, B. L. Welch's degrees of freedom).
+    `deviation`: standard error of g; `onset`: stated for the rise.
     """
     from scipy.special import ndtr, ndtri
 
@@ -171,7 +171,7 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether a duty is in the range `low` to `high` and a margin, larger below, as a leak lowers the pressure."""
+    """Test whether a duty is from `low` to `high` with a margin, larger for low pressures, as a leak lowers them."""
     margin = LIVE.watch.margin
     min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)
     return all(lower <= value <= upper + margin for value, lower, upper in zip(duty, min_duty, high, strict=True))

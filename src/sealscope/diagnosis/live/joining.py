@@ -68,10 +68,10 @@ class SampleRun(NamedTuple):
 class SampleJoiner:
     """Divide the samples of an actuator into runs without a gap.
 
-    `ways`: channels that it may be watched by (`ways_to_watch`); `names`: those that it is watched by, which a position
-    that is recorded later changes unless `is_final`. `late_s`: samples up to this much older than the `newest` are late
-    or repeated, and dropped; older ones show that the clock was set back. `changed`: the rate is another than that of
-    the last run. `counters`: samples that were dropped and interruptions, by reason.
+    `ways`: sets of channels that suffice (`ways_to_watch`); `names`: the set in use, replaced if a position is recorded
+    later, unless `is_final`. Samples up to `late_s` older than the `newest` one [s] are late or repeated, and dropped;
+    older ones show that the clock was set back. `changed`: the `rate` differs from that of the last run. `counters`:
+    numbers of dropped samples and of interruptions, by reason.
     """
 
     ways: tuple[tuple[str, ...], ...]
@@ -115,7 +115,7 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels to watch by: those so far, the best recorded ones at first or if a position is new."""
+        """Choose the channels to watch by: the best recorded set at first or once a position appears, else `names`."""
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names

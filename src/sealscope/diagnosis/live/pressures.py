@@ -58,7 +58,7 @@ class PressureEstimator:
     `rig`: prior of the machine; `litres`: whether it states the sizes that L/min need. Only changes of the conductance
     are stated (`states_level`), with a relative error `size_error`. An orifice of the same apparent conductance passes
     `orifice_factor` times the flow of a laminar leak, which widens the upper end of an interval;
-    `min_internal_fraction`: of an apparent leak, surely internal.
+    `min_internal_fraction`: fraction of an apparent leak that is internal, at least.
     """
 
     method, data, states_level = "pressures", RESPONSE, False
@@ -107,7 +107,7 @@ class PressureEstimator:
         self._samples = samples.copy()
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
-        """Set hanging pressure readings in the first `n_block` samples to nan; False if later ones must decide."""
+        """Set stuck pressure readings in the first `n_block` samples to nan; return False if later ones must decide."""
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         if min(hold.pending for hold in holds) < n_block:
             return False

@@ -112,9 +112,9 @@ class LiveLeak:
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide on a watched machine by its leakage, or state in one line the `lack` of blocks to estimate it from.
+    """Decide whether a watched machine leaks; `lack`: why there is no estimate of its `leak`, in one line.
 
-    The rivals of a leak are weighed once, when its test raises an alarm (`explanation`).
+    Rivals of the leak are not weighed here, but once, when its test raises an alarm (`explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

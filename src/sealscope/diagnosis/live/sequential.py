@@ -82,7 +82,7 @@ class StepDetector:
         self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
 
     def is_representable(self, g: float, deviation: float) -> bool:
-        """Test whether the squares of a block's estimate and `deviation`, over the first deviation, fit into floats."""
+        """Test whether the squares of `g` and its `deviation`, in units of the first deviation, fit into floats."""
         unit = self._unit or deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
@@ -199,7 +199,7 @@ class StepDetector:
         return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Compute the rise exceeded with probability 1 - `probability`, given that there is one; inf without onsets."""
+        """Compute the quantile of the rise at a `probability`, given that the rise is > 0; inf without onsets."""
         if not len(self._onsets):
             return np.inf
         a, b, T = self._sums[_A : _T + 1]

@@ -143,7 +143,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Conditions of the baseline, the rig, whether it states L/min by way of watching, and hours of learning."""
+        """Conditions of the baseline: rig, whether it states L/min for each way of watching, and learning time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -182,7 +182,7 @@ class Watch:
         return decide_on_stream(measure, probability)
 
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Describe the leak that a test has shown, or if there is none the upper bound of an undetected one."""
+        """Describe the detected `leak`, or if it is None the upper bound of an undetected one."""
         make_measure = partial(
             LiveLeak,
             flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
@@ -220,7 +220,7 @@ class Watch:
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
         """Yield the estimate of each block (`update`) with the leak known by then.
 
-        Iterate to the end, as samples are processed only then.
+        Iterate to the end, as samples are processed only as the iterator advances.
         """
         if not follows:
             self._samples.restart("pauses between samples")
@@ -389,7 +389,7 @@ class Watch:
         return explanation
 
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Test the mean of the last `GROUP` blocks against the baseline, before there is one the healthy recordings."""
+        """Test the mean of the last `GROUP` blocks against the baseline or, until it exists, the healthy recordings."""
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
         if healthy is None:
@@ -425,10 +425,10 @@ class Watch:
         before: float | None = None,
         cause: Cause | None = None,
     ) -> None:
-        """Set the leak from a rise that a test shows, at the end of a block.
+        """Set the present leak from a significant rise, at the end of a block.
 
-        `before`: conductance before the onset; None: the mean of the blocks before. Of a leak that was raised before,
-        conductance and time of the alarm stay. `cause`: None means that of all the estimator's leaks.
+        `before`: conductance before the onset, by default the mean of the blocks before it; `cause`: by default that of
+        the estimator. A leak that was already raised keeps its conductance before and the time of its alarm.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -462,9 +462,9 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows of the last block's estimate by means over cycles of the duty, as those of a recording are.
+        """Replace the flows of the last block's estimate by means over more blocks, and thus over cycles of the duty.
 
-        The means are over the last `RECENT` blocks since an interruption, or since the onset of a leak.
+        The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):

@@ -33,11 +33,11 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 class RmsBlocks:
     """Log RMS of every quantity (`QUANTITIES`) in the n blocks without missing samples.
 
-    `edges` (n + 1,): where each block begins and the last ends [s]; `log_rms` (n, 5 per chamber), `duty` (n, 4): log
-    RMS of the command, of its rate of change, and of the pressure difference, and the mean of the latter over its RMS,
-    all without the mean of the block's phase; `chambers`: their names; `phases`: blocks a cycle; `cycle` of the command
-    [s], None if there is none; `frozen`: the first block in which a reading does not move, as text (its log RMS means
-    nothing); `n_left_out`: number of blocks with missing samples.
+    `edges` (n + 1,): begin of each block and end of the last one [s]; `log_rms` (n, 5 per chamber); `duty` (n, 4): log
+    RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp) / RMS(dp). Differences
+    between the phases of a cycle are removed from both. `phases`: blocks a cycle; `cycle` of the command [s], or None;
+    `frozen`: text on the first block in which a reading does not move, so that its log RMS means nothing, or None;
+    `n_left_out`: number of blocks with missing samples.
     """
 
     edges: Array

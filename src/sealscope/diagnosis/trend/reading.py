@@ -241,7 +241,7 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 
 
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """List findings on the clock, on groups, and on readings left out, one for each reason apart from its numbers."""
+    """List findings on the clock, on groups, and on readings left out, one for reasons that differ in numbers only."""
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
     for point in points:

@@ -385,7 +385,7 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the compared levels to the trend's unit and to the oil temperature of the first recording.
 
     The unit is L/min at the trend's pressure, or % of the usual level, the mean of the healthy recordings. Levels are
-    conductances [m^3/(s Pa)], but those of the ringing logarithms, whose differences from the usual one become %.
+    conductances [m^3/(s Pa)]; those of the ringing are logarithms, whose differences from the usual one become %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (

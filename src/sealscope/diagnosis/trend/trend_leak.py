@@ -60,7 +60,7 @@ class TrendLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The rise, with no step within a recording as its rival."""
+        """The rise, of which no step within a recording explains a part; None without a rise."""
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
@@ -85,8 +85,9 @@ def decide_trend(
 ) -> Evidence:
     """Decide whether leakage has risen since the last repair, by the compared recordings since then, in time order.
 
-    `pressure`: difference for which L/min are stated [Pa], None if the levels are relative; `interval`: typical time
-    between two recordings [days]; `years`: machine-years to a false alarm.
+    `trend_units_per_level`: factor from levels of readings to the trend's unit; `pressure`: difference for which L/min
+    are stated [Pa], None if the levels are relative; `interval`: typical time between two recordings [days]; `years`:
+    machine-years to a false alarm.
     """
     wear = episode.wear
     # interval over the mean time to a false alarm of this score

@@ -117,10 +117,10 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute the part of each value (n,) to ignore as an outlier: while it is the last, and once the next is known.
+    """Compute the excess of each value (n,) to ignore as an outlier: while the value is the last one, and afterwards.
 
-    That is its distance from the median of the three values before it, in excess of `outlier` standard deviations, or 0
-    if the value before or after it lies as far out on the same side.
+    It is the distance from the median of the three values before, less `outlier` standard deviations, or 0 if the value
+    before or after lies as far out on the same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -329,7 +329,7 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rises (d,) of the last recording's level by the drawn changes, whose hypotheses are `changes`."""
+        """Compute the rise (d,) of the last recording's level due to each draw from the hypotheses `changes`."""
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
@@ -463,9 +463,9 @@ def find_episodes(
 
 
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
-    """Find the first recording after the first repair; the number of recordings if there is none.
+    """Find the index of the first recording after the first repair; the number of recordings if there is none.
 
-    `days`: mean time to a false alarm. After an alarm of the `rise` the level is compared with the worn machine's.
+    `days`: mean time to a false alarm. If the `rise` has raised an alarm, the fall is tested from the worn level on.
     """
     fall, worn_from = score_changes(levels, n_healthy, falls=True), 0
     alarm, repair = rise.find_alarm(days), fall.find_alarm(days)

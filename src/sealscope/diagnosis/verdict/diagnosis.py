@@ -62,7 +62,7 @@ class Diagnosis(Evidence):
     start : str, optional
         When the recording began, as ISO 8601, if the file states it.
     unused : tuple of str
-        Recorded pressures, positions, speeds and flows that no channel is made of.
+        Recorded pressures, positions, speeds and flows that are read into no channel.
     pressure_unit : str
         Unit in which its texts state pressures: that of the log, else bar.
 
@@ -97,7 +97,7 @@ class Diagnosis(Evidence):
     ) -> Diagnosis:
         """Make the diagnosis of a recording from its evidence and the file's own statements.
 
-        `file`: name of the recording, by default that of its file; `fields`: the other ones.
+        `file`: name of the recording, by default that of its file; `fields`: remaining fields of `Diagnosis`.
         """
         if evidence.relative is None:
             evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
@@ -126,9 +126,9 @@ class Diagnosis(Evidence):
 
     @property
     def repair_lpm(self) -> float | None:
-        """Repair limit on the axis of the leak over time [L/min]; None if it cannot be stated as a flow.
+        """Repair limit for the plot of `course` [L/min]; None if it cannot be stated as a flow.
 
-        It counts from the healthy level if the total leakage is drawn: from its median before the onset.
+        If the course is the total leakage, its median before the onset, without a leak from the start, is added.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None or not course.whole:
@@ -144,7 +144,7 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Displacement over area as measured, over the assumed one, and its interval; None if not measured."""
+        """Measured ratio of displacement to area, relative to the assumed one, and its interval; None if unknown."""
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
                 return decision.ratio, decision.ratio_interval

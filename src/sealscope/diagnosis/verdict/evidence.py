@@ -42,7 +42,7 @@ class LeakCourse:
     """Leak over a recording.
 
     Estimates `lpm` (k,) [L/min] at the instants `t` (k,) [s], each with its 95 % interval `low`, `high` (k,). `whole`:
-    they are all that pump and piston together pass, as where no leak began; else what came with the leak.
+    True for the total flow past pump and piston, if no leak began; False for its rise since the onset of a leak.
     """
 
     t: Array
@@ -105,7 +105,7 @@ class Evidence:
     score, threshold : float, optional
         A leak is reported if the score exceeds the threshold.
     onset_s, onset_interval_s : float and pair of floats, optional
-        Time since when oil leaks, on the recording's time axis, and its 95 % interval [s].
+        Time at which the leak began, on the recording's time axis, and its 95 % interval [s].
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
         Mean flow past the piston while the leak is open, and its 95 % interval [L/min].
     parts : tuple of Evidence
@@ -118,7 +118,7 @@ class Evidence:
     refuses : frozenset of {"onset_s", "leak_lpm"}
         Figures that the detector has a reason not to state, as opposed to those it cannot compute.
     total_leakage : TotalLeakage, optional
-        What pump and piston pass together, where the detector measures it.
+        Total flow past pump and piston, where the detector measures it.
     share : float
         Share of the recording, 0 to 1, that the verdict rests on.
     judged_until : float
@@ -134,7 +134,7 @@ class Evidence:
     relative : RelativeLeak, optional
         The leak relative to the recording's own measurements; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
-        Displacement over area as measured, over the assumed one, and its 95 % interval.
+        Measured ratio of displacement to area, relative to the assumed one, and its 95 % interval.
     bound_lpm : float, optional
         95 % upper bound of a leak [L/min] if none is reported.
     """

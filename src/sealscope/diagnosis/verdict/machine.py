@@ -25,9 +25,9 @@ class AssumedMachine:
 
     `rig`: its name; `stated_by` the call (`--rig` or a Rig), the recording's provenance, or nobody;
     `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
-    `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether flows are a
-    meter's, `q_pump`, and rest on neither; `areas` of sides A and B [m^2]; `bypass`: whether a flow meter in a bypass
-    of the cylinder was recorded.
+    `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether a meter, `q_pump`,
+    measures the flows, which then need neither; `areas` of sides A and B [m^2]; `bypass`: whether a flow meter in a
+    bypass of the cylinder was recorded.
     """
 
     rig: str
@@ -86,7 +86,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Test whether a rig was stated, not the default one with only area or displacement stated."""
+    """Test whether a whole rig was stated, as opposed to the default rig with at most areas or displacement stated."""
     # nobody states the mass alone: it is assumed for want of a rig, or it is the rig's
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 

@@ -85,7 +85,7 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the leak's interval: `repair` if all over the limit, `monitor` if under half of it, else `plan`.
+        """Level by the leak's interval: `repair` if all above the limit, `monitor` if below half of it, else `plan`.
 
         None if the leak is not known in the limit's unit.
         """

@@ -56,8 +56,8 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine under a condition of `states.toml`; KeyError for an unknown condition.
 
-    `cause`: of the change, which proposes the action, and decides the state unless the machine leaks past piston or
-    pump; `since_s`: clock [s]; `action`: in place of the table's.
+    `cause` of the change sets the action, and the state unless the machine leaks past piston or pump; `since_s`: begin
+    of the state [s]; `action`: in place of the table's.
     """
     tables = _tables()
     condition_row, cause_row = tables["conditions"][condition], tables["causes"].get(cause or "", {})

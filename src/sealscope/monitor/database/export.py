@@ -29,7 +29,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     """
     events = _events_by_alarm(store)
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
-    rows, labelled = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
+    rows, intervals = [], defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     for alarm in sorted(reversed(store.alarms()), key=lambda alarm: float(alarm["raised_s"])):
         history = events[alarm["id"]]
         last_mark = next((event for event in reversed(history) if event["event"] in _LABELS), None)
@@ -46,7 +46,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         if last_mark is not None:
             start, label = alarm["onset_s"] if onset[0] is None else onset[0], _LABELS[last_mark["event"]]
             labels = {"label": label, "alarm": alarm["id"]}
-            labelled[alarm["actuator"]].append((start, last_mark["t"], labels))
+            intervals[alarm["actuator"]].append((start, last_mark["t"], labels))
 
     n_estimates = 0
 
@@ -54,7 +54,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         """Yield the rows of the estimates, and count them."""
         nonlocal n_estimates
         for n_estimates, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
-            labels = [labels for start, stop, labels in labelled[row["actuator"]] if start <= row["t"] <= stop]
+            labels = [labels for start, stop, labels in intervals[row["actuator"]] if start <= row["t"] <= stop]
             yield _select_columns({**row, **(labels[-1] if labels else {})}, ESTIMATE_COLUMNS)
 
     write_csv(folder / "alarms.csv", ALARM_COLUMNS, [_select_columns(row, ALARM_COLUMNS) for row in rows])

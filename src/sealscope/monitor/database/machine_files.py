@@ -19,7 +19,7 @@ from sealscope.storage.toml_file import read_toml
 
 
 def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
-    """Write a person's mark of an alarm into a machine's file, and return a line that states the result.
+    """Write a person's mark of an alarm into the machine's file `rig`, and return a line that states the result.
 
     The `samples` before an `invalid` mark are added as a healthy recording, unless the machine judges them leaking.
     After a `valid` mark no recording from the onset on becomes healthy until a repair. Returns "" for any other mark,
@@ -35,13 +35,13 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         # a machine's file has times since 1970; the samples' clock may start anywhere
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
         leak_lpm = None if mark == "invalid" else alarm.leak_lpm
-        judged = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak_lpm, reason)
+        judgement = JudgedAlarm(name, mark, time.time(), alarm.onset_s + shift, leak_lpm, reason)
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
             """Add the alarm to a machine, and after an invalid one its samples as healthy."""
             nonlocal outcome
-            machine = replace(machine, alarms=(*machine.alarms, judged))
+            machine = replace(machine, alarms=(*machine.alarms, judgement))
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_combine_samples(samples, shift), file=name)

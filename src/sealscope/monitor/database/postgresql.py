@@ -46,11 +46,14 @@ def limit_answers(engine: Engine) -> None:
         """A connection, closed if the server does not answer in time."""
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
-            """Wait for the end of a driver's generator, which psycopg calls for each answer."""
+            """Run a generator of the driver, with which psycopg waits for an answer, under the time limit."""
             return super().wait(self._limited(gen), *arguments, **options)
 
         def _limited(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run a driver's generator until its deadline; psycopg resumes it several times a second meanwhile."""
+            """Close the connection and raise OperationalError if `gen` gets no answer for `ANSWER_S`.
+
+            Psycopg resumes the generator several times a second, also without an answer.
+            """
             last_answer, ready = time.monotonic(), None
             while True:
                 try:

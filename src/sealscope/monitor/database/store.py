@@ -66,11 +66,11 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add samples, with the verdict on them, that a restart judges again after loading the checkpoint."""
+        """Add the samples and verdict of block `number` since the checkpoint, which a restart judges again."""
         self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state; if `kind` is not empty, also an event with a person's name and comment."""
+        """Add an alarm in its present state, and unless `kind` is empty an event at `t` [s] with a person's comment."""
         actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
@@ -92,7 +92,7 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """Samples of a block; whether they continue those before; the verdict on them if they are a whole recording."""
+    """Samples of a block, whether they continue those before, and the verdict, None if they are not a recording."""
 
     samples: Recording
     follows: bool
@@ -129,7 +129,7 @@ class MonitorStore:
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {version} ({database})")
 
     def _prepare_tables(self, attempts: int) -> str:
-        """Create missing tables, and return the version of the database."""
+        """Create missing tables, in up to `attempts` tries, and return the schema version of the database."""
         facts = tables.facts
         try:
             with self.engine.begin() as connection:
@@ -218,10 +218,10 @@ class MonitorStore:
         for table in (tables.actuators, tables.summaries, tables.alarms):
             self.upsert(connection, table, [*getattr(rows, table.name).values()])
         for table, last_numbers in ((tables.blocks, rows.old_blocks), (tables.estimates, rows.old_estimates)):
-            old = [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]
-            if old:
+            last_old_rows = [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]
+            if last_old_rows:
                 is_old = (table.c.actuator == actuator) & (table.c.number <= bindparam("last"))
-                connection.execute(table.delete().where(is_old), old)
+                connection.execute(table.delete().where(is_old), last_old_rows)
 
     def commit_rows(self, rows: StoredRows) -> None:
         """Store rows in a transaction of their own."""
@@ -275,7 +275,7 @@ class MonitorStore:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
-        """Return the number of an actuator's last row of a table, `tables.blocks` or `tables.estimates`."""
+        """Return the highest number of an actuator's rows of `table` (blocks or estimates), 0 if there are none."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
@@ -321,9 +321,9 @@ class MonitorStore:
         return [_event_from_row(row) for row in self._rows(query)]
 
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
-        """Return the estimates of an actuator, as means of so many successive ones that about `max_rows` rows result.
+        """Return the estimates of an actuator, averaged over successive ones to at most about `max_rows` rows.
 
-        `seconds`: length of the time before the newest estimate, None for all.
+        `seconds`: length of the history before the newest estimate [s], None for all of it.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator

@@ -80,11 +80,11 @@ class SparkplugNode:
                 if actuator not in self._sent_values:
                     self._send_device_birth(actuator, summary, {})
                     continue
-                sent, present = self._sent_values[actuator], _metric_values("summary", summary)
-                changed = {name: value for name, value in present.items() if value != sent[name]}
-                metrics = _build_metrics("summary", changed, _milliseconds(summary["t"]))
-                if changed and self._send("DDATA", metrics, actuator):
-                    sent.update(changed)
+                sent_values, present_values = self._sent_values[actuator], _metric_values("summary", summary)
+                changed_values = {name: value for name, value in present_values.items() if value != sent_values[name]}
+                metrics = _build_metrics("summary", changed_values, _milliseconds(summary["t"]))
+                if changed_values and self._send("DDATA", metrics, actuator):
+                    sent_values.update(changed_values)
 
     def end(self) -> None:
         """Send the remaining events and disconnect."""

@@ -62,10 +62,10 @@ class Admission:
 def _network(address: str) -> str:
     """Return the /64 network of an IPv6 address, any other address unchanged."""
     try:
-        parsed = ipaddress.ip_address(address)
+        ip_address = ipaddress.ip_address(address)
     except ValueError:
         return address
-    return str(ipaddress.ip_network((parsed, 64), strict=False)) if parsed.version == 6 else address
+    return str(ipaddress.ip_network((ip_address, 64), strict=False)) if ip_address.version == 6 else address
 
 
 def connection_limit() -> int:
@@ -80,7 +80,7 @@ def connection_limit() -> int:
 
 
 def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asyncio.Protocol]:
-    """Derive a protocol from uvicorn's HTTP protocol with limits of connections and of their silence `silent_s` [s].
+    """Derive from uvicorn's HTTP protocol a class that limits the connections, and their silence to `silent_s` [s].
 
     Above the limit the connection that has been silent for longest is closed, or the new one if all others are being
     answered.
@@ -98,9 +98,9 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:
                 silent = [other for other in self.connections if other is not self and not other.is_sending_answer()]
-                closed = min(silent, key=lambda other: other.last_activity, default=self)
-                closed.transport.abort()
-                self.connections.discard(closed)  # a closed one must not be chosen again
+                surplus = min(silent, key=lambda other: other.last_activity, default=self)
+                surplus.transport.abort()
+                self.connections.discard(surplus)  # a closed one must not be chosen again
             self.loop.call_later(_CHECK_INTERVAL_S, self.check_silence)
 
         def is_sending_answer(self) -> bool:

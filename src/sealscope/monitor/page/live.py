@@ -151,13 +151,13 @@ class LiveSamples:
 
 
 def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
-    """Round numbers to so many decimals, with None for those not finite."""
-    rounded = np.round(values, digits)
-    return [value if math.isfinite(value) else None for value in rounded.tolist()]
+    """Round numbers to `digits` decimals; those that are not finite become None."""
+    rounded_values = np.round(values, digits)
+    return [value if math.isfinite(value) else None for value in rounded_values.tolist()]
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce series over t to the minimum and maximum of each bin, in their order, unless there are few samples."""
+    """Reduce series over `t` to minimum and maximum of about `_BINS` bins, in order of time, if they are longer."""
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
         return {"t": _round_to_json(t, 4), **{name: _round_to_json(values) for name, values in series.items()}}
@@ -175,27 +175,27 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
     """Compute the wavelet details of a pressure, or their RMS, from the samples after the last missing one."""
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
-    missing = np.flatnonzero(~np.isfinite(samples))
-    samples = samples[missing[-1] + 1 if missing.size else 0 :]
+    missing_indices = np.flatnonzero(~np.isfinite(samples))
+    samples = samples[missing_indices[-1] + 1 if missing_indices.size else 0 :]
     header: dict[str, Any] = {"of": pressure, "drawn": detail_form, "needs": min_samples() + WINDOW_SIZE - 1}
     if samples.size < header["needs"]:
         return {**header, "t": [], "has": int(samples.size)}
     t = t[-samples.size :]
     try:
-        transformed: Details = details(samples)
-        windows = windowed_rms(transformed, step=_RMS_STEP)
+        transform: Details = details(samples)
+        windows = windowed_rms(transform, step=_RMS_STEP)
     except InputError:  # numbers overflow
         return {**header, "t": [], "has": 0}
     if detail_form == "details":
-        inside = transformed.inside()
-        series = {f"d{level}": row[inside] for level, row in enumerate(transformed.values, 1)}
+        inside = transform.inside()
+        series = {f"d{level}": row[inside] for level, row in enumerate(transform.values, 1)}
         return {**header, **_envelope(t[inside], series)}
     rows = {f"d{level}": _round_to_json(row, 4) for level, row in enumerate(windows.rms, 1)}
     return {**header, "t": _round_to_json(t[windows.ends - 1], 4), **rows}
 
 
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
-    """Average position, pressures and pump over short bins, and compute the speeds from these means."""
+    """Average the channels over bins of 1/`_MOTION_HZ`, and compute the speeds of piston and pump from the means."""
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))
     if n_bins < 2:  # too few for a speed
@@ -230,13 +230,13 @@ def describe_rig(rig: str) -> dict[str, Any]:
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit
 
-    loaded: Rig = load_watched(rig).rig
-    circuit = build_circuit(loaded, ())
+    loaded_rig: Rig = load_watched(rig).rig
+    circuit = build_circuit(loaded_rig, ())
     return {
-        "title": loaded.title,
+        "title": loaded_rig.title,
         "rods": circuit.rods,
         "valve": circuit.valve,
-        "stroke": loaded.cylinder.L / _MILLIMETRE,
-        "area": 0.5 * (loaded.cylinder.A_A + loaded.cylinder.A_B) * _MILLIMETRE / LITRE_PER_MINUTE,
-        "displacement": loaded.pump.q_b * 1e3,
+        "stroke": loaded_rig.cylinder.L / _MILLIMETRE,
+        "area": 0.5 * (loaded_rig.cylinder.A_A + loaded_rig.cylinder.A_B) * _MILLIMETRE / LITRE_PER_MINUTE,
+        "displacement": loaded_rig.pump.q_b * 1e3,
     }

@@ -167,7 +167,7 @@ class _Pages:
         return JSONResponse(alarm.as_dict())
 
     async def changes(self, request: Request) -> Response:
-        """Answer with a stream of news, and of the samples of one actuator if its name is given."""
+        """Answer with a stream of change numbers, and of the live curves of one actuator if its name is given."""
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
         defaults = {"actuator": "", "pressure": "p_A", "drawn": "rms"}

@@ -156,9 +156,9 @@ class _Connection:
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         """Queue a message without blocking, which would let the connection time out."""
-        arrived, size = (self._connection, message), len(message.payload)
+        queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
-            if not self._arrived.put(arrived, size):
+            if not self._arrived.put(queue_entry, size):
                 self._service.count(_NO_ROOM)
             return
         n_messages, n_bytes = self._arrived.size()
@@ -168,7 +168,7 @@ class _Connection:
         if self._refusing == self._connection:
             self._service.count(_ASKED_AGAIN)
         else:
-            self._arrived.put(arrived, size, always=True)
+            self._arrived.put(queue_entry, size, always=True)
 
     def _submit_arrived(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
@@ -176,19 +176,19 @@ class _Connection:
         Once the queue is empty, a connection whose messages were refused is closed, so that they are sent again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
-            arrived = self._arrived.pop(1, 0.5)
-            for connection, message in arrived:
+            queue_entries = self._arrived.pop(1, 0.5)
+            for connection, message in queue_entries:
                 if message is not None:
                     self._submit(connection, message)
                 elif self._host is not None:  # a connection was made
                     self._host.request_all_births()
-            if not arrived and (refusing_socket := self._to_close) is not None:
+            if not queue_entries and (refusing_socket := self._to_close) is not None:
                 self._to_close = None
                 with suppress(OSError):  # paho reconnects
                     refusing_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
-        """Decode a message and submit its block, or its refusal; acknowledge it when that is stored."""
+        """Decode a message and submit its block or refusal; the message is acknowledged once that is stored."""
         number, qos = message.mid, message.qos
 
         def acknowledge() -> None:

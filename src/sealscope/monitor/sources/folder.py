@@ -120,7 +120,7 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Return the time for which a file has not changed [s]; for one dated in the future, since it was found."""
+        """Return the time since the last change of a file [s], or since it was first seen if that is longer."""
         return max(time.time() - file.modified_s, time.monotonic() - self._first_seen[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
@@ -180,21 +180,21 @@ class WatchedFolder:
         are corrected as for `diagnose`. An oil temperature in the file's header becomes a channel. Raises PartAway if
         the machine's file cannot be read.
         """
-        start, corrected = file_seconds(recording, path), remove_holes(correct_samples(recording).recording)
-        if not len(corrected):
-            return replace(block, samples=corrected)
+        start, corrected_samples = file_seconds(recording, path), remove_holes(correct_samples(recording).recording)
+        if not len(corrected_samples):
+            return replace(block, samples=corrected_samples)
         machine = self._read_machine()
         if _is_date_of(start, self._newest_s):
             start = max(start, self._end_s + _GAP_S)
         finite_t = recording.t[np.isfinite(recording.t)]
         shift = start - float(finite_t[0]) if finite_t.size else 0.0
-        times = corrected.t + shift
+        times = corrected_samples.t + shift
         verdict = None if machine is None else self._judge(machine, recording, path, shift)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
-        channels, units = dict(corrected.channels), dict(corrected.units)
-        if "T_oil" not in channels and (celsius := oil_temperature(corrected)) is not None:
-            channels["T_oil"], units["T_oil"] = np.full(len(corrected), celsius + 273.15), "K"
-        return replace(block, samples=Recording(times, channels, units, corrected.rate), verdict=verdict)
+        channels, units = dict(corrected_samples.channels), dict(corrected_samples.units)
+        if "T_oil" not in channels and (celsius := oil_temperature(corrected_samples)) is not None:
+            channels["T_oil"], units["T_oil"] = np.full(len(corrected_samples), celsius + 273.15), "K"
+        return replace(block, samples=Recording(times, channels, units, corrected_samples.rate), verdict=verdict)
 
     def _judge(
         self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
@@ -276,5 +276,5 @@ def _printable(name: str) -> str:
 
 
 def _is_date_of(start: float, newest: float) -> bool:
-    """Test whether a start [s since 1970] is a date without time of day, the day of the newest watched recording."""
+    """Test whether `start` is 0:00 of the day that contains `newest` [s since 1970], as of a date without a time."""
     return start % DAY == 0.0 and start <= newest < start + DAY

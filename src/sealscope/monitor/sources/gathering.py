@@ -41,10 +41,10 @@ class _Channel:
 
     def pop_values(self, first: int, stop: int) -> Array:
         """Remove and return the samples from index `first` up to `stop`; a missing one repeats the value before it."""
-        known = sorted(k for k in self.values if k < stop)
-        n_known_before = np.searchsorted(known, np.arange(first, stop), side="right")  # up to each sample
+        known_indices = sorted(k for k in self.values if k < stop)
+        n_known_before = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
         previous = math.nan if self.previous is None else self.previous
-        samples = np.array([previous, *(self.values.pop(k) for k in known)])[n_known_before]
+        samples = np.array([previous, *(self.values.pop(k) for k in known_indices)])[n_known_before]
         self.previous = float(samples[-1])
         return samples
 
@@ -91,11 +91,11 @@ class ValueGatherer:
         return self._pop_blocks()
 
     def _continue_after_pause(self) -> None:
-        """Start again with the last value of each channel as the one before the next."""
-        before = self._channels
+        """Restart the time axis after a pause, with the last value of each channel as its `previous` one."""
+        old_channels = self._channels
         self.discard_values()
-        for name, gathered in before.items():
-            self._channels[name] = _Channel(previous=gathered.last_value(), arrival=gathered.arrival)
+        for name, old_channel in old_channels.items():
+            self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
         """Add values to a channel from index `first` on; drop and count those before the next block."""

@@ -133,9 +133,10 @@ def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
 
 @law
 def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int) -> tuple[int, int, int]:
-    """Skip the pieces, all of type `major`, of the text or bytes of unknown length whose item begins at `start`.
+    """Skip the pieces of a text or byte string of unknown length, all of which must have its major type `major`.
 
-    Returns the broken rule's code (0: none), the position of the fault or else after the end, and the texts so far.
+    `start`, `position`: first byte of the item, and of its first piece; `n_texts`: pieces of text or bytes so far.
+    Returns the broken rule's code (0: none), the position of the fault or else after the end, and the new `n_texts`.
     """
     while True:
         n_texts += 1

@@ -108,10 +108,10 @@ class _OpcUaSession:
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this."""
         name, channel = self._channels[node.nodeid]
-        stamped = data.monitored_item.Value
-        timestamp = stamped.SourceTimestamp or stamped.ServerTimestamp or datetime.now(UTC)
+        data_value = data.monitored_item.Value
+        timestamp = data_value.SourceTimestamp or data_value.ServerTimestamp or datetime.now(UTC)
         t = (timestamp if timestamp.tzinfo is not None else timestamp.replace(tzinfo=UTC)).timestamp()
-        is_good = stamped.StatusCode is None or stamped.StatusCode.is_good()
+        is_good = data_value.StatusCode is None or data_value.StatusCode.is_good()
         try:
             samples = np.atleast_1d(np.asarray(value if is_good else math.nan, dtype=np.float64))
             samples = np.where(np.isfinite(samples), samples, math.nan)

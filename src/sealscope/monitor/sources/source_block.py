@@ -56,7 +56,7 @@ class BlockReceiver(Protocol):
     supervisor: Supervisor
 
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
-        """Queue a block for storage, or count a refused message; may block."""
+        """Queue a block or a refused message for storage; wait while the queue is full."""
 
     def count(self, reason: str, number: int = 1) -> None:
         """Add `number` to the counter of `reason`, usually of dropped messages or blocks."""
@@ -72,8 +72,8 @@ def do_nothing() -> None:
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     """A message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size`: length of the `contents`; `beginning`: their leading bytes, `bytes` in number,
-    which are stored; `done`: called when they are.
+    `reason`: one of `REASONS`; `size`: length of the `contents` [bytes]; `beginning`: their leading bytes, which are
+    stored; `bytes`: number of these; `done`: called when they are stored.
     """
 
     def __init__(
@@ -283,7 +283,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel to SI; None means that they are in SI. Refuse a unit of another dimension."""
+    """Convert values of a channel from `unit`, None for SI, to SI; refuse a unit of another dimension."""
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

@@ -64,9 +64,9 @@ class _Birth:
         birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
-            channel, bracketed = channel_of.get(name), _BRACKETED.fullmatch(name)
-            if bracketed is not None:
-                channel, unit = channel or channel_of.get(bracketed["name"]), unit or bracketed["unit"]
+            channel, name_with_unit = channel_of.get(name), _BRACKETED.fullmatch(name)
+            if name_with_unit is not None:
+                channel, unit = channel or channel_of.get(name_with_unit["name"]), unit or name_with_unit["unit"]
             if channel is None:
                 continue
             birth.names[channel], birth.metrics[name] = name, replace(metric, unit=unit)
@@ -103,7 +103,7 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """An edge node.
+    """The session of an edge node.
 
     `births`: births of actuators by device, "" for the node itself; `birth_sequence`: bdSeq of the last birth; `seq`:
     last sequence number, None before a birth; `is_complete`: whether no number since the birth is missing.
@@ -118,7 +118,7 @@ class _EdgeState:
 class SparkplugHost:
     """The actuators that are nodes, or devices of nodes, of Sparkplug B; those without `sparkplug` are ignored.
 
-    `publish`: sends a payload to a topic; `count_event`: raises the counter of an event by its name, such as `GAPS`.
+    `publish`: sends a payload to a topic; `count_event`: increments the counter of that name, such as `GAPS`.
     """
 
     def __init__(
@@ -229,9 +229,10 @@ class SparkplugHost:
     def _build_recording(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent_ms: int | None
     ) -> Recording | None:
-        """Combine the samples of a message's metrics to a recording in SI, None if none of them is a channel.
+        """Build a recording in SI from the samples of a message's metrics, None if there are no samples.
 
-        `sent_ms`: time of sending [ms since 1970], for metrics without a time. Single values of slow channels are kept.
+        `sent_ms`: time of sending [ms since 1970], for metrics without a time. A single value of a slow channel is no
+        sample, but repeated in all recordings until the next value.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -262,8 +263,8 @@ class SparkplugHost:
                 values[channel] = np.full(n_samples, float(last))
         births = ((channel, birth.metrics[name]) for name, channel in channel_of.items())
         units = {channel: metric.unit or actuator.units.get(channel) for channel, metric in births}
-        converted = {channel: convert_to_si(array, units.get(channel), channel) for channel, array in values.items()}
-        return Recording(t, converted, {channel: CHANNEL_UNITS[channel] for channel in converted}, rate)
+        si_values = {channel: convert_to_si(array, units.get(channel), channel) for channel, array in values.items()}
+        return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples from `t` on; if they nearly follow the block before, they join it.
@@ -282,7 +283,11 @@ class SparkplugHost:
 def _simultaneous_samples(
     group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
 ) -> dict[str, Array]:
-    """Return the samples (n,) of the metrics of one timestamp; a channel left out repeats its last single value."""
+    """Return channel -> samples (n,) of the metrics of one timestamp: of its arrays, or of single values (n = 1).
+
+    `group`: channel -> metric; `channel_of`: name of a metric -> channel. A channel without a single value repeats its
+    last one.
+    """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}

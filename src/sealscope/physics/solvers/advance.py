@@ -76,7 +76,7 @@ def advance_closed(
 ) -> int:
     """Integrate as `advance` does, with the voltage of a controller; return the number of outputs written.
 
-    `start`: the run's output that is the first row. Fewer outputs than rows are written if a voltage is not finite.
+    `start`: index of the first row's output in the run. Fewer outputs than rows are written if a voltage is not finite.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))

@@ -59,7 +59,7 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """Add a stage's explicit rates `f` with weight `e`, and implicit rates `s` with weight `i`, over a step h [s]."""
+    """Compute z + h (e f + i s) from a stage's explicit rates `f` and the implicit rates `s` of its pressures."""
     return add_to_pressures(add_step(z, h * e, f), h * i, s)
 
 
@@ -67,9 +67,8 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve an implicit stage: return its state, and the throttles' part `s` of the pressure rates [Pa/s].
 
-    `z`: the state without the stage's own implicit rates. r is the pressure rate of a volume per unit of flow, and g
-    the change of a throttle's pressure difference by its flow over the stage. The pressure of boiling oil is constant
-    whatever flows in, so that such a volume adds nothing to g.
+    `z`: the state without the stage's own implicit rates. r [Pa/m^3]: pressure rate of a volume per flow; g [Pa s/m^3]:
+    fall of a throttle's pressure difference over the stage per flow. Boiling oil keeps its pressure: its r is 0.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h

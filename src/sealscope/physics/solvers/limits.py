@@ -51,7 +51,7 @@ def stiffest_rate(p: RigNumbers) -> float:
 
 
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Compute the longest step [s] of an explicit method for a rig's laws except the throttles', for leaks `G`, `C`.
+    """Compute the longest step [s] that resolves a rig apart from its throttles, for leakage coefficients `G`, `C`.
 
     The minimum over: speed loop (winding and shaft); piston between its oil columns, sliding, and within the linear
     part of the friction (slope F_C/v_th, F_C at the charge pressure), with the load's spring and damper; pump and motor

@@ -22,10 +22,10 @@ class Loop(NamedTuple):
     """A controller over a run: its inputs, its memory and its outputs.
 
     `inputs` (samples, 5): time [s], target [m], target's speed [m/s], noise of p_A and p_B [Pa]; `volts` (samples +
-    delay,): voltage [V] from each sample on; `compensated` (samples,): leakage flow [m^3/s] that the controller makes
-    up for; `measured` (7,): the last sample, as the control law reads it; `memory`: that of the control law, its first
-    number the compensated flow or NaN; `addresses` (3,): of the control law, its memory and `measured`; `numbers`,
-    `counters`: see above.
+    delay,): voltage [V] from each sample on; `compensated` (samples,): leakage flow [m^3/s] that the controller
+    compensates; `measured` (7,): the last sample, as the control law reads it; `memory`: that of the control law, its
+    first number the compensated flow or NaN; `addresses` (3,): of the control law, its memory and `measured`;
+    `numbers`, `counters`: see above.
     """
 
     inputs: np.ndarray
@@ -46,7 +46,10 @@ def quantize(value: float, count: float) -> float:
 
 @law
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
-    """Measure the state `y` at sample k and call the controller, once a sample; return False if u is not finite."""
+    """Measure the state `y` (14,) and call the controller for sample k; return False if its voltage is not finite.
+
+    A sample that is repeated, such as in a check of the solver's step, keeps its first voltage.
+    """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:
         return True

@@ -33,7 +33,10 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile the function `law` of a source text, in which each element of a tuple is written out for numba."""
+    """Compile the function `law` that a source text defines; `scope`: the names that it uses.
+
+    The source is text because numba needs each element of a tuple written out.
+    """
     scope["load"] = load
     exec(text, scope)
     return contracted(scope["law"])

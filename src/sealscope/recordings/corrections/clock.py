@@ -26,8 +26,8 @@ MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample to an even clock, with NaN for lost rows; return the same recording if its clock is even.
 
-    Rows without a time, late rows and repeated times are dropped. If a file contains several recordings, whose clock
-    goes back or leaps, the longest is used.
+    Rows without a time, and rows no later than a previous one, are dropped. If the clock goes back or leaps because the
+    file contains several recordings, the longest is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -44,7 +44,10 @@ def resample_evenly(recording: Recording) -> Recording:
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the rows with increasing times; if too many are late, the rows of the longest increasing run."""
+    """Find the indices of the rows with increasing times `t` (n,), without those no later than a previous row.
+
+    If these are more than `MAX_LATE_FRACTION`, only the longest run of rows without a step back is used.
+    """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
         return timed
@@ -58,7 +61,7 @@ def _ordered_rows(t: Array) -> NDArray[np.intp]:
 
 
 def _longest_dense_stretch(t: Array, rate: float) -> slice:
-    """Find the longest stretch of times (n,) of which gaps take at most `MAX_GAP_FRACTION`."""
+    """Find the longest slice of times `t` (n,) with at least 1 - `MAX_GAP_FRACTION` of the samples due at `rate`."""
     # samples beyond the fewest allowed since the first row: a stretch is dense enough if it does not decrease
     first_time = t[:1].sum()  # 0 if there is none
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
@@ -70,7 +73,7 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
 
 def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
-    """Insert rows of NaN between `rows` (k,) where the interval, `steps` (k - 1,) of the clock, is longer than one."""
+    """Insert rows of NaN for lost samples between `rows` (k,), which are `steps` (k - 1,) sampling steps apart."""
     row_index = np.concatenate([[0], np.cumsum(steps)])
     n = int(row_index[-1]) + 1
     channels = {name: np.full(n, np.nan) for name in recording.channels}
@@ -92,7 +95,7 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 
 
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
-    """Interpolate samples (n,) linearly at `even_times` (m,), but not across long intervals unless `is_slow`."""
+    """Interpolate samples (n,) linearly at `even_times` (m,); NaN outside and, unless `is_slow`, in long intervals."""
     if t.size < 2:
         return np.full(even_times.size, np.nan)
     result = np.interp(even_times, t, values, left=np.nan, right=np.nan)

@@ -71,10 +71,10 @@ def remove_impossible(recording: Recording) -> Recording:
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Bridge the gaps of the `needed` channels, but not at the ends; return the same recording if there are none.
+    """Fill and mark the gaps of the `needed` channels, except at the ends; return the same recording if there are none.
 
-    In bridged rows the missing values of all other channels are bridged as well; recorded values stay. The clock must
-    be even (`corrections.clock.resample_evenly`).
+    By length and duty, a gap is filled by a spline, another cycle or a line. In its rows the missing values of all
+    other channels are filled as well; recorded values stay. The clock must be even (`clock.resample_evenly`).
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -135,7 +135,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) in bridged gaps longer than the prior `hole`, a tenth of the length of a test function."""
+    """Flag the rows (n,) in bridged gaps longer than the prior `hole` [s] and than `MAX_INTERVAL` sampling steps."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -151,9 +151,9 @@ def _finite_mean(values: Array) -> float:
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Bridge a gap of all channels by the nearest cycle with the same duty around it; return True if there is one.
+    """Fill the gap `first` to `stop` of all channels, in place, from the nearest similar cycle; False if there is none.
 
-    `period`: of the duty [samples], known to within `_SLACK`.
+    A cycle is similar if its `_cycle_mismatch` is small. `period`: of the duty [samples], known to within `_SLACK`.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -171,7 +171,11 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute the relative rms difference between the duty around a gap and `shift` samples away; inf if unknown."""
+    """Compute the rms difference of the duty around a gap and `shift` samples away, relative to the latter's deviation.
+
+    The mean is removed from both; they extend up to `half_cycle` samples beyond the gap, `first` to `stop`. inf if too
+    few samples are known, or if a `needed` channel lacks samples to copy.
+    """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as it exists here and there
     window = slice(max(first - half_cycle, -shift, 0), min(stop + half_cycle, n - shift, n))

@@ -36,8 +36,8 @@ class CorrectedSamples(NamedTuple):
     """A recording with corrected samples.
 
     `recording`: on an even clock, from the first to the last sample with all chamber pressures and the command;
-    `findings`: the corrections; `stuck`: chambers whose pressure is stuck too long to be used; `used_fraction`: of
-    the original samples, those within the recording.
+    `findings`: the corrections; `stuck`: chambers whose pressure is stuck too long to be used; `used_fraction`:
+    fraction of the original samples within its time span.
     """
 
     recording: Recording
@@ -92,7 +92,7 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long bridged gaps to NaN, for detectors that cannot weight them down."""
+    """Set long bridged gaps (`flag_holes`) to NaN and clear `bridged`, for detectors that cannot weight gaps down."""
     rows = flag_holes(recording)
     if not rows.any():
         return recording

@@ -79,9 +79,8 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for long.
 
-    All channels are constant; both chamber pressures stop and continue together, after longer than a reading may be
-    held (`motion.find_holds`), without a jump at the beginning and with one at the end. A machine at rest continues
-    smoothly.
+    In these rows all channels are constant or missing, and both chamber pressures are held (`motion.find_holds`). No
+    channel jumps at the beginning and one does at the end; a machine at rest continues smoothly.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]

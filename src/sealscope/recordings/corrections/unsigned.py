@@ -75,7 +75,7 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Test whether the sums of negative and of positive values (n,) differ by less than a prior ratio."""
+    """Test whether the smaller of the sums of positive and of negative values (n,) is over `least` times the larger."""
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
 

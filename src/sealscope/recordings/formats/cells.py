@@ -86,7 +86,7 @@ def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str
 
 
 def _parse_number(cell: str, pointed: str, decimal: str) -> float:
-    """Parse a cell to a double, NaN for a word; `pointed`: the cell with a decimal point."""
+    """Parse a cell to a double, NaN for a word; `pointed`: the cell with a point as decimal separator."""
     with suppress(ValueError):
         return np.nan if "_" in pointed else float(pointed)
     text = cell.strip().replace("\u2212", "-")
@@ -98,9 +98,9 @@ def _parse_number(cell: str, pointed: str, decimal: str) -> float:
 
 
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
-    """Test whether numbers end in prefixes of powers of ten rather than a unit.
+    """Test whether the numbers in the cells of `rows` end in SI prefixes, as `170.3m` does, rather than in units.
 
-    They are prefixes if a column has several different endings, or the ending `k` or `u`, which are no units.
+    They do if a column has several different endings, or the ending `k` or `u`, which are no units.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -123,14 +123,14 @@ def expand_prefixes(line: str) -> str:
 
 
 def _trailing_unit(cell: str) -> str | None:
-    """Return the text after the number in a cell such as `20 bar`, where a unit is expected; None for other cells."""
+    """Return the text after the number in a cell such as `20 bar`, a known unit or not; None for other cells."""
     cell = cell.strip()
     match = _QUANTITY.fullmatch(cell) if len(cell) <= _MAX_QUANTITY else None
     return None if match is None else match["unit"]
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the columns in which over half of the cells are a number with a known unit: column -> unit."""
+    """Find the columns in which over half of the cells are numbers with a known unit: column -> most frequent unit."""
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:
@@ -146,13 +146,13 @@ def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def remove_units(line: str, units: Iterable[str]) -> str:
-    """Remove these units after numbers from a line of a log, at the ends of its cells."""
+    """Remove `units` after the numbers at the ends of the cells in a line of a log."""
     pattern = "|".join(re.escape(unit) for unit in sorted(set(units), key=len, reverse=True))
     return re.sub(rf"(?<=[\d.])[ \u00a0\u202f]{{0,2}}(?:{pattern})(?=[ ]{{0,8}}\"?[ ]{{0,8}}(?:[;,|\t]|$))", "", line)
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units of the cells to the labels; raise InputError if a heading gives another unit."""
+    """Add `units`, column -> unit in its cells, to labels without one; raise InputError for another unit in a label."""
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)
@@ -166,9 +166,10 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 
 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[int], str]) -> list[str]:
-    """Remove `unit` from the cells of a column; words stay, and the last cell becomes missing if it `is_cut`.
+    """Remove `unit` from the ends of a column's cells; words and zeros without it stay.
 
-    Raises InputError for a cell with another unit or with none.
+    `is_cut`: the last cell may be incomplete, and is missing if it does not end in `unit`; `where`: index -> place for
+    the message. Raises InputError for a number with another unit or with none.
     """
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):

@@ -42,7 +42,7 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Request:
-    """A caller's validated request to a reader: `map`, `rate` [Hz], and `file`, its name for the provenance."""
+    """A validated request to a reader: `map`, `rate` [Hz] or None, and `file`, the file's name for the provenance."""
 
     map: ChannelMap
     rate: float | None = None
@@ -53,7 +53,10 @@ class Request:
 
     @property
     def infers_rate(self) -> bool:
-        """True if the times give the rate, not a written one: a map may choose other times, a frame may lack rows."""
+        """True if the times determine the rate, even where a description states one.
+
+        A map may choose other times, and a data frame, which has no `file`, may lack rows.
+        """
         return bool(self.map) or not self.file
 
 
@@ -81,12 +84,12 @@ class ColumnMap:
 
     @property
     def channel_of(self) -> dict[int, str]:
-        """Columns -> a channel that uses each."""
+        """Column -> channel that uses it, the last if there are several."""
         return {column: name for name, formula in self.channels.items() for column in formula.factors}
 
     @property
     def columns(self) -> dict[int, str]:
-        """Columns to read -> "numbers", or "time" for the time, which is last.
+        """Column to read -> "numbers", or "time" for the time column, which is last.
 
         A time column that is also a channel is read as numbers.
         """
@@ -108,11 +111,11 @@ def split_map_option(text: str) -> tuple[str, str]:
 
 def _check_channel(channel: str) -> None:
     """Raise InputError unless `channel` is the name of a channel or `t`."""
-    known = [*CHANNEL_UNITS, "t"]
-    if channel not in known:
-        near = nearest(channel, known)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        raise InputError(f"a mapped channel must be one of {', '.join(known)}, got {channel}{hint}")
+    names = [*CHANNEL_UNITS, "t"]
+    if channel not in names:
+        suggestions = nearest(channel, names)
+        hint = f" (did you mean {suggestions[0]}?)" if suggestions else ""
+        raise InputError(f"a mapped channel must be one of {', '.join(names)}, got {channel}{hint}")
 
 
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
@@ -133,7 +136,7 @@ def uses_names(channel_map: ChannelMap) -> bool:
 
 
 def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
-    """Return the entries of a map that name a channel and its column."""
+    """Return the entries of a map, channel -> column, other than `REST`; empty for "auto"."""
     return (
         {} if isinstance(channel_map, str) else {name: column for name, column in channel_map.items() if name != REST}
     )
@@ -162,7 +165,8 @@ def _format_columns(labels: Sequence[Label]) -> str:
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
     """Find the column with a name or number (`#4`, from 1); None if there is none.
 
-    If `mapped`, the last words of a column's name suffice, such as `ch2`. Raises InputError if several columns match.
+    If `mapped`, the last words of a column's name suffice, such as `ch2`. Raises InputError if several columns match;
+    `description` begins its message.
     """
     folded = name.casefold()
     for matches_name in (  # strict criteria first
@@ -185,9 +189,9 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
-    """Parse what a map has for a channel, the name of a column or a formula, to a formula of column numbers.
+    """Parse a map's entry for a channel, the name of a column or a formula, to a formula of column numbers.
 
-    Its unit takes precedence over that of the heading, which takes precedence over that at the end of the name.
+    A unit in the entry takes precedence over that of the heading, and this over that at the end of the column's name.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -217,9 +221,10 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
-    """Return (unit, note for the history or None) of a channel; raise InputError for a wrong dimension.
+    """Choose the unit in which a channel is read; return it and a note for the history, or None.
 
-    Without a unit the channel is in raw counts.
+    `unit`: of the column; None: raw counts; `description`: the column, in the note. Raises InputError for a wrong
+    dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -234,7 +239,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add the channels and the time that a map names to the choice."""
+    """Add the channels and the time of a map to the choice; `columns`: channel -> column or formula."""
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole
@@ -272,7 +277,7 @@ def _apply_names(choice: ColumnMap) -> None:
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
-    """Find the only column with a channel's name in a path or before a unit: `Rig.Cyl.p_A [bar]`, `p_A_bar`."""
+    """Find the only column with a channel's name in a path or before a unit, as in `Rig.Cyl.p_A [bar]` or `p_A_bar`."""
     matches = [
         i
         for i, label in enumerate(labels)
@@ -331,13 +336,13 @@ def _choose_time_columns(choice: ColumnMap) -> None:
 
 
 def _date_columns(choice: ColumnMap) -> list[int]:
-    """List the columns with the name of a date that no channel uses."""
+    """List the columns named as a date, such as `Datum`, and not used by a channel."""
     columns = [i for i, label in enumerate(choice.labels) if label.name.casefold() in WORDS["date"]]
     return [i for i in columns if i not in choice.channel_of]
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Add the columns that are not `used` to the choice, with a note that suggests a map for them."""
+    """Add a note on the columns that are not `used`, with a map for them; those that are measured become `unused`."""
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
     if not unused:
@@ -361,12 +366,12 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     """
     choice, columns, rate = ColumnMap(labels, stated_rate), explicit_columns(request.map), request.rate
     if uses_names(request.map):
-        mapped: set[int] = set()
+        mapped_columns: set[int] = set()
         for channel, column_text in columns.items():
             with suppress(InputError):  # `_apply_map` raises it
-                mapped.update(_parse_mapping(labels, channel, column_text).factors)
-        unmapped = [Label("", "") if column in mapped else label for column, label in enumerate(labels)]
-        columns = {**proposed_map(unmapped), **columns}
+                mapped_columns.update(_parse_mapping(labels, channel, column_text).factors)
+        other_labels = [Label("", "") if column in mapped_columns else label for column, label in enumerate(labels)]
+        columns = {**proposed_map(other_labels), **columns}
     _apply_map(choice, columns)
     _apply_names(choice)
     if rate is None:

@@ -14,7 +14,8 @@ from sealscope.errors import MissingExtra
 def import_library(module: str, purpose: str, package: str) -> ModuleType:
     """Import a library of the extra `io` and silence its warnings and log; raise MissingExtra if it is not installed.
 
-    Handlers that a program has set up before stay.
+    `purpose` ("a data frame") and `package`, its name for pip, appear in the error. Log handlers of a library that the
+    program has imported before stay.
     """
     is_first = module not in sys.modules
     try:

@@ -87,7 +87,7 @@ def _check_links(file: Any) -> None:
 
 
 def _read_streams(file: Any) -> Iterator[Series]:
-    """Yield the streamed signals of doubles.
+    """Yield the series of doubles among the signal streams of a file.
 
     `CompressedTime` contains first time, step and count, `DataR2` the number of the stream.
     """

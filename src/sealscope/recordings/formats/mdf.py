@@ -20,7 +20,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, b
 
 
 def read_mdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels in physical values; bus frames that are not decoded are no channels."""
+    """Read the requested channels of an MDF file in physical values; undecoded bus frames are not supported."""
     with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         # a file without a date has 1980 or before
@@ -32,7 +32,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
             master = file.masters_db.get(number)
 
             def read_seconds(number: int = number) -> Any:
-                """Read the group's times (n,) [s] and their start."""
+                """Read the group's times (n,) [s] and the time stamp of 0 s, or None."""
                 return np.asarray(file.get_master(number), dtype=np.float64), start
 
             clock = None if master is None else Clock(number, read_seconds)

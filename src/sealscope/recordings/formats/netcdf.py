@@ -78,7 +78,7 @@ def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
 
 
 def _is_series(item: Any) -> bool:
-    """Test whether an item of a file is a one-dimensional data set with values, unlike a dimension without them."""
+    """Test whether an item of a file is a one-dimensional data set, other than a NetCDF dimension without values."""
     import h5py
 
     if not isinstance(item, h5py.Dataset) or item.ndim != 1:
@@ -109,7 +109,7 @@ def _first_number(value: Any) -> float:
 
 
 def _parse_label(name: str, data: Any) -> Label:
-    """Make the label of a data set from its name and its attribute of a unit."""
+    """Make the label of a data set from its name and its unit attribute."""
     unit = next(
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
@@ -139,7 +139,7 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts in small chunks: many cells may refer to one text as long as the file [bytes]."""
+    """Read a data set of texts in chunks: many cells may refer to one text as long as the file, `file_size` [bytes]."""
     import h5py
 
     check_texts(data.size, data.dtype.itemsize, name)
@@ -182,7 +182,7 @@ def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write NetCDF-4 without loss; made in memory first, as libhdf5 aborts the process if the disk is full."""
+    """Write a NetCDF-4 file without loss; it is made in memory, as libhdf5 aborts the process if the disk is full."""
     import h5netcdf
 
     content = BytesIO()

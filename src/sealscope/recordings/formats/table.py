@@ -105,13 +105,13 @@ def uniform_clock(
 ) -> Clock:
     """Make the clock of `count` samples every `step` [s], the first at `first` [s] after `start`.
 
-    `key`: with the other arguments, the identity by which series share the clock.
+    Series share the clock if `key` and all other arguments are equal.
     """
     return Clock((key, count, step, first, start), lambda: (first + step * np.arange(count, dtype=np.float64), start))
 
 
 class RecordingFields(NamedTuple):
-    """The arguments of a recording in order, and the `kind` of its file, in words."""
+    """The arguments of `Recording` in order, and the `kind` of its file, in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -141,7 +141,7 @@ def build_fields(
 
     `kind`: the format, in words; `remarks`: the file's remarks on the recording; `rate` [Hz]: stated by the file, for
     series without a clock; `description`: rate, provenance and history written by Sealscope; `prepare`: reads all used
-    columns together; `size`: bytes of a file that may be compressed.
+    columns together; `size`: of a file that may be compressed [bytes], for `check_size`.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
@@ -187,8 +187,8 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording.
 
-    `kind`, `remarks`, `description`: as for `build_fields`; `state`: for a part of a text log, that after the last
-    part, which is updated.
+    `kind`, `remarks`, `description`: as for `build_fields`; `state`: of the time column after the previous part of a
+    text log; it is updated.
     """
     label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
     count = len(next(iter(columns.values())))
@@ -271,9 +271,10 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give series without a clock that of their group's time series, and remove the time series if there are several.
+    """Give series without a clock the times of their group's time series, and remove the time series.
 
-    A series called `data` or `value` that is alone in its group gets the group's name.
+    A file's only time series stays, as a column. A series called `data` or `value` that is alone in its group gets the
+    group's name.
     """
     time_series: dict[str, Series] = {}
     for member in series:
@@ -296,7 +297,7 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 
 
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
-    """Read the times (n,) [s] of a time series and the time stamp of 0 s: its first stamp, else `start`."""
+    """Read the times (n,) [s] of a time series and the time stamp of 0 s: its first, None in a group, else `start`."""
     values = time.values()
     if values.dtype.kind == "m":
         return timedelta_seconds(values), start
@@ -369,7 +370,7 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the used columns to the clock of the chamber pressures; return them, with the time, and notes."""
+    """Resample the used columns to the clock of the chamber pressures; return columns with the time, and notes."""
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
     # the chamber pressures first, then the longest series
@@ -401,7 +402,7 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 
 
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
-    """Resample `member` to the times `t` (n,) after `start`; return the samples and a note, empty if unchanged."""
+    """Resample the `values` of `member` to times `t` (n,) [s] after `start`; also return a note, empty if unchanged."""
     assert member.clock is not None
     times, member_start = member.clock.read()
     if member_start is not None and start is not None:
@@ -428,7 +429,7 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
 
 
 def _average(values: Array, times: Array, t: Array, step: float) -> Array:
-    """Average `values` (m,) at `times` (m,) over intervals of length `step` centred at `t` (n,)."""
+    """Average `values` (m,) at `times` (m,) over intervals of length `step` centred at `t` (n,); NaN in empty ones."""
     begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
     total = np.concatenate(([0.0], np.cumsum(values)))
     with np.errstate(invalid="ignore"):
@@ -436,7 +437,7 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
 
 
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
-    """Find the columns of names, values, units and validity of a long table; None for other tables."""
+    """Find the columns of a long table, "name", "value", "unit" or "valid" -> column; None for other tables."""
     names = [label.name.strip().casefold() for label in labels]
     columns_of_kind = {
         kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()
@@ -449,9 +450,9 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 
 @dataclass(frozen=True)
 class _LongTable:
-    """The rows of a long table, from which those of a name are read as a table with one channel, `u` in counts.
+    """The rows of a long table; the rows of each name are read as a recording with one channel, `u` in counts.
 
-    `columns`: cells (n,) of the columns of values, `value`, and of times, `time`.
+    `columns`: column -> cells (n,); `value`, `time`: columns of values and times.
     """
 
     choice: ColumnMap
@@ -463,7 +464,7 @@ class _LongTable:
     def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
         """Make the series of one channel of a long table from its rows (k,), which are read when they are needed.
 
-        `number`: of the channel, whose clock the series has.
+        `number`: of the channel, the key of its clock.
         """
         read_rows = cache(partial(self._read_rows, label, rows))
         clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
@@ -494,7 +495,7 @@ class _LongTable:
 def _pivot_long_table(
     series: Sequence[Series], column_by_kind: Mapping[str, int], prepare: Prepare | None
 ) -> tuple[list[Series], list[str]]:
-    """Make a series of each name in a long table; also return lines for the history.
+    """Make a series for each name in a long table; also return lines for the history.
 
     `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
     """
@@ -551,7 +552,7 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError for too many or too wide texts in a column."""
+    """Raise InputError if `count` texts of up to `width` bytes are too many or too long for the column `name`."""
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "

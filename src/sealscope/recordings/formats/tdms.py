@@ -20,7 +20,7 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
 def read_tdms(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels; a channel with a waveform interval (``wf_increment``) has a clock."""
+    """Read the requested channels of a TDMS file; those with a waveform interval (``wf_increment``) have a clock."""
     nptdms = import_library("nptdms", "TDMS", "npTDMS")
     # no warnings on a truncated last segment
     import_library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)
@@ -38,8 +38,8 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
             )
             for member in (file, *file.groups())
         )
-        stated = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
-        return build_fields(series, request, "TDMS", remarks, stated, size=path.stat().st_size)
+        rate = next(filter(None, map(stated_rate, (remarks, *group_remarks))), None)
+        return build_fields(series, request, "TDMS", remarks, rate, size=path.stat().st_size)
 
 
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:

@@ -297,7 +297,7 @@ class _Log:
         return self._remove_text_rows(rows, line_numbers)
 
     def _count_rows(self, n_rows: int) -> None:
-        """Count rows and check their total number."""
+        """Add to the number of rows; raise InputError if the columns then have too many values."""
         self.n_rows += n_rows
         check_size(self.n_rows, len(self.kinds))
 
@@ -375,7 +375,10 @@ class _Log:
     def _remove_text_rows(
         self, rows: list[list[str]], line_numbers: Sequence[int]
     ) -> tuple[list[list[str]], Sequence[int]]:
-        """Remove and count short rows of text; return the others and their line numbers, or raise InputError."""
+        """Remove and count short rows of text; return the others and their line numbers.
+
+        Raises InputError for other rows with too few or too many cells.
+        """
         layout, max_cells, complete = self.layout, len(self.layout.labels), []
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:
             return rows, line_numbers
@@ -398,7 +401,7 @@ class _Log:
         return [rows[i] for i in complete], [line_numbers[i] for i in complete]
 
     def _parse_rows(self, rows: Sequence[Sequence[str]], lines: Sequence[int], is_cut: bool) -> _Block:
-        """Parse rows of cells to a block; `is_cut`: the last row is incomplete."""
+        """Parse rows of cells to a block; `lines`: their line numbers; `is_cut`: the last row is incomplete."""
         block = _Block()
         for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
@@ -483,7 +486,7 @@ class _Log:
         return order
 
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-        """Join the columns of blocks and remove them there; also return lines for the history.
+        """Join the columns of blocks, removing them there to save memory; also return lines for the history.
 
         Raises InputError if too many cells are words.
         """
@@ -535,7 +538,7 @@ def _iter_line_blocks(
 ) -> Iterator[tuple[int, bytes, int, bool]]:
     """Yield blocks of a file with complete lines.
 
-    A block is (number of its first line, bytes, end of the complete lines in them, True if its last line is cut);
+    A block is (number of its first line, bytes, number of bytes in complete lines, True if its last line is cut);
     `n_bytes`: returns the number of bytes to read next.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1

@@ -133,7 +133,7 @@ def _used_width(row: Sequence[str]) -> int:
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Choose the delimiter, decimal separator and row width with which most cells of the body are values."""
+    """Choose the delimiter, decimal separator and row width with which most cells of the lines `body` are values."""
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
     for delimiter, decimal in _DIALECTS:
@@ -155,7 +155,11 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 
 
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
-    """Split a heading into names; with blanks as delimiter, names may have a unit in brackets."""
+    """Split a heading into names.
+
+    If the delimiter is a blank, a unit in brackets stays with its name; names may contain single blanks if wider spaces
+    separate exactly `width` names.
+    """
     if delimiter == " ":
         words = _SPACED_LABEL.findall(line)
         phrases = re.split(r"\s{2,}|\t", line.strip())  # names with a blank, separated by two
@@ -212,7 +216,7 @@ def _parse_heading(
 
 
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Parse heading rows, lowest first, by `Name` and `Unit` in the first cell: (labels, number of rows); else None."""
+    """Parse heading rows, lowest first, that begin with `Name` and `Unit`; return (labels, number of rows) or None."""
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     heading = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
     unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -265,7 +269,7 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Test whether a row is a ruler, or repeats one text other than a unit in all cells."""
+    """Test whether a row is a ruler such as `----`, or repeats one text other than a unit in all cells."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)
@@ -341,7 +345,7 @@ def _is_content(line: str) -> bool:
 
 
 def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
-    """Find the first line of samples by the columns that contain numbers in the `body`; None if there is none."""
+    """Find the index of the first line with samples in over half of the numeric columns of `body`; None if none has."""
     rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) == width]
     is_value_cell = [[is_value(cell, decimal) for cell in row] for row in rows]
     max_values = max(map(sum, is_value_cell), default=0)
@@ -368,7 +372,7 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
 
 
 def _has_prefixes(body: Sequence[str]) -> bool:
-    """Test whether the numbers of a log end in prefixes of powers of ten, with any delimiter."""
+    """Test whether the numbers of a log end in SI prefixes, with any delimiter."""
     return any(map(_QUANTITY.search, body)) and any(
         has_prefixes([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"
     )

@@ -71,7 +71,7 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 @dataclass
 class TimeState:
-    """State of the time column of a log after the parts read before.
+    """The state of a log's time column between two parts of the log.
 
     `head`: first times of a column without unit; `rate`: sampling rate [Hz]; `resolution`: of times that samples share
     [s]; `last_time`: the last time as in the file, and `last_seconds`: the same [s].
@@ -149,9 +149,9 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
     Criteria in order: a number over 12 (`explicit_order`), the order in which no column goes back, the order with the
     shorter time span; else the day is first with hyphens, and the month with slashes.
     """
-    stated = next((order for order in map(explicit_order, columns) if order is not None), None)
-    if stated is not None:
-        return stated
+    known_order = next((order for order in map(explicit_order, columns) if order is not None), None)
+    if known_order is not None:
+        return known_order
     has_hyphens = any("-" in text for column in columns for text in column)
     ranks = {}
     for day_first in (has_hyphens, not has_hyphens):
@@ -163,7 +163,7 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
-    """Return the ordinal number of a day; 0 for a date that does not exist."""
+    """Return the ordinal (`date.toordinal`) of an ambiguous date read in this order; 0 if there is no such date."""
     first, second, year = _date_numbers(text)
     try:
         return date(year, *((second, first) if day_first else (first, second))).toordinal()
@@ -187,7 +187,7 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock [s] counts from 1970, not from the start of a machine."""
+    """Test whether a clock reading [s] counts from 1970, not from the start of a machine."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -198,7 +198,7 @@ def iso_moment(moment: np.datetime64) -> str:
 
 
 def clock_text(clock: float) -> str:
-    """Format a clock [s]: date and time in UTC if it counts from 1970, else seconds."""
+    """Format a clock reading [s]: date and time in UTC if it counts from 1970, else seconds."""
     if not counts_from_1970(clock):
         return f"{clock:.0f} s"
     return str(np.datetime64(round(clock), "s")).replace("T", " ") + " UTC"
@@ -297,7 +297,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 
 
 def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
-    """Remove jumps by `step` [s], to within some median intervals; None if there is none, or several and `single`."""
+    """Remove clock jumps of `step` [s] from times (n,); None if there is none, or if there are several and `single`."""
     steps = np.diff(t)
     positive_steps = steps[np.isfinite(steps) & (steps > 0)]
     if not positive_steps.size:
@@ -334,7 +334,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 
 
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
-    """Convert numbers (n,) without a unit to seconds; the `finite` ones tell days, epochs and seconds."""
+    """Convert numbers (n,) without a unit to seconds; size and step of the `finite` ones tell days from seconds."""
     first, is_first_part = float(finite[0]), state.head is None
     state.head = head = finite if state.head is None else state.head
     if (days := _detect_days(head)) is not None:
@@ -361,7 +361,7 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Detect numbers that are days by their steps: return (origin, meaning in words); None for seconds.
+    """Detect by their steps that numbers (n,) are days; return (origin, meaning in words), or None for seconds.
 
     Numbers are days if, taken as seconds, they were sampled faster than any logger does; the origin of fractions of a
     day is None.
@@ -388,8 +388,8 @@ def time_base(
 
     Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps and epoch
     times are relative to their first sample; other times stay as they are. The file's `stated_rate` [Hz] spaces samples
-    that share stamps. `state`: that after the previous part, which the values may continue; it is updated. Raises
-    InputError.
+    that share stamps. `state`: after the previous part, which the values may continue; it is updated. Raises InputError
+    for a column that is empty, counts rows, does not increase or has no unit of time.
     """
     state = TimeState() if state is None else state
     if values.dtype.kind == "M":

@@ -92,7 +92,7 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors find, and their false alarms."""
     judgement, unit = result.judgement, result.plan.unit
-    ranked: list[tuple[float, float, str]] = []
+    ranked_findings: list[tuple[float, float, str]] = []
     for pod in judgement.pods:
         rows = [row for row in judgement.table if row.detector == pod.detector and row.leak_lpm > 0]
         if not rows:
@@ -104,10 +104,10 @@ def result_text(result: CampaignResult) -> str:
             a90 = pod.curve.a90
             finding = f"finds 9 in 10 leaks of {a90:.2g} {unit}"
         text = f"{pod.detector} {finding} at {percent(largest.false_alarm)} false alarms."
-        ranked.append((a90, -largest.alarms.value, text))
-    ranked.sort(key=lambda item: item[:2])
-    sentences = [text for _, _, text in ranked[:_MAX_NAMED]]
-    n_more = len(ranked) - len(sentences)
+        ranked_findings.append((a90, -largest.alarms.value, text))
+    ranked_findings.sort(key=lambda item: item[:2])
+    sentences = [text for _, _, text in ranked_findings[:_MAX_NAMED]]
+    n_more = len(ranked_findings) - len(sentences)
     rest = f" {n_more} more detectors are in the table." if n_more > 1 else " Another detector is in the table."
     records = f"{judgement.judged} records were judged."
     return " ".join([*sentences, records]) + (rest if n_more else "")
@@ -132,8 +132,8 @@ def _notes(result: CampaignResult) -> list[str]:
     if judgement.thresholds:
         key = "thresholds_of_records" if isinstance(plan, SimulatedPlan) else "thresholds_of_recordings"
         notes.append(_say(key, share=percentage, leak_free=judgement.leak_free, judged=judgement.judged))
-    stating = [name for name in plan.detectors if parse_detector_name(name).scorer is None]
-    notes += [_say("own_verdict", share=percentage, detectors=", ".join(stating))] if stating else []
+    judges = [name for name in plan.detectors if parse_detector_name(name).scorer is None]
+    notes += [_say("own_verdict", share=percentage, detectors=", ".join(judges))] if judges else []
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _prior_knowledge_notes(result)
@@ -150,7 +150,7 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format a note for each group of detectors that know the same channels, and for each that know the same rig."""
+    """Format a note for each set of channels, and for each rig, with the detectors to which it was given."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -229,15 +229,15 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
     """Describe the rig that the detectors assume, and up to six parameters that differ from the simulated rig."""
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
-    simulated = {row.name: row.value for row in plan.rig.table()}
-    different = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
-                 for row in plan.assumed.table() if simulated.get(row.name) != row.value]  # fmt: skip
-    more = f" and {len(different) - 6} more" if len(different) > 6 else ""
-    return f"{plan.assumed.name}, which differs from the rig: {', '.join(different[:6])}{more}"
+    simulated_values = {row.name: row.value for row in plan.rig.table()}
+    different_values = [f"{row.name} {row.value:g}" if isinstance(row.value, float) else f"{row.name} {row.value}"
+                        for row in plan.assumed.table() if simulated_values.get(row.name) != row.value]  # fmt: skip
+    more = f" and {len(different_values) - 6} more" if len(different_values) > 6 else ""
+    return f"{plan.assumed.name}, which differs from the rig: {', '.join(different_values[:6])}{more}"
 
 
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
-    """Build the template's values for one detector: plots, areas under the ROC, and detections by cell."""
+    """Build the template's values for one detector: plots, areas under the ROC, and detections by factor levels."""
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
     drawn_rocs = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
@@ -327,17 +327,17 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
     """Draw curves of the detected fraction, thinned to `_MAX_CURVE_POINTS`, with frame and axes."""
-    thinned = []
+    thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))
-        thinned.append((label, x[indices], y[indices]))
+        thinned_curves.append((label, x[indices], y[indices]))
         if band is not None:
             picture.area("band", x[indices], band[0][indices], band[1][indices])
     for value in log_ticks(*picture.x_ends) if picture.log else ticks(*picture.x_ends, 5):
         picture.mark("grid", value)
         picture.below(value, f"{value:g}")
     picture.frame(5)
-    for k, (label, x, y) in enumerate(thinned):
+    for k, (label, x, y) in enumerate(thinned_curves):
         picture.line(f"path s{k % 6}", x, y, label, digits=2)
     picture.labels.append(SvgText(WIDTH / 2, HEIGHT + 32.0, x_label))
     picture.labels.append(SvgText(-34.0, HEIGHT / 2, "detected", turned=True))

@@ -40,7 +40,7 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Build the tables of `page_tables.toml` by name, without empty ones."""
+    """Build the tables of `page_tables.toml` by name, without empty ones; `part`: purpose of the plan, for titles."""
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
@@ -63,7 +63,7 @@ class CauseTable(NamedTuple):
     """The causes that one detector names.
 
     A row: true cause, number of its records, and fraction with each named cause (`columns`). `right`: fraction of all
-    records with exactly the true cause; `covered`: also with an ambiguous cause that includes it.
+    records for which exactly the true cause is named; `covered`: including ambiguous causes that contain it.
     """
 
     detector: str
@@ -90,7 +90,7 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
 
 
 def _format_fraction(proportion: Proportion) -> str:
-    """Format a proportion in percent, a dot for none."""
+    """Format a proportion in percent, a dot for zero."""
     return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 

@@ -135,7 +135,7 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 
 
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the newest recording's channels together with those of the last earlier one, if possible judged `no leak`.
+    """Draw the channels of the newest recording with those of the last one before it, if possible judged `no leak`.
 
     Both are drawn from a common start. Returns (charts, drawn charts, names of the two files), empty if there is no
     earlier recording, no common channel or a clock that does not increase.

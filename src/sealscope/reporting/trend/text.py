@@ -114,7 +114,7 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 
 
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
-    """Format the limit and the date at which the level reaches it, by `reach` [d] from the last recording on."""
+    """Format the limit and the date of reaching it; `reach`: days from the last recording until then."""
     limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
     expected, earliest, latest = (moment(trend, last + days) if days <= max_days else "later" for days in reach)
@@ -169,10 +169,10 @@ def events(trend: Trend) -> list[str]:
 
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
     """Format the trend as lines of at most 80 columns; `whole`: with reason, assumptions and all findings."""
-    known, findings = figures(trend), [finding.text for finding in trend.findings]
+    known_figures, findings = figures(trend), [finding.text for finding in trend.findings]
     rows = [("state", state_text(trend.state))]
-    rows += [(level_name(trend), known["total"])]
-    rows += [(name, known[name]) for name in ("leak", "healthy", "since", "growth", "limit")]
+    rows += [(level_name(trend), known_figures["total"])]
+    rows += [(name, known_figures[name]) for name in ("leak", "healthy", "since", "growth", "limit")]
     rows += [("event", line) for line in events(trend)]
     if whole:
         rows += [("reason", trend.reason), ("assumed", assumptions_text(trend))]

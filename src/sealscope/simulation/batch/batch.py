@@ -1,7 +1,7 @@
 """Many experiments at once: eight to a vector register, over all cores, reduced to statistics as they run.
 
-Pressures, readings and details are kept for a few seconds of each run only, so that memory grows with the number of the
-runs only by the description and the result of each, and not with their length.
+Pressures, readings and details are kept for a few seconds of each run only, so that memory does not grow with the
+length of the runs, and with their number only by the description and the result of each.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Batch:
 
     `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
     [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) limits of the segments [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while
-    open [L/min]; `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) solver's [s].
+    open [L/min]; `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) solver step [s].
     """
 
     rms: Array
@@ -175,7 +175,7 @@ def simulate_batch(
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the completed fraction of the batch from that of this set; `before`: that of the sets before."""
+            """Report the completed fraction of the batch from that of this set; `before`: that at the set's start."""
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
 
@@ -207,8 +207,8 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the step [s] of a set: the shortest that error control chooses for a few sample members.
 
-    Those run for their first seconds. The step is at most the longest that the parameters and leaks of all members
-    allow.
+    Each of these runs for its first seconds only. The step is at most the longest that the parameters and leaks of all
+    members allow.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -219,7 +219,7 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 
 
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
-    """Compute the longest step [s] that parameters and leaks of all members allow, at least the shortest chosen."""
+    """Compute the longest step [s] for members with leaks `coefficients` (runs,), at least error control's shortest."""
     from sealscope.physics.solvers.limits import longest_step
 
     limits = []
@@ -235,7 +235,7 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
-        """Run the set; return the mean flows (runs,) [m^3/s] per unit of the coefficients, and no further result."""
+        """Run the set; return the mean flows (runs,) [m^3/s] for a coefficient of 1, and None."""
         flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
         run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)

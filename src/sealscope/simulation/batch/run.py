@@ -67,7 +67,7 @@ class ExperimentSet:
 
     @property
     def experiment(self) -> Experiment:
-        """The first experiment, for what all have in common."""
+        """The first experiment, which stands for the settings that all members share."""
         return self.members[0].experiment
 
 
@@ -144,12 +144,12 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
             numbers = numbers._replace(open_circuit=(True,))
         if any(effect.field == "air" for effect in effects):
             numbers = numbers._replace(aerated=(True,))
-        scaled = _split_command(experiment.voltage_command)
+        scaled_command = _split_command(experiment.voltage_command)
         choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")  # that follows from the load
         method = choose_method(experiment.rig, experiment.method)
-        kind = (scaled.key, load, choices, method, experiment.step, experiment.error)
-        shapes[kind] = scaled.shape
-        member = Member(row, experiment, numbers, effects, scaled.gain, scaled.offset)
+        kind = (scaled_command.key, load, choices, method, experiment.step, experiment.error)
+        shapes[kind] = scaled_command.shape
+        member = Member(row, experiment, numbers, effects, scaled_command.gain, scaled_command.offset)
         members_by_kind.setdefault(kind, []).append(member)
     return [ExperimentSet(tuple(members), shapes[kind]) for kind, members in members_by_kind.items()]
 
@@ -170,8 +170,8 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the leaks' parameters (runs, LEAK_ROWS): acting G, C; start [s] and slope [1/s] of the opening; flow G, C.
 
-    The acting `coefficients` and the `flow_coefficients`, whose mean flow is computed, differ while a leak is sized:
-    the flow of a unit leak is found in a run without a leak.
+    `coefficients` act in the run, `flow_coefficients` are those whose mean flow is computed. They differ while a leak
+    is sized: a run without a leak gives the flow of a unit leak under its pressures.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -210,8 +210,8 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """Build the cells of a set: the blocks of all effects of its members, for `n_out` outputs at `rate` [Hz]."""
     from sealscope.physics.rig import NUMBERS
 
-    distinct = {id(member.numbers): member.numbers for member in members}  # most members share their parameters
-    rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in distinct.items()}
+    numbers_by_id = {id(member.numbers): member.numbers for member in members}  # most members share their parameters
+    rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in numbers_by_id.items()}
     base = np.array([rows[id(member.numbers)] for member in members])
     effects = [effect for member in members for effect in member.effects]
     bounds = block_bounds(effects, n_out, rate)
@@ -232,7 +232,7 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 
 
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the parameters (runs, 2, INSTRUMENT_ROWS) of the instruments of p_A and p_B, linear over first .. last."""
+    """Build the parameters (runs, 2, INSTRUMENT_ROWS) of p_A's and p_B's instruments from sample `first` to `last`."""
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
     ends = np.array([first, last]) / members[0].experiment.rate
@@ -286,7 +286,7 @@ MAX_CHUNK_STEPS = 4096
 
 
 class SetRun:
-    """The runs of a set.
+    """The simulation of all runs of an `ExperimentSet`.
 
     `coefficients` (runs,): those of the leaks; `flow_coefficients` (runs,): those whose mean flow is computed
     (`build_leak_rows`); `bounds` [s]: segments of the detail statistics, None to compute flows only.
@@ -322,12 +322,12 @@ class SetRun:
         self.cells = build_cells(members, self.n_outputs, rate)
         self.numbers = members[0].numbers  # for its choices only; the runs' numbers are in the table of the cells
         leaks = build_leak_rows(members, coefficients, flow_coefficients)
-        checked = set()  # members that share parameters and leak are checked once
+        checked_cases = set()  # members that share parameters and leak are checked once
         for member, (G, C) in zip(members, leaks[:, :2].tolist(), strict=True):
             for numbers in member.step_limiting_parameters:
                 case = id(numbers), G, C
-                if not (member.experiment.allow_unresolved or case in checked):
-                    checked.add(case)
+                if not (member.experiment.allow_unresolved or case in checked_cases):
+                    checked_cases.add(case)
                     refuse_unresolved(numbers, self.step, self.method)
                     refuse_long(self.step, longest_step(numbers, G, C), f"the leak of run {member.row}")
         experiments = [member.experiment for member in members]
@@ -344,7 +344,7 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Compute each lane's anti-alias filter; tap k multiplies the output k - `taps_before` from the sample's."""
+        """Compute each lane's anti-alias filter; tap k multiplies the output k - `taps_before` after the sample's."""
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
         taps_by_delay = {delay: anti_alias_taps(self.oversampling, delay % 1.0) for delay in np.unique(delays).tolist()}
@@ -358,7 +358,7 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Allocate the sums of squared details, for segments that the wavelet's filters see in full."""
+        """Allocate the sums of squared details, and clip segments to the samples whose details need no padding."""
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
@@ -376,7 +376,7 @@ class SetRun:
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Report a further completed fraction of all groups; called by all threads."""
+            """Add to the completed fraction of all groups, and report it; called by all threads."""
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -410,7 +410,7 @@ class SetRun:
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
         """Simulate the groups of lanes groups[0] <= g < groups[1] in chunks, from standstill to the end.
 
-        Each chunk's sensor signals are added to the statistics of the runs.
+        The squared details of each chunk's readings are added to the sums.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -480,7 +480,10 @@ class SetRun:
         return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
 
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
-        """Raise SimulationFailed if a run of the groups, now at output `stop`, diverged, cavitated or hit a stop."""
+        """Raise SimulationFailed if a run of the groups, now at output `stop`, is not valid.
+
+        That is if it diverged, fell below vacuum, or hit an end stop that its step cannot resolve.
+        """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
 

@@ -29,7 +29,7 @@ INSTRUMENT_ROWS = 18
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressure [Pa] as read back from the analog-digital converter (`instruments.digitize`)."""
+    """Compute the pressure [Pa] as read back from the converter (`instruments.digitize`) of the instrument `row`."""
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
     volts_per_code = load(sensor, row + VOLTS_PER_CODE)
@@ -62,7 +62,8 @@ def _read_pressure(
 ) -> Any:
     """Compute the reading [Pa] of a filtered `pressure` [Pa] by the instrument in row `row` of `sensor`.
 
-    `channel_noise`, `common_noise`: standard normal; `drift` [Pa]; `samples_since`: age of the values in `sensor`.
+    `channel_noise`, `common_noise`: standard normal; `drift` [Pa]; `samples_since`: samples since that for
+    which `sensor` was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)

@@ -120,7 +120,7 @@ def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> 
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw one nuisance: the value of each parameter by name (a factor on it if the nuisance scales), and drifts."""
+    """Draw a nuisance's values by parameter (factors if it scales), and its drifts; `oil`: path of the temperature."""
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
     groups = [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]

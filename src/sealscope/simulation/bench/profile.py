@@ -107,8 +107,9 @@ class NuisanceChoice:
 class Duty:
     """The duties of a profile's machines, of which each machine has one.
 
-    Drawn are one of `commands`, a factor on it within `amplitude`, the closed fraction of both throttles from `closed`
-    (in the file: per cent), one of `loads` on the rod, and for a position target one of `controllers` (default: PI).
+    A machine draws one of `commands`, a factor on its amplitude within `amplitude`, the closed fraction of both
+    throttles from `closed` (in the file: per cent), one of `loads` on the rod, and one of `controllers` for a position
+    target (default: PI).
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -249,7 +250,8 @@ class Family:
 class Profile:
     """The nuisances of a kind of machines, their duty, and `families` of machines that differ from the others.
 
-    `seeds`: name that the seeds of cases derive from, "" for the profile's: so a renamed profile draws the same cases.
+    `place`: the file, for messages; `seeds`: name from which seeds of cases are derived, "" for `name`. With it, a
+    renamed profile draws the same cases.
     """
 
     name: str
@@ -279,10 +281,10 @@ def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
     """Append the nuisances `replacing`, and remove their parameters from the others."""
-    replaced = {parameter for nuisance in replacing for parameter in nuisance.parameters}
+    replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
-        parameters = tuple(parameter for parameter in nuisance.parameters if parameter not in replaced)
+        parameters = tuple(parameter for parameter in nuisance.parameters if parameter not in replaced_parameters)
         remaining += [replace(nuisance, parameters=parameters)] if parameters else []
     return (*remaining, *replacing)
 
@@ -322,7 +324,7 @@ class _File(BaseModel):
 
 
 def _read_profile(path: Path, place: str) -> Profile:
-    """Read the profile in a file over the one it extends; `place` names the file in messages."""
+    """Read a profile from its file, added to the profile that it extends; `place` names the file in messages."""
     tree = read_toml(path, "a profile", place)
     try:
         file = convert_type(_File, tree)

@@ -38,9 +38,9 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw the relative changes of a test's parameters at half time: uniform size, random sign, all independent.
+    """Draw the steps of a test's parameters at half time: uniform relative size, random sign, all independent.
 
-    `number`: of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
+    `number`: number of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
     """
     rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
@@ -55,7 +55,7 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of a test on the identified rig: its command and throttles, its leak from half time on."""
+    """Build the experiment of a test on the identified rig, of twice `half` [s], with its leak in the second half."""
     return Experiment.of(
         rig=BENCH_RIG,
         command=condition.command,
@@ -78,7 +78,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe an experiment's change at half time."""
+    """Describe what changes at half time: an opened leak, parameters with their factors, or nothing."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -102,7 +102,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
 
 
 def pressure_range(values: Array) -> float:
-    """Compute the range of a pressure from its 5 % to its 95 % quantile, in its unit."""
+    """Compute the difference between the 95 % and the 5 % quantile of a pressure, in its unit."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 

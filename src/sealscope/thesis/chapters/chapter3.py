@@ -117,7 +117,7 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
 
 
 def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
-    """Compute the gain at `frequencies` [Hz] of eq. (3.4) and its inverse with the measure da db / |a|^weight.
+    """Compute the gain, at `frequencies` [Hz], of transform (3.4) followed by its inverse with da db / |a|^weight.
 
     gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da, over six decades of scales around the frequencies.
     With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and dividing by it
@@ -288,7 +288,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Compute the middles [s] of blocks of `size` samples, and each row's rms in them, (rows, blocks)."""
+    """Compute the rms of each row in blocks of `size` samples; return the blocks' middles [s], rms (rows, blocks)."""
     n_used = t.size // size * size
     block_rms = np.sqrt(np.mean(rows[:, :n_used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
     return t[:n_used].reshape(-1, size).mean(axis=1), block_rms

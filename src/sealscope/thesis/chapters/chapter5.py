@@ -266,7 +266,7 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate and measure one of the ten tests, or the same test without its leak."""
+    """Simulate one of the ten tests and compute its measures; `leak`: False for the same test without its leak."""
     experiment = make_test_experiment(test)
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
     recording = run.recorded

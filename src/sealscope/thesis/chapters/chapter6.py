@@ -73,7 +73,7 @@ def conductance(lpm: float, rig: Rig) -> float:
 
 @cache
 def _rig(name: str = RIG) -> Rig:
-    """Load a rig once."""
+    """Load a rig by name; later calls return the same object."""
     return load_rig(name)
 
 
@@ -292,7 +292,7 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Read a column of the rows that begin with `names`, by leak [L/min], which is the column after them."""
+    """Read column `head` of the rows that begin with `names`, by the leak [L/min] in the column after the names."""
     n, k = len(names), table.columns.index(head)
     return {float(row[n] or 0.0): float(row[k] or 0.0) for row in table.rows if row[:n] == names}
 

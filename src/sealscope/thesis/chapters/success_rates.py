@@ -118,11 +118,10 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
-    """Compute the log change that noise exceeds with probability `FALSE_ALARMS`, to one or to either side.
+    """Compute the log change that noise exceeds with probability `FALSE_ALARMS`, on one side or on either side.
 
-    It is ``1.645 rms(log change of d1)``, or 1.960 times it for either side. d1 is noise and does not depend on the
-    leak, so that its changes between the halves are those of a leak-free rig. The other details scatter at least as
-    much.
+    ``1.645 rms(log change of d1)``, or 1.960 times this rms for either side. d1 is noise and does not depend on the
+    leak, so its changes between the halves are those of a leak-free rig. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
@@ -134,7 +133,7 @@ def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule of one detail finds with a threshold, as rows with the columns `THRESHOLDS`."""
+    """Count the leaks found by each rule of one detail with a threshold, as rows with the columns `THRESHOLDS`."""
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
         ((chamber, detail),) = rule.details

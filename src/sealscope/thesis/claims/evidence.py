@@ -83,7 +83,7 @@ class SheetClaim:
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
 
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge the claim by the measured sheet, and state the findings on the simulated sheet."""
+        """Judge the claim by the measured sheet, and state the findings on both sheets; `kind`: as in `judge_claim`."""
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
             """Return the text of all findings on a sheet, and the results of all parts."""

@@ -67,12 +67,12 @@ def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
 
 
 def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim on the printed success rate of a rule, which stands at `where` in the thesis."""
+    """Build the claim on a rule's success rate as printed; `where`: its place in the thesis."""
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test whether the rate is within 1 % of a printed one, and beyond chance."""
+        """Test whether the rate is within one percentage point of a printed one, and beyond chance."""
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
         as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
@@ -98,7 +98,7 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 
 
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.7: each detail moves against its chamber's direction in most tests."""
+    """Test claim 5.5.7: each detail moves opposite to its chamber's direction (`DIRECTION`) in most tests."""
     for chamber in CHAMBERS:
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
@@ -160,7 +160,7 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline`."""
+    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline`, by what is left out."""
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
     for name in groups:
@@ -309,9 +309,9 @@ def leak_level_claims() -> Iterator[Claim]:
 def _test_rows(
     sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test whether the details `names` change beyond noise in the test's row, and count its candidate rows that do.
+    """Test whether the details `names` change beyond noise in the test's row; return a text, and each detail's result.
 
-    Returns a text, and the result for each detail.
+    If several rows can be the test, the text also counts those with a change beyond noise.
     """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}

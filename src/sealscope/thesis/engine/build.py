@@ -110,7 +110,7 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the jobs of items whose needs are done, and report each as in work when it is taken."""
+            """Yield the jobs of the `ready` items, and report each as in work when it is taken."""
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
@@ -146,7 +146,7 @@ def _empty_runs_folder(store: Path) -> Path:
 
 
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
-    """Compute for each item a digest of all inputs of its products and files, its needed items included."""
+    """Compute for each item a digest of all inputs of its products and files, including the items it needs."""
     by_id, sources = {item.id: item for item in items}, sources_key()
 
     @cache

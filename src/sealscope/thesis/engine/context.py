@@ -25,9 +25,9 @@ Products = tuple[Product | Claim, ...]
 class SimulatedRun:
     """The result of a simulated run.
 
-    `recording`; `t`, `outputs`: true outputs at its samples (`simulation.simulate.TRUE_OUTPUTS`); `resolved`: whether
-    all channels changed little when the step was halved, None if not tested; `step_changes`: these changes;
-    `diverged`: one-line reason of a failed run, whose recording and outputs are empty.
+    `recording`: None if the run failed; `t` [s], `outputs`: true outputs at its samples (`TRUE_OUTPUTS` in
+    `simulation.simulate`); `resolved`: whether all channels changed little when the step was halved, None if not
+    tested; `step_changes`: these changes by channel; `diverged`: one-line reason of a failed run, "" for none.
     """
 
     recording: Recording | None

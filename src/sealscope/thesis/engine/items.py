@@ -60,7 +60,7 @@ class Item:
         title: str = "",
         resolved: bool | None = None,
     ) -> ThesisTable:
-        """Build the item's table, or a further one with a `tail` of its id, a `title` and `columns`."""
+        """Build a table of the item; `tail` is appended to its id, `title` and `columns` replace the item's."""
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title
         return ThesisTable(id, title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes)
@@ -79,7 +79,7 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the item of a row of `items.toml`; its entry `each` names a function that lists several items instead."""
+    """Yield the item of a row of `items.toml`, or those listed by the function that its entry `each` names."""
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
     row_fields["make"] = _import_function(row_fields["make"])

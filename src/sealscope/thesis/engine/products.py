@@ -44,7 +44,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One set of axes; labels carry the unit in brackets, such as "p_A [MPa]"."""
+    """One set of axes; labels carry the unit in brackets, such as "p_A [MPa]"; `marks`: (x, text) of vertical lines."""
 
     x_label: str
     y_label: str

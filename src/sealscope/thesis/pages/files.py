@@ -59,7 +59,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
-    """Yield head and rows of a figure's data as drawn: columns x, y of each curve, and x, y, value of an image."""
+    """Yield the header and the rows of a figure's drawn points: x, y of each curve, and x, y, value of each image."""
     heads: list[str] = []
     columns: list[list[str]] = []
     for number, panel in enumerate(figure.panels, 1):

@@ -29,7 +29,7 @@ _MAX_OPEN_ROWS = 45
 
 
 class PageProduct(NamedTuple):
-    """A figure or table with what the page shows of it: picture (data URI), links to its files, and its claims."""
+    """Entry of a figure or table on the page; `picture`: data URI or ""; `links`: (format, path) of its files."""
 
     id: str
     heading: str

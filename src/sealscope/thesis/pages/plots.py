@@ -207,7 +207,7 @@ def _use_plain_numbers(axis: Axis) -> None:
 
 
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points of a curve to draw: those in the range and one on each side, thinned for a long line."""
+    """Select the points (x, y) of a curve to draw: those in `x_range` and one on each side; a long line is thinned."""
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
         first, stop = np.searchsorted(x, sorted(x_range))

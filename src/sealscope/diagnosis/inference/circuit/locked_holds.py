@@ -53,7 +53,7 @@ TAIL = 0.05
 
 
 class CylinderSides(NamedTuple):
-    """Areas of both sides in the unit of a balance's flow, with the sign of x, and the ends of the stroke [m]."""
+    """Piston areas by the assumed displacement [m^2], negative if x is reversed, and the ends of the stroke [m]."""
 
     area_A: float
     area_B: float
@@ -79,17 +79,17 @@ class LockedHold(NamedTuple):
         return np.asarray(sums / np.diff(self.edges))
 
     def steepest_time(self) -> float:
-        """Return the time [s] from which p_A - p_B changes most while a large leak would equalise the pressures."""
+        """Return the time [s] after which p_A - p_B changes most within the time of equalisation by a large leak."""
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.p_A - self.p_B
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
-    """Find the holds of a recording: rests of the pump, from when the valves have shut until before they open.
+    """Find the holds of a recording: rests of the pump without the time in which valves shut or open.
 
-    `channels`: time, absolute pressures of A and B, and position, (n,) each; `rests` (n - 1,). Holds that are too short
-    for `MIN_READINGS`, or have missing samples, are omitted.
+    `channels`: time, absolute pressures of A and B, and position, (n,) each; `rests` (n - 1,): flags of the intervals
+    at rest. Holds too short for `MIN_READINGS`, or with missing samples, are omitted.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # samples that are averaged to one
@@ -134,9 +134,9 @@ class _OilRegression(NamedTuple):
     """Regression of displaced volumes on the oil's coefficients over r readings.
 
     `left` (r,): volume displaced by the piston, less the compression expected from the priors; `oil` (r, 4): columns of
-    the coefficients' deviations from their priors, of the compressibility, of the dead volumes of A and B, and of free
-    air; `deviations` (4,): standard deviations of the priors; `inflation`: readings over independent ones;
-    `min_variance` of a reading, as the model describes the compressed volume to within a fraction.
+    compressibility, dead volumes of A and B, and free air, for deviations from the priors; `deviations` (4,): standard
+    deviations of the priors; `inflation`: number of readings over that of independent ones; `min_variance`: of a
+    reading, since the model describes the compressed volume to within a fraction only.
     """
 
     left: Array
@@ -294,7 +294,7 @@ class HeldChambers:
         return fit._replace(likelihood=fit.likelihood - 0.5 * offset_cost(offset))
 
     def leaks_since(self, onset: float) -> Array | None:
-        """Return `leaks`, (6,), with the piston's leak after an onset [s], not its mean; None if no hold follows it."""
+        """Return `leaks` (6,) with the piston's leak since `onset` [s] instead of its mean; None if no hold follows."""
         fits = self._fits_over_offsets(onset)
         if not fits:
             return None
@@ -302,7 +302,7 @@ class HeldChambers:
         return np.array(self.leaks._replace(piston=leak.value, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
-        """Fit a leak past the piston from `onset` [s] on for each offset of a grid, without fits that have no flow.
+        """Fit a leak past the piston since `onset` [s] for each offset of a grid; omit fits in which nothing flows.
 
         Under a small pressure difference, or where a leak has equalised the pressures, the offset is undetermined.
         """
@@ -326,7 +326,7 @@ class HeldChambers:
     def onsets(self) -> Array:
         """Possible onsets [s]: the beginning of the recording, between the holds, and within each.
 
-        A large leak equalises the pressures at once, so that one of them is where p_A - p_B changes most.
+        As a large leak equalises the pressures at once, each hold has an onset where p_A - p_B changes most.
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
@@ -354,7 +354,7 @@ class HeldChambers:
         return np.vstack(columns)
 
     def _onset_posteriors(self, leak: UnitLeak) -> Array:
-        """Compute the log posterior of each of the `onsets` (o,) of a leak, at least zero, with the oil eliminated.
+        """Compute the log posterior of each of `onsets` (o,) of a leak >= 0, with the oil's coefficients eliminated.
 
         It is log prior - N/2 log residual sum of squares, for N independent readings.
         """
@@ -374,7 +374,7 @@ class HeldChambers:
 
     @cached_property
     def _offset_grid(self) -> Array:
-        """First grid of offsets of p_A - p_B [Pa], with the difference at the end of each hold: a leak equalises it."""
+        """Grid of offsets of p_A - p_B [Pa], and the last difference of each hold, which a leak makes the offset."""
         ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
@@ -432,9 +432,9 @@ class HeldChambers:
     @property
     def probability_after_holds(self) -> float:
         """Prior probability that a leak begins after the last hold."""
-        after = self.end - float(self.holds[-1].t[-1])
+        time_after = self.end - float(self.holds[-1].t[-1])
         # half of all leaks begin within the recording
-        return 0.5 * after / max(self.end - self.begin, np.finfo(float).tiny)
+        return 0.5 * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
     @cached_property
     def piston_onset(self) -> Interval | None:

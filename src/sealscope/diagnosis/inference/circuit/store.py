@@ -102,10 +102,10 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     count = len(volume)
     time = (np.arange(count, dtype=float) + 0.5) * block_s
     # lost by the middle of each block (rows) with unit conductance in each (columns): half in the block itself
-    lost = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * block_s
+    losses = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * block_s
     noise = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # second differences have 6 times white noise's variance
     temperature = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
     weight = np.linalg.inv(max(noise, np.finfo(float).tiny) * np.eye(count) + temperature @ temperature.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # without the initial volume
-    precision, vector, healthy = lost.T @ weight @ lost, lost.T @ weight @ volume, INFERENCE.healthy.outside
+    precision, vector, healthy = losses.T @ weight @ losses, losses.T @ weight @ volume, INFERENCE.healthy.outside
     return Information(begin + time, 0.5 * (precision + precision.T), vector, level=healthy, slope=healthy)

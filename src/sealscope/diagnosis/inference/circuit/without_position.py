@@ -95,7 +95,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
 
 
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
-    """Flag the samples (n,) in which the piston is held and has settled, by a flow (n,) [m^3/s] that is 0 then.
+    """Flag the samples (n,) in which the piston is held and has settled, by a `flow` (n,) [m^3/s] near zero.
 
     The averaged flow must be below a fraction of its largest value, or below `min_limit`. A sample with an infinite
     flow is not held.

@@ -37,11 +37,11 @@ class PressureResponse:
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
-        """Estimate the conductance in a recording; None if it has no information."""
+        """Estimate the leakage of a recording; None if the model of the response does not describe it."""
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Return the level of the conductance of a healthy recording; None if it has no information."""
+        """Compute the mean conductance of a healthy recording, "level"; None if the model does not describe it."""
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}
 

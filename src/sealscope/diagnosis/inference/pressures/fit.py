@@ -46,7 +46,7 @@ class Priors(NamedTuple):
 
     @property
     def unit(self) -> Array:
-        """Units of the parameters, small enough for differences."""
+        """Units of the parameters (p,), small enough for finite differences."""
         return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
@@ -65,9 +65,9 @@ class Priors(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    """Model about parameters `theta` (p,).
+    """Linearisation of the model about parameters `theta` (p,).
 
-    `rows` (1 + p, n): its residual [Pa] and Jacobian [Pa per unit], and `gram` (1 + p, 1 + p) of these; `ends`: states
+    `rows` (1 + p, n): residual [Pa] and Jacobian [Pa per unit], and `gram` (1 + p, 1 + p) of these; `ends`: states
     at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter sets, that of `theta`
     first.
     """
@@ -87,8 +87,8 @@ class Linearisation(NamedTuple):
 class Block(NamedTuple):
     """Sums of a block about its parameters `theta` (p,).
 
-    `gram` (1 + p, 1 + p) of residual and Jacobian over `samples`; `scores` (s, 1 + p): products with the tested
-    parameter's column in each of s pieces, which contain the autocorrelation of the residual.
+    `gram` (1 + p, 1 + p) of residual and Jacobian over `samples`; `scores` (s, 1 + p): products of these with the
+    tested parameter's column in each of s pieces, whose scatter shows the autocorrelation of the residual.
     """
 
     theta: Array

@@ -133,8 +133,8 @@ class ResponseLeak:
     def _fraction_after(self, step: StepTest) -> float:
         """Compute the fraction of the information on the mean conductance that lies after a step's onset."""
         weights = self.information.precision.sum(axis=0)
-        after = self.information.time >= step.onset().value
-        return float(np.clip(weights[after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
+        is_after = self.information.time >= step.onset().value
+        return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:

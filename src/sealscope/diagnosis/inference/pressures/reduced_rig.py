@@ -57,7 +57,7 @@ _MAX_STEP, _SEGMENT = 1.01e-3, 256
 
 @contracted
 def _direction_factor(v: float, theta: Parameters) -> float:
-    """Compute the factor 1 + side or 1 - side of the friction, for motion out or in."""
+    """Compute the friction's factor of direction: 1 + theta[SIDE] for motion out, 1 - theta[SIDE] for motion in."""
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
 

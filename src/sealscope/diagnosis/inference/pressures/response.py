@@ -209,7 +209,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     priors = segment.priors
 
     def rank_starts(section: Segment, theta: Array, n_groups: int, values: dict[int, Array]) -> Array:
-        """Rank 16 sets, `theta` with other `values` of some parameters, in each group: (16/n_groups, n_groups, p)."""
+        """Sort 16 variants of `theta`, with `values` by parameter, in each group: (16/n_groups, n_groups, p)."""
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, column in values.items():
             sets[:, parameter] = column
@@ -281,7 +281,7 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Follow the beginning of a recording, and keep only the parameters at its end, as those of the start."""
+        """Refine the start parameters by filtering the beginning of a recording; reset covariance and states."""
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         stop = min(round(_FOLLOW.beginning * recording.rate), len(recording) - length + 1)

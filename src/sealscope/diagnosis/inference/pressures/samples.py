@@ -63,8 +63,8 @@ def mains_waves(total: Array, rate: float) -> Array:
     frequency = np.fft.rfftfreq(n_padded, 1.0 / rate)
     mains, lines = PRESSURE.mains, []
     for nominal in mains.lines:
-        near = np.flatnonzero(np.abs(frequency - nominal) <= mains.within * nominal)
-        lines += [frequency[near[np.argmax(spectrum[near])]]] if near.size else []
+        bins = np.flatnonzero(np.abs(frequency - nominal) <= mains.within * nominal)
+        lines += [frequency[bins[np.argmax(spectrum[bins])]]] if bins.size else []
     waves = np.exp(2j * np.pi / rate * np.outer(lines, np.arange(total.size)))
     harmonics = np.concatenate([waves[k * np.array(lines) < 0.5 * rate] ** k for k in range(1, mains.harmonics + 1)])
     return np.concatenate([harmonics.real, harmonics.imag])

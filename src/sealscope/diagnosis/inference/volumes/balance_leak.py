@@ -181,8 +181,9 @@ class BalanceLeak:
     def _rise_laws(self) -> list[LawWeight]:
         """Compute mean flow of a unit rise of the leak coefficient and log weight of each leak law of `EXPONENTS`.
 
-        A law of exponent n is orifice flow by the fraction f = 2 (1 - n), flow laminar^(1 - f) orifice^f and log weight
-        log prior + f N (log likelihood ratio of one reading), N the number of independent readings of a recording.
+        A law of exponent n lies the fraction f = 2 (1 - n) of the way from laminar to orifice flow: its flow is
+        laminar^(1 - f) orifice^f, its log weight log prior + f N (log likelihood ratio of one reading), N the number of
+        independent readings of a recording.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -214,8 +215,8 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow [m^3/s], infinite if nothing was tested.
 
-        With healthy recordings it bounds the rise over them, by holds, too, if there are any; else a step within the
-        recording. It covers the uncertainty of the machine's size and of the leak's law.
+        With healthy recordings it bounds the rise over them, from the holds as well if there are any; otherwise a step
+        within the recording. It covers the uncertainty of the machine's size and of the leak's law.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -262,9 +263,9 @@ class BalanceLeak:
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Rise over healthy recordings, with the log likelihood ratio of the step's contribution; None without any.
+        """Rise over healthy recordings, with the log likelihood ratio of the step's part; None without recordings.
 
-        Holds after the step's onset show the whole step; without any, the whole recording shows a part of it.
+        Holds after the step's onset show the whole step; without such holds, the whole recording shows a part of it.
         """
         step, rise, motion_rise = self.step, self.rise, self._motion_rise
         if rise is None or motion_rise is None or step is None:
@@ -284,9 +285,9 @@ class BalanceLeak:
 
     def _fraction_after(self, step: StepTest) -> float:
         """Compute the fraction of the information on the mean leakage that lies after a step's onset."""
-        after = self.balance.running_blocks.time >= step.onset().value
+        is_after = self.balance.running_blocks.time >= step.onset().value
         weights = self.balance.leak.precision.sum(axis=0)
-        return float(np.clip(weights[after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
+        return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -381,9 +382,10 @@ class BalanceLeak:
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
-    """Build the distribution of a rise's flow, centred on `value` but at least zero, with a `weight` in a mixture.
+    """Build the distribution of a rise's flow, as a part of a mixture with a total `weight`.
 
-    `unit`: flow of a unit coefficient; `oil_deviation`: standard deviation of the coefficient due to the oil.
+    `value`: rise of the coefficient, used if positive, else 0; `unit`: flow of a unit coefficient; `oil_deviation`:
+    standard deviation of the coefficient due to the oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

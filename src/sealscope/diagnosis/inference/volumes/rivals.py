@@ -32,18 +32,18 @@ def rival_rises(
     columns: Sequence[ColumnRoles],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Compare the coefficients of other leaks, the turning pump's and air in a recording with the healthy ones.
+    """Compare the coefficients of external leaks, the turning pump's leak and free air with the healthy recordings.
 
     `volume_ratio`: measured over assumed ratio of area to displacement.
     """
     names, hold_rivals = columns[0].names, held_rivals(judged, healthy)
     turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
-    tested = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
+    columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
     if hold_rivals is not None:
-        tested = [k for k in tested if not names[k].startswith("external leak")]
+        columns_to_test = [k for k in columns_to_test if not names[k].startswith("external leak")]
     healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
     observables = list[Observable]()
-    for k in tested:
+    for k in columns_to_test:
         change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
         # of each healthy recording from the others
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
@@ -115,7 +115,7 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
             prior = 1.0 / (np.abs(coefficients) * deviations[free]) ** 2
         matrix, cross = gram[e][np.ix_(free, free)], gram[e][free, tested]
         regularised = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
-        solved = solve(regularised, np.column_stack([cross, residual[free]]))
-        precision += float(gram[e][tested, tested] - cross @ solved[:, 0])
-        moment += float(residual[tested] - cross @ solved[:, 1])
+        solution = solve(regularised, np.column_stack([cross, residual[free]]))
+        precision += float(gram[e][tested, tested] - cross @ solution[:, 0])
+        moment += float(residual[tested] - cross @ solution[:, 1])
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

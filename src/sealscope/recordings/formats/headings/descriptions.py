@@ -22,7 +22,7 @@ _SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
 
 
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
-    """Rename labels by tables of channels and rows of labels above the heading.
+    """Rename labels by the descriptions in tables of channels and rows of labels above the heading.
 
     The columns' own names stay in `called`. A description may give the unit if the heading does not. `rows`: cells of
     the lines above the heading, and of rows of labels in it.
@@ -50,7 +50,7 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return a column's own name for comparison, the last word, as a row of groups may be prefixed to it."""
+    """Return the last word of a column's name for comparison, as the name of its group may stand before it."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 

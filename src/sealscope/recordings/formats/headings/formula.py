@@ -25,7 +25,10 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Formula(Generic[K]):
-    """`constant` plus the sum of columns, by name or number, times their `factors`; `unit`: None if not stated."""
+    """A linear formula: `constant` plus the sum of columns times `factors`; `unit` of the result, None if not stated.
+
+    `factors`: name or number of a column -> factor.
+    """
 
     factors: Mapping[K, float]
     constant: float = 0.0
@@ -37,14 +40,14 @@ class Formula(Generic[K]):
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
-        """Add another formula, multiplied by `times`."""
+        """Add another formula, multiplied by `times`; the sum has no unit."""
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor
         return Formula(factors, self.constant + times * other.constant)
 
     def values(self, columns: Mapping[K, Array]) -> Array:
-        """Compute the samples (n,) in `unit`; those of the only column are not copied."""
+        """Compute the samples (n,) in `unit`; a column without factor and constant is returned itself, not a copy."""
         if self.column is not None:
             return columns[self.column]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -53,10 +56,10 @@ class Formula(Generic[K]):
 
 
 def parse_formula(text: str) -> Formula[str]:
-    """Parse sums, products with numbers, quotients by numbers and brackets; the rest of the text is the unit.
+    """Parse a formula of sums, products with numbers, quotients by numbers and brackets, and the unit after it.
 
-    The text is parsed as Python but never evaluated. The longest beginning of the text that is a formula is used.
-    Raises InputError for any other text, such as a product of two columns.
+    The longest beginning of the text that is a formula is used; it is parsed as Python but never evaluated. Raises
+    InputError for any other text, such as a product of two columns.
     """
     if len(text) > _MAX_LENGTH:
         raise InputError(f"{_RULE}, got {len(text)} signs")
@@ -81,7 +84,7 @@ def parse_formula(text: str) -> Formula[str]:
 
 
 def _parse_linear(tree: ast.expr, names: list[str]) -> Formula[str]:
-    """Convert a syntax tree to a formula; raise ValueError if it is not linear in the columns."""
+    """Convert a syntax tree, with `columnN` for `names[N]`, to a formula; raise ValueError if it is not linear."""
     empty = Formula[str]({})
     match tree:
         case ast.Name(id=name):

@@ -29,11 +29,11 @@ class Label:
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi`; `unit`: stated elsewhere, as in a row."""
+        """Parse `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi`; a `unit` from elsewhere takes precedence."""
         whole = text.strip().translate(_WIDE_BRACKETS)
-        name, bracketed = split_square_brackets(whole)
-        if bracketed is not None:
-            return cls(whole, name, bracketed if unit is None else unit)
+        name, bracket_text = split_square_brackets(whole)
+        if bracket_text is not None:
+            return cls(whole, name, bracket_text if unit is None else unit)
         name, remark = _split_brackets_or_slash(whole)
         trailing = _TRAILING_UNIT.fullmatch(whole) if unit is None and remark is None else None
         if trailing and any(

@@ -62,7 +62,7 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
 
 
 def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Collect name -> text of pairs with both, printable and shortened; the first of a repeated name is used."""
+    """Collect remarks, name -> text, from pairs with both, printable and shortened; of a repeated name the first."""
     remarks: dict[str, str] = {}
     for name, value in pairs:
         key, text = _clean_text(str(name), _MAX_NAME), _clean_text(str(value), _MAX_TEXT)
@@ -74,7 +74,7 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks in a recording's provenance, printable and shortened, as it may come from anywhere."""
+    """Return the remarks in a recording's provenance, name -> text, made printable and short."""
     remarks = provenance.get("about")
     return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 

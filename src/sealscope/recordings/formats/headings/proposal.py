@@ -36,7 +36,7 @@ _MAX_NAME = 80
 
 
 class _Guess(NamedTuple):
-    """The guessed meaning of a column: `kind` of quantity; `side`: "A", "B", "pump" or a number; `unit` or None."""
+    """The guessed meaning of a column: `kind` of quantity, `side` (`_find_side`), and `unit` or None."""
 
     kind: str
     side: str
@@ -90,18 +90,18 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
 
 
 def format_map(channel_map: Mapping[str, str]) -> str:
-    """Format a map as text."""
+    """Format a map as text: `p_A=PG_1, p_B=PG_2`."""
     return ", ".join(f"{channel}={column}" for channel, column in channel_map.items())
 
 
 def is_time(label: Label) -> bool:
-    """Test whether a column's name means the time; a number may tell it from the times of other channels."""
+    """Test whether a column's name, with or without a number after it, means the time."""
     guess = _guess_meaning(label)
     return _is_named_time(label) or (guess is not None and guess.kind == "time")
 
 
 def _is_named_time(label: Label) -> bool:
-    """Test whether a column has one of the names that loggers give the time."""
+    """Test whether a column has a usual name of the time, with or without a number after it: `X_Value.1`."""
     return _COUNTED.sub("", label.name.casefold()) in WORDS["time"]
 
 
@@ -132,22 +132,22 @@ def split_unit(name: str) -> tuple[str, str | None]:
     last_word = _LAST_WORD.search(name)
     if last_word and len(last_word[0]) > 2:
         endings.append((name[: last_word.start()], last_word[0]))
-    for before, unit in endings:
-        if not before or not unit or unit in ("A", "B", "a", "b"):  # a chamber, no unit
+    for stem, unit in endings:
+        if not stem or not unit or unit in ("A", "B", "a", "b"):  # a chamber, no unit
             continue
         quantity = _AMBIGUOUS_UNITS.get(unit)
-        if quantity is not None and not _split_words(before) & _MEASURED[quantity]:
+        if quantity is not None and not _split_words(stem) & _MEASURED[quantity]:
             continue
         channel_units = (*CHANNEL_UNITS.values(), "s", "m/s")
         if is_familiar(unit) and (
             is_current_or_fraction(unit) or any(same_dimension(unit, channel_unit) for channel_unit in channel_units)
         ):
-            return before, unit
+            return stem, unit
     return name, None
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether a column's name ends in these words: `ADC1_Channel_2` in `ch2`, `Main_Pa` in `Pa`."""
+    """Test whether a column's name ends in `words`, as `ADC1_Channel_2` does in `ch2` and `Main_Pa` in `Pa`."""
     tokens = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
@@ -188,7 +188,7 @@ def _strip_accents(text: str) -> str:
 
 
 def _split_words(name: str) -> set[str]:
-    """Split a name into words, with the ends of compounds, and `p` and the side of `pa`."""
+    """Split a name into lower-case words; add the ends of compounds (`weg` of `kolbenweg`), and `p`, `a` for `pa`."""
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
         words |= {token, "p", token[1:]} if token in ("pa", "pb") else {token}
@@ -197,7 +197,7 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that columns called head mean: A if others are called rod, B if cap; empty if unknown."""
+    """Find the chamber that "head" stands for: A if other columns are called rod, B if cap; empty if unknown."""
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""
@@ -205,7 +205,7 @@ def _find_head_side(labels: Sequence[Label]) -> str:
 
 
 def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
-    """Guess the meaning of a column from its name and unit; `head`: the chamber that the word head stands for."""
+    """Guess a column's meaning from its name and unit, None if unknown; `head`: the chamber that "head" stands for."""
     if len(label.name) > _MAX_NAME:
         return None
     name, unit = split_unit(label.name)
@@ -250,7 +250,7 @@ def is_current_or_fraction(unit: str) -> bool:
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess a pressure `before` or `behind` a valve from a column's name; None for any other column."""
+    """Guess from its name that a column is the pressure before or behind (`kind`) a valve; None for other columns."""
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
     words = _split_words(name if label.unit is None else label.name)

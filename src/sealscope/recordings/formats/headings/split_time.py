@@ -78,7 +78,7 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Test whether `offset` grows while the second stays the same, and restarts with the next second."""
+    """Test whether `offset` (n,) grows within most seconds of `base` (n,), and falls at the next second."""
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)
     if 2 * np.count_nonzero(is_same_second) < steps.size:  # most seconds have one sample

@@ -101,7 +101,7 @@ def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
 
 
 def _select_recording(names: Sequence[str], path: Path) -> str:
-    """Select the recording among the names in an archive, where documents may accompany it."""
+    """Select the only recording among the names in an archive, without documents; raise UnreadableFile otherwise."""
     names = [name for name in names if "__MACOSX" not in name and not Path(name).name.startswith(".")]
     candidates = [name for name in names if Path(name).suffix.lower() not in _DOCUMENTS] if len(names) > 1 else names
     if len(candidates) > 1:

@@ -202,7 +202,7 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 
 
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
-    """Convert the lists in a document to arrays, and lists of records to columns by name."""
+    """Convert the lists in a document: samples and rows to arrays, records to columns by name, structs to mappings."""
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}
     if not isinstance(value, list) or not value:

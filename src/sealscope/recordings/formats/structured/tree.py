@@ -31,7 +31,7 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
 
 def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series in a value `name` of the group `group`."""
+    """Yield the series in a value of any type, called `name` in `group`; `clock`: for series without times."""
     if depth > _MAX_DEPTH:
         return
     if (fields := _struct_fields(value)) is not None:
@@ -163,7 +163,7 @@ def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None
 
 
 def _list_structs(value: Any) -> list[Mapping[str, Any]]:
-    """List the structs of an array, or the only one."""
+    """List the structs of an array of structs, or the single struct."""
     fields = _struct_fields(value) or {}
     members = [member for field in fields.values() if (member := _struct_fields(field)) is not None]
     return members if members and all(key.startswith("(") for key in fields) else [fields]

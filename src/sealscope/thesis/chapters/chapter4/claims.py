@@ -155,7 +155,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 
 
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Format how many tests passed, and under which readings all of them did."""
+    """Format the number of passed tests; if only some passed, also the readings under which all did."""
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
     text = f"{sum(results)} of {len(results)} tests pass"
@@ -170,7 +170,10 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` by testing its `numbers` by solver and reading; the converged runs decide."""
+    """Judge claim 4.`number` by the converged runs under both readings, and state the results of both solvers.
+
+    `numbers`: by solver and reading; `test`: tests the numbers of one reading; `format_numbers`: formats those of all.
+    """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
     }
@@ -189,18 +192,18 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build the function that formats `head` and the range of `values` over the rows of all readings."""
+    """Build a function that formats `head` and the range [kPa] of the `values` in the rows of all readings."""
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute the change of each later row from the first in a statistic ("peak" or "range") of the pressures."""
+    """Subtract the first row's "peak" or "range" (`statistic`) of each pressure from those of the later rows."""
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Compute the numbers of each (command, closing) under both solvers and readings."""
+    """Simulate each (command, closing [%]) with both solvers and readings; return the numbers of `summarise_run`."""
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
