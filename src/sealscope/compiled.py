@@ -205,7 +205,7 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """Call double f(double *memory, double *sample) by its address; all three arguments are integer addresses."""
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the call in LLVM."""
+        """Emit the LLVM instructions that call the function at the address."""
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
         function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
@@ -219,14 +219,14 @@ def address_of(context: Any, pointer: Any) -> Any:
     """Return the address of a pointer as an integer."""
 
     def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the conversion in LLVM."""
+        """Emit the LLVM instruction that converts the pointer to a 64-bit integer."""
         return builder.ptrtoint(values[0], target.get_value_type(numba.int64))
 
     return numba.int64(pointer), emit_conversion
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the dtype of a record of doubles named `numbers`, and `parts`: arrays by shape or records by dtype."""
+    """Build the dtype of a record of doubles `numbers`, and of `parts`, each an array's shape or a record's dtype."""
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
@@ -251,7 +251,7 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
         """Cast a pointer to doubles to a pointer to the record."""
 
         def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            """Emit the cast in LLVM."""
+            """Emit the LLVM instruction that casts the pointer."""
             return builder.bitcast(values[0], target.get_value_type(kind))
 
         return kind(pointer), emit_cast

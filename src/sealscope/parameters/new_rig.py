@@ -31,10 +31,10 @@ def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[
 
 
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
-    """Format the file of a pump-controlled rig, with comments.
+    """Format a new rig's TOML file, with comments, for a cylinder that is controlled by its pump.
 
-    All other parameters are those of `thesis` (equal areas) or `single-rod-eha`. Some are scaled with the machine's
-    size: friction with the bore, moving mass and valves with the volume.
+    All other parameters are those of the rig `thesis` (equal areas) or `single-rod-eha`. Some are scaled with the
+    machine's size: friction with the bore, moving mass and valves with the volume.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def valve_rig_text(
     rated_drop: float | None = None,
     pressure: float | None = None,
 ) -> str:
-    """Format the file of a valve-controlled rig, with comments.
+    """Format a new rig's TOML file, with comments, for a cylinder that is controlled by a servo valve.
 
-    All other parameters are those of `servo-valve`, some of them scaled with the machine's size.
+    All other parameters are those of the rig `servo-valve`, some of them scaled with the machine's size.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def valve_rig_text(
     rated_drop : float, optional
         Pressure drop of one edge at the rated flow [Pa]; by default that of a servo valve, 35 bar.
     pressure : float, optional
-        Pressure of the supply above the return [Pa].
+        Pressure of the supply above the return [Pa]; by default that of `servo-valve`.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def _read_template(file: str) -> Template:
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute the volume of a side at mid-stroke, dead volume included, over that of the rig `base`."""
+    """Compute the larger side's volume at mid-stroke, with its dead volume, over that of the rig `base`."""
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 

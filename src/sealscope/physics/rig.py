@@ -386,7 +386,10 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """Compute the part of dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] due to the throttles, eqs. (4.16)-(4.19)."""
+    """Compute the rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that the throttles' flows cause.
+
+    `Q_A`, `Q_B` [m^3/s]: from line 1 to chamber A, from chamber B to line 2 (`throttle_flows`). Eqs. (4.16)-(4.19).
+    """
     V_A, V_B = volumes_at(y[POSITION], p)
     from_1, to_A = flows_at_both_ends(Q_A, y[P_1], y[P_A], p)
     from_B, to_2 = flows_at_both_ends(Q_B, y[P_B], y[P_2], p)
@@ -432,7 +435,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the part of dp_A/dt .. dp_2/dt [Pa/s] due to external leakage and make-up, and the make-up's flow.
+    """Compute the rates dp_A/dt .. dp_2/dt [Pa/s] that external leakage and make-up cause, and the make-up's flow.
 
     The flow [m^3/s] is that out of the accumulator, at its pressure.
     """
@@ -481,7 +484,7 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Compute the part of the rates of p_A, p_B, p_1, p_2 [Pa/s] due to a servo valve and its supply.
+    """Compute the rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that a servo valve and its supply cause.
 
     `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure is constant.
     """
@@ -504,7 +507,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute dy/dt without the throttles' flows; command `u` [V], leakage coefficients `G`, `C`, load `F` [N]."""
+    """Compute dy/dt without the throttles' flows; command `u` [V], `G` and `C` of `piston_leakage`, load `F` [N]."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)

@@ -41,9 +41,10 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 
 
 def file_seconds(recording: Recording, path: Path) -> float:
-    """Find the time of the first sample of a file's recording [s since 1970].
+    """Find the time of the first sample [s since 1970] of the recording in the file `path`.
 
-    Taken from the provenance, else from the file's name, else from its modification time, as that of the last sample.
+    It is taken from the provenance, else from the file's name. Otherwise the file's modification time counts as the
+    time of the last sample.
     """
     start = start_seconds(recording, path.name)
     if start is not None:

@@ -40,7 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Copy values to a read-only array of doubles, unless they are one that owns its memory."""
+    """Copy values to a read-only array of doubles; return them as they are if they are one that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)

@@ -194,7 +194,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the leakage of pump and piston together and the smallest detectable step; None if not known.
+    """Format the total leakage past pump and piston, and the smallest detectable step; None if it is not known.
 
     `basis`: whether to add the machine data on which L/min are based.
     """
@@ -216,7 +216,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a leakage without L/min as a fraction of the pump's flow, and the smallest detectable step."""
+    """Format a total leakage that is not known in L/min: as a fraction of the pump's flow, with the smallest step."""
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -228,7 +228,7 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Format the leakage of pump and piston briefly; None if it is not known or there is a leak."""
+    """Format the usual leakage past pump and piston in a few words; None if unknown, or if the verdict is "leak"."""
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
         return None

@@ -60,11 +60,12 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Compute the details (levels, CHUNK, WIDTH) of `n` new rows of a channel, which has a buffer for each level.
+    """Compute the wavelet details (levels, CHUNK, WIDTH) of `n` new rows, the samples of a channel of WIDTH signals.
 
-    The first buffer begins at row `start` of `buffers`, its new rows at start + `first`; each has `capacity` rows, and
-    the low-pass of a level goes to the next buffer. Shallower levels are delayed like the deepest, so that a row of
-    `details` belongs to one sample.
+    `low`, `high` (taps, WIDTH): low-pass and high-pass filter. In `buffers` the channel has a buffer of
+    `capacity` rows for each level, one after the other from row `start` on; the new rows are those from `first` on in
+    the first buffer. The high-pass of a level's buffer is its detail, the low-pass goes to the next buffer. Shallower
+    levels are delayed like the deepest, so that a row of `details` belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):

@@ -124,8 +124,8 @@ class Alternating:
 class Polyline:
     """A signal that is linear between points, and constant before the first and after the last.
 
-    `t`, `y`: (n,) non-decreasing times [s] and values; two points at one time are a jump. `words`: its text, as parsers
-    read it. Polylines are equal if points and text are.
+    `t`, `y`: (n,) non-decreasing times [s] and values; two points at one time are a jump. `words`: text of the
+    signal, such as "step 5 at 1 s". Polylines are equal if points and text are.
     """
 
     t: Array
@@ -172,7 +172,7 @@ _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the polyline through points (t [s], y); `words`: its text, as parsers read it."""
+    """Make the polyline through points (t [s], y); `words`: text of the signal, such as "step 5 at 1 s"."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 

@@ -174,7 +174,7 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    """Check that a row is the test `condition`; raise InputError otherwise."""
+    """Check that a row of the sheet states command, closing, leak and level of a test; raise InputError otherwise."""
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"

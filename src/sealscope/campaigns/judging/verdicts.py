@@ -77,10 +77,11 @@ def compute_thresholds(
 def collect_verdicts(
     rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
-    """Collect each detector's verdicts on the rows, by detector.
+    """Collect the verdict of each detector on each row; return detector -> judged rows, in the order of `rows`.
 
-    A scorer's verdict is `leak` if its score exceeds a limit: that in `limits`, or that of the record's duty in
-    `thresholds`. It is `cannot tell` without a score or a limit.
+    A verdict that the detector states is taken. Otherwise it is `leak` if the detector's score exceeds its limit in
+    `limits` or, without one, the threshold for the row's duty in `thresholds`; `cannot tell` if the record failed, or
+    without a score or a limit.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:

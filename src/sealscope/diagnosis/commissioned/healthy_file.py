@@ -70,7 +70,7 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
 
 
 def uniform_table_type(value_type: Any) -> Any:
-    """Make the pydantic type of a table of any names and one type of values; errors name the first other value."""
+    """Make the pydantic type of a table of any names and one type of values; errors name the first value of another."""
 
     def check_values(table: Any) -> Any:
         """Check the values one after the other; raise ValueError for the first of another type."""
@@ -87,12 +87,12 @@ def uniform_table_type(value_type: Any) -> Any:
 
 
 def list_type(value_type: Any, min_length: int = 0) -> Any:
-    """Make the pydantic type of a list of one type of values; errors name the first other value."""
+    """Make the pydantic type of a list of one type of values; errors name the first value of another."""
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
 def _check_array(value: Any) -> Any:
-    """Check that a value is an array of finite numbers; raise ValueError otherwise."""
+    """Return a value that is an array of numbers below `_MAX_NUMBER` in size; raise ValueError for any other."""
     if not isinstance(value, np.ndarray):
         raise ValueError("must be an array of numbers")
     if not (np.abs(value) < _MAX_NUMBER).all():
@@ -101,13 +101,13 @@ def _check_array(value: Any) -> Any:
 
 
 def _check_statistic(value: Any) -> Any:
-    """Check that a value is a finite number or an array of such; raise ValueError otherwise."""
+    """Return a value that is a number, or an array of numbers, below `_MAX_NUMBER` in size; else raise ValueError."""
     _check_array(np.array(value) if isinstance(value, float) else value)
     return value
 
 
 def _check_sums(summary: Any) -> Any:
-    """Check the shapes of a balance's Gram matrices, and that leak and flow obey Cauchy's inequality in them."""
+    """Return a balance's summary if its sums fit its terms and obey Cauchy's inequality; raise ValueError otherwise."""
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {summary.sums.shape}")
@@ -129,7 +129,10 @@ def _check_sums(summary: Any) -> Any:
 
 
 def _check_levels(summary: Any) -> Any:
-    """Check the shapes of the levels of the ringing, and that they can be logarithms."""
+    """Return the summary of a recording's ringing if its `levels` and `duty` are valid; raise ValueError otherwise.
+
+    Their shapes must fit the chambers, and each number is a logarithm: its size is below `_MAX_LOGARITHM`.
+    """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
         shapes = f"{summary.levels.shape} and {summary.duty.shape}"
@@ -334,7 +337,7 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
 
 
 def _iter_lines(path: Path) -> Iterator[Line]:
-    """Read the lines one after the other, without torn ones; raise InputError for a file that cannot be used."""
+    """Yield the complete lines of a file of summaries; raise InputError for a file that cannot be used."""
     what = "a file of healthy summaries"
     try:
         with open_regular(path, what) as file:

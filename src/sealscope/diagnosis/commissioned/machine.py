@@ -325,13 +325,14 @@ def commission(
     paths : path-like or sequence of path-like
         A folder of healthy recordings, or their files.
     rig : Rig, str or path-like, optional
-        What is stated of the machine, as for `sealscope.diagnose`.
+        Parameters that are stated of the machine: a Rig, the name of a packaged one or the path of a TOML file; by
+        default nothing is stated.
     map : mapping of str to str, or "auto", optional
         Channel to column of the logs, as for `sealscope.read`; by default that of the rig's file.
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which the machine is to be repaired, such as ``"5 mL/min"``.
+        Leak from which the machine is to be repaired: a flow (``"5 mL/min"``) or a creep (``"8 mm/min"``, the default).
     name : str, optional
         Name of the machine.
     keep : bool, optional
@@ -345,7 +346,8 @@ def commission(
     Raises
     ------
     InputError, UnreadableFile
-        A recording cannot be read or trusted, two hold the same samples, or an argument breaks a rule.
+        There is no recording, none can be used, or `rig` or `limit` is not valid. While others can be used, those that
+        cannot, and copies, are listed in `left_out` instead.
 
     Examples
     --------

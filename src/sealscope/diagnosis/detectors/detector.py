@@ -118,5 +118,5 @@ def log_failure(name: str, distribution: str | None, error: Exception) -> str:
 
 @cache
 def _log_once(line: str) -> None:
-    """Log a line at the level of errors, with the traceback of the exception being handled."""
+    """Log an error with the traceback of the exception being handled, once per process for each text of the line."""
     _log.exception("%s", line)

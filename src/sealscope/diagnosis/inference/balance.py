@@ -340,10 +340,11 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
 def derive_drive_signals(
     samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
 ) -> dict[str, Array]:
-    """Add the decay of the drive's initial state (`START`) to samples, and the pump's speed if only a command is known.
+    """Add signals of the drive's model to samples: the decay `START` of its initial state, and the pump's speed.
 
-    The speed is the drive's response to the command, NaN where the command is missing. `loaded`: under the load
-    p_A - p_B; otherwise the speed is that without load, and its droop under load counts as leakage.
+    The speed "omega" [rad/s] is added only if the pump is known by the command u alone: it is the drive's response to
+    u, NaN where u is missing. `loaded`: under the load p_A - p_B; otherwise without load, so that the droop of the real
+    speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -371,9 +372,9 @@ def min_samples_for_step(rate: float) -> int:
 
 
 class RegimeBlocks(NamedTuple):
-    """Blocks of a recording under one hypothesis of its rests (`regimes`), with equations and columns.
+    """Blocks of a recording, equations and columns for valves that are open, or `shut`, at rest (`regimes`).
 
-    `blocks`: with the offset of p_A - p_B removed; `plain`: as recorded; `shut`: the pump is cut off at rest.
+    `blocks`: with the offset of p_A - p_B removed; `plain`: as recorded; `shut`: valves cut the pump off at rest.
     """
 
     blocks: Blocks
@@ -384,9 +385,9 @@ class RegimeBlocks(NamedTuple):
 
 
 class RecordedBlocks(NamedTuple):
-    """Blocks of a recording under both hypotheses of rests; `shut` is None if the pump never rests.
+    """Blocks of a recording for valves that are `open` and `shut` at rest (`regimes`).
 
-    `odds`: log odds that the pump is cut off at rest.
+    `shut`: None if the pump never rests; `odds`: log odds that valves cut the pump off at rest.
     """
 
     open: RegimeBlocks
@@ -394,12 +395,12 @@ class RecordedBlocks(NamedTuple):
     odds: float
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks of the likelier hypothesis, by the log `odds` from all recordings."""
+        """Return the blocks for shut valves if the log `odds` from all recordings are > 0, else those for open ones."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
-    """Compute the blocks of a recording under both hypotheses of rests; None if its channels allow no balance."""
+    """Compute the blocks of a recording for valves that are open and shut at rest; None if it allows no balance."""
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
     if not balances:
@@ -440,7 +441,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
-    """Build the blocks of one hypothesis, with the offset of p_A - p_B removed.
+    """Build the blocks for the equations `balances`, with the offset of p_A - p_B removed.
 
     `blocks_about(offset)` computes the blocks with an offset [Pa] subtracted from p_A - p_B.
     """

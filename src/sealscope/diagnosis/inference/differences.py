@@ -131,9 +131,10 @@ def compare_estimates(
 
 
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
-    """Compute the part of a value's standard error that the scatter of the healthy values does not contain.
+    """Compute the standard error that a value has in addition to that in the scatter of the healthy values.
 
-    `healthy_errors`: standard errors of these, whose scatter contains their median.
+    The scatter contains the median of `healthy_errors`, the standard errors of the healthy values. The result is
+    sqrt(`error`^2 - median^2), at least 0; it is `error` if there are no healthy values.
     """
     if not healthy_errors:
         return error

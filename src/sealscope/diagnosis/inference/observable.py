@@ -165,7 +165,7 @@ class LeakMeasure(Protocol):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit of the rig's file, in standard deviations; None if not stated."""
+        """Total leakage above the limit in the rig's file, over its standard deviation; None if no limit applies."""
 
     @property
     def bound_flow(self) -> float:

@@ -246,7 +246,7 @@ class NullLaw(NamedTuple):
     length: float
 
     def chance(self, score: float) -> float:
-        """Compute the probability of a higher score: that of a cap of the sphere, and of the tube about the curve."""
+        """Compute the probability that a coefficient without a step has a higher score (P of the module)."""
         from scipy.special import betainc
 
         m = self.dimensions
@@ -333,7 +333,11 @@ class _StepFits(NamedTuple):
 
 
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
-    """Fit a step up to z (n,) at each onset, by whitened unit steps (n, o) and the walk's eigenvalues (n,)."""
+    """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
+
+    `z` (n,): whitened readings; `steps` (n, o): unit steps, whitened likewise; `eigen` (n,): eigenvalues of the walk's
+    covariance (`_Whitened`). A negative step does not reduce the residual.
+    """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
     moments, energies = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
@@ -344,9 +348,9 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 class _Whitened(NamedTuple):
     """Readings z (n,) of a coefficient without level and slope, in the eigenvectors of the walk.
 
-    `transform` (n, K): from the coefficient in blocks to z; `eigen` (n,): eigenvalues of the walk, times `unit`;
-    `positions` (o,) of onsets in blocks, and their times `onsets` (o,) [s]; `walk_log_priors`: log prior of each of
-    `WALKS`.
+    `transform` (n, K): from the coefficient in blocks to z; `eigen` (n,): eigenvalues of the walk's covariance, times
+    `unit`; `positions` (o,) of onsets in blocks, and their times `onsets` (o,) [s]; `walk_log_priors`: log prior of
+    each of `WALKS`.
     """
 
     z: Array

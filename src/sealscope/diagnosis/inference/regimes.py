@@ -1,7 +1,7 @@
-"""Two hypotheses of a machine at rest: its valves leave the pump in the circuit (open), or cut it off (shut).
+"""Two hypotheses on the valves while the pump rests: they connect it to the cylinder (open), or cut it off (shut).
 
 Open, leakage of pump and piston is in the balance at rest as in motion. Shut, leakage and flow offset of the pump
-count in motion only, and rests show the piston alone. Both balances are linear in the same columns, so that one set
+count in motion only: at rest only the piston leaks. Both balances are linear in the same columns, so that one set
 of sums serves both. Let g be the leakage in motion and r at rest, coefficients of p_A - p_B, with the covariance of
 blocks whose errors differ. Open, r lies about g; shut and healthy, about zero,
 
@@ -27,7 +27,11 @@ from sealscope.recordings.recording import Array
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
-    """Transform Gram matrices with columns at rest to the columns of one hypothesis: open, or `shut` at rest."""
+    """Reduce the Gram matrices of blocks to the balance for valves that are open, or `shut`, while the pump rests.
+
+    `roles`: columns of `blocks`, with those of leak and flow offset at rest (`terms.with_rests`). Open, these two are
+    dropped; shut, they are combined with the others (`shut_at_rest_matrix`).
+    """
     if shut:
         transform = shut_at_rest_matrix(roles.names)
         return replace(blocks, gram=np.asarray(transform.T @ blocks.gram @ transform))
@@ -36,7 +40,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 
 
 def shut_at_rest_matrix(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) that combines a balance's m columns to those with the pump cut off at rest.
+    """Build the matrix (m, n) that combines a balance's m columns to the n of one with the pump cut off at rest.
 
     With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`): the column of
     the offset becomes bias - rest bias, that of the leak at rest becomes leak - rest leak, and the rest bias is left
@@ -58,8 +62,8 @@ def shut_at_rest_matrix(names: Sequence[str]) -> Array:
 def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
     """Repeat the leak's row and column in Gram matrices (E, m, m) of a recording without rests.
 
-    With the pump cut off at rest the leak at rest has a column of its own, equal to the leak's where nothing rests.
-    `names` (m - 1,) of the columns, without the left side; the result is (E, m + 1, m + 1).
+    The balance with the pump cut off at rest has one more column, the leakage of the turning pump. Without rests it
+    equals the leak's column. `names` (m - 1,) of the columns, without the left side; the result is (E, m + 1, m + 1).
     """
     index = [*range(len(names) + 1)]
     index.insert(names.index(LEAK), names.index(LEAK))
@@ -67,13 +71,13 @@ def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Test whether blocks with columns at rest contain any rest."""
+    """Test whether the pump rests in any block; `roles`: columns of `blocks`, with those at rest (`apply_regime`)."""
     bias = roles.names.index(REST_BIAS)
     return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)  # its column is zero in motion
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
-    """Compute the log odds that the pump is cut off at rest; 0 without information."""
+    """Compute the log odds that valves cut the pump off at rest, from blocks as in `apply_regime`; 0 if unknown."""
     gram = blocks.gram[:, 0]
     at_rest, bias = (roles.names.index(name) for name in RESTS)
     if not has_rests(blocks, roles) or len(blocks) < 2:
@@ -92,9 +96,9 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 
 
 def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
-    """Compute the log odds that a quantity at rest is about zero rather than about its value in `motion`.
+    """Compute the log odds that a quantity is zero at rest rather than equal to its value in `motion`.
 
-    `variance`: of the value at rest; `difference_variance`: of its difference from that in motion.
+    `value`, `variance`: the quantity at rest; `difference_variance`: that of `value` - `motion`.
     """
     prior = INFERENCE.rest
     shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)

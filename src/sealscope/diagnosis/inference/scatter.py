@@ -62,7 +62,7 @@ PARTS, PART_WIDTH, MAX_Z, NEGLIGIBLE = 7, 0.5, 30.0, 16.0
 
 
 class Mixture(NamedTuple):
-    """Mixture of normal laws: `weights`, `deviations` and `centres` about the mean of the mixture, (k,) each."""
+    """Mixture of k normal laws: their `weights`, standard `deviations` and `centres`, (k,) each."""
 
     weights: Array
     deviations: Array
@@ -87,7 +87,7 @@ class Rise(NamedTuple):
     """Rise of the leak's coefficient beyond the healthy recordings: estimate `value` and its standard `deviation`.
 
     In a healthy recording `value` has the distribution `mixture`, or without one that of `deviation` times Student's t.
-    `may_be_partial`: the leak may have begun within the recording, which shows between nothing and all of the rise.
+    `may_be_partial`: the leak may have begun within the recording, whose mean then contains only a part of the rise.
     """
 
     value: float
@@ -97,7 +97,7 @@ class Rise(NamedTuple):
     may_be_partial: bool = False
 
     def widen(self, variance: float) -> Rise:
-        """Add a variance to all parts of the mixture; return the rise unchanged if it has none, or variance <= 0."""
+        """Add a variance to each normal law of the mixture; return the rise unchanged without one, or if it is <= 0."""
         if self.mixture is None or not variance > 0.0:
             return self
         mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
@@ -138,7 +138,7 @@ class Rise(NamedTuple):
         return self._log_density(self.value - rise) - self._log_density(self.value)
 
     def _log_ratio_partial(self, rise: float) -> float:
-        """Compute `log_ratio` for a rise of which the recording shows any part: by the mean density over the parts."""
+        """Compute `log_ratio` if the recording shows an unknown fraction of the rise, by averaging over fractions."""
         densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
         if 0.0 < self.value < rise:  # the likeliest part, which the grid may miss
             densities.append(self._log_density(0.0))
@@ -295,7 +295,7 @@ class _Estimates(NamedTuple):
 
 
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
-    """Estimate the rise beyond the distribution of levels that healthy recordings predict, about in logarithms.
+    """Estimate the rise of the judged recording's level beyond the level that the healthy recordings predict for it.
 
     z = asinh(level / 2 c) (`_LevelScale`) is normal about an unknown mean, with an unknown scatter sigma of each
     recording and the covariances of sessions, oil and unusual conditions.
@@ -379,17 +379,18 @@ class _LevelScale(NamedTuple):
     crossover: float
 
     def transform(self, excess: Array) -> Array:
-        """Compute z of levels that exceed the mean level by `excess`."""
+        """Compute z of levels that exceed the healthy recordings' mean, `level`, by `excess`."""
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
-        """Return dz/da at levels."""
+        """Compute the derivative dz/da at the level a = `level`."""
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
-        """Convert a distribution of z, relative to `transformed` (s,), to one of levels relative to the mean level.
+        """Convert a mixture of normal laws of z to one of levels, relative to the healthy recordings' mean `level`.
 
-        Each part is split into narrower ones, within which the level is linear in z.
+        `predicted`: (s, ...) with log weights and centres relative to `transformed` (s,), the judged z. Each normal law
+        is split into `PARTS` narrower ones, along a new last axis, within which the level is nearly linear in z.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
@@ -402,7 +403,7 @@ class _LevelScale(NamedTuple):
 
 
 def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
-    """Convert predictions (s, ...) of a healthy level, with log weights, to the rise of `values` (s,) beyond them."""
+    """Estimate the rise of judged levels `values` (s,) over the healthy ones `predicted` (s, ...), with log weights."""
     offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
     logs, deviations, centres = (
         part.ravel() for part in (predicted.weights, predicted.deviations, predicted.centres - offset)
@@ -451,7 +452,7 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 
 
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
-    """Compute how far the leak coefficient (n,) of each recording lies above the mean of all n.
+    """Compute the deviation (n,) of each recording's leak coefficient from the mean of all n.
 
     That is (n - 1)/n of its rise beyond the other n - 1; other coefficients differ by their usual prior.
     """
@@ -549,7 +550,7 @@ def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
 
 
 class _Oil(NamedTuple):
-    """Hypothesis on the oil of n + 1 recordings: what it makes of the logarithm of their leakage.
+    """Hypothesis on the oil of n + 1 recordings, the judged one last: its effect on the logarithm of their leakage.
 
     `thinning` (n + 1,): predicted logarithm relative to the mean of all but the last, proportional to a slope with a
     relative `slope_deviation`; `variances` (n + 1,) of each prediction; `session_deviation`: standard deviation between
@@ -564,7 +565,7 @@ class _Oil(NamedTuple):
 
 
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
-    """List the hypotheses on the oil: by its temperature if known, else by the viscous pressure drop, or unknown."""
+    """List the hypotheses on the oil's effect: by its temperature, else by the viscous pressure drop, or unknown."""
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
     if len(temperatures) == len(recordings):
@@ -669,9 +670,10 @@ class LawFit(NamedTuple):
 def compare_laws(
     judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
 ) -> LawFit | None:
-    """Compare the fit of an orifice's law with the laminar one's to the residual of the healthy recordings' balance.
+    """Fit a recording's residual by a leak through an orifice and by a laminar one, and compare the fits.
 
-    Return None if the balance has no such term, or the recording has no information on both.
+    The residual is that under the coefficients of the healthy recordings, `baseline`. Return None if the balance has no
+    column of an orifice, or the recording has no information on both.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -737,8 +739,8 @@ class _Residual(NamedTuple):
 def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> _Residual:
     """Compute the residual of a recording under the coefficients of others, as its products with every column.
 
-    `gram`, `reference` (m, m): of the recording and of the others. Its `compared` coefficients are those of the others;
-    all but the leak may differ from these by a prior (`nuisance`). `has_leak`: the leak may, too, by `between.pump`.
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the others, whose `compared` coefficients are
+    used. All but the leak's may differ by a prior (`nuisance`); with `has_leak` the leak's may, too, by `between.pump`.
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))

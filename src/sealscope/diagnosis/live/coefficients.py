@@ -36,7 +36,7 @@ ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of n nuisances with the sums that they rest on, and arrays to work in.
+    """Coefficients of n nuisances, the sums from which they are computed, and arrays to work in.
 
     `sums` (n + 2, n + 2); `values` (n,); `leak_products` (n,), products of the leak's column with the nuisances;
     `numbers` (6,), by `ROWS` to `MISFIT`. To work in: `block` (n + 2, n + 2), sums of one block; `matrix` (n, n + 3),
@@ -66,7 +66,7 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
 
 @large_law
 def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
-    """Add `model.block` to the sums, and reduce the weight of earlier blocks.
+    """Add `model.block`, of so many `rows`, to the sums with a `weight`, and reduce the weight of earlier blocks.
 
     Between blocks the leak makes a random step, of the variance of a block's estimate, or unlimited if `has_stepped`.
     """
@@ -105,7 +105,10 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute the residual sum of squares of the coefficients solution[:, 0], minimised over the leak."""
+    """Compute the residual sum of squares for given nuisance coefficients, minimised over the leak coefficient.
+
+    `sums` (n + 2, n + 2): products of nuisances, leak and left side; `solution` (n, k): coefficients in column 0.
+    """
     n, square, leak_moment = len(solution), 0.0, 0.0
     for i in range(n + 2):
         residual = sums[i, n + 1]
@@ -122,7 +125,7 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute the coefficients and the variance of a row from the sums."""
+    """Compute the nuisance coefficients and the variance of a row from the sums, and store them in `model`."""
     n = len(model.matrix)
     solution = model.matrix[:, n:]
     solution[:] = 0.0

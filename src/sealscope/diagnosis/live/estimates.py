@@ -181,8 +181,9 @@ def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
 class BaselineLearning:
     """Running sums from which the baseline is computed.
 
-    Of all `blocks`: `total` conductance, `flow` per unit of it, range of the duty. Of `count` means of `GROUP` blocks:
-    `mean`, sum of `squares` about it, `low`, `high`. `group`: conductances that await their mean.
+    Of all `blocks`: sums of the conductance (`total`) and of the `flow` of a unit conductance, range of the duty. Of
+    `count` means of `GROUP` blocks: `mean`, sum of `squares` about it, `low`, `high`. `group`: conductances that await
+    their mean.
     """
 
     blocks: int = 0
@@ -198,7 +199,7 @@ class BaselineLearning:
     high: float | None = None
 
     def add(self, g: float, flow: float, duty: Duty) -> None:
-        """Add a block: its conductance `g` [m^3/(s Pa)], `flow` per unit of it [L/min], and duty."""
+        """Add a block: its conductance `g` [m^3/(s Pa)], the `flow` of a unit conductance [L/min], and its duty."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -216,9 +217,10 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline, learned until `end` [s] in `hours`, from the sums over at least `GROUP` blocks.
+        """Compute the baseline from the sums, which must contain at least `GROUP` blocks.
 
-        `states_lpm`: state its level as a flow [L/min], too.
+        `version`, `hours`: as in `WatchBaseline`; `end`: end of the last block [s]; `states_lpm`: state the level as a
+        flow [L/min], too.
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks

@@ -342,10 +342,10 @@ class Watch:
             self._learning = BaselineLearning()
 
     def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
-        """Test for a step of the conductance, and raise the leak if a leak explains it.
+        """Test for a step of the conductance after a block, and set the leak alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a higher score replaces onset and size. Return whether a step awaits an
-        explanation by further blocks.
+        For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Return True if a step was found
+        that only further blocks can explain.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -425,10 +425,10 @@ class Watch:
         before: float | None = None,
         cause: Cause | None = None,
     ) -> None:
-        """Set the present leak from a significant rise, at the end of a block.
+        """Set the leak alarm, `self.leak`, from a significant rise at the end of a block.
 
         `before`: conductance before the onset, by default the mean of the blocks before it; `cause`: by default that of
-        the estimator. A leak that was already raised keeps its conductance before and the time of its alarm.
+        the estimator. If there is an alarm already, its time and its conductance before the onset are kept.
         """
         raised_s = block.end
         if self.leak is not None:

@@ -75,7 +75,7 @@ class Trend:
     years : float
         Machine-years to a false alarm.
     healthy : int
-        First recordings that were known to be healthy.
+        Number of first recordings that were known to be healthy.
     dated : bool
         Whether the times are those of the recordings, as opposed to equal intervals.
 
@@ -134,7 +134,7 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Rise of the total over the healthy one in the trend's unit, as in a diagnosis; None if it did not rise."""
+        """Rise of the flow past pump and piston since the machine was healthy, in the trend's unit; None if none."""
         value, ends = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and ends is not None:
             return Interval(value, *ends)
@@ -142,7 +142,7 @@ class Trend:
 
     @property
     def limit(self) -> float | None:
-        """Level at which a repair is due, None if the limit cannot be stated in the levels' unit."""
+        """Level at which a repair is due, in the trend's unit; None if the repair limit cannot be converted to it."""
         return None if self.wear is None else self.wear.limit
 
     @property

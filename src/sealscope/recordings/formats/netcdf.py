@@ -95,7 +95,7 @@ def check_internal(name: str, data: Any) -> None:
 
 
 def _decode_text(value: Any) -> str | None:
-    """Return the only text of an attribute or cell; None for other values."""
+    """Decode an attribute or cell that is one text: a str, UTF-8 bytes, or an array of one; None for other values."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):

@@ -536,10 +536,10 @@ class _Log:
 def _iter_line_blocks(
     file: BinaryIO, encoding: str, place: str, n_bytes: Callable[[], int]
 ) -> Iterator[tuple[int, bytes, int, bool]]:
-    """Yield blocks of a file with complete lines.
+    """Yield a file in blocks as (number of the first line, bytes, end, is_cut).
 
-    A block is (number of its first line, bytes, number of bytes in complete lines, True if its last line is cut);
-    `n_bytes`: returns the number of bytes to read next.
+    The bytes before `end` are complete lines; those after it come again in the next block. `is_cut`: the file ends
+    within the block's last line. `place`: path of the file, for errors; `n_bytes`: returns how many bytes to read next.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")

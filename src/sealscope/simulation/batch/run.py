@@ -517,7 +517,7 @@ class SetRun:
                 )
 
     def rms(self) -> Array:
-        """Compute the RMS of d1, d2, d3, d4 and d3 d4 in each segment, (runs, 2, segments, 5)."""
+        """Compute the RMS of d1..d4 [Pa] and d3 d4 [Pa^2] of p_A and p_B in each segment, (runs, 2, segments, 5)."""
         n_samples = np.diff(self.segments)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)

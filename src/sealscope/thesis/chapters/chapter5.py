@@ -83,7 +83,7 @@ def make_test_experiment(test: PrintedTest) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class FigureView:
-    """Draws a simulated test over the interval `span` [s]; views of wavelet details show one `chamber`."""
+    """Draws a simulated test over the interval `span` [s]; views of wavelet details show the pressure of `chamber`."""
 
     run: SimulatedRun
     test: PrintedTest
@@ -159,13 +159,16 @@ class FigureView:
         return panels, numbers
 
     def draw_details(self) -> PanelsAndNumbers:
-        """Draw d1 to d4 and d3d4 of the chamber's pressure."""
+        """Draw the wavelet details d1 to d4 and d3d4 of the pressure of `chamber`."""
         series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
         return panels, self._rms_changes(QUANTITIES)
 
     def draw_windowed_rms(self) -> PanelsAndNumbers:
-        """Draw the windowed RMS of d3, d4 and d3d4 of the chamber's pressure, and the RMS of each part."""
+        """Draw the windowed RMS of the wavelet details d3 and d4 and their product d3d4, of the pressure of `chamber`.
+
+        Horizontal lines mark the RMS over the settled part of the test without the leak, and over the part with it.
+        """
         t, curves = windowed_detail_rms(self.recording, self.chamber)
         rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
         panels = []
@@ -175,7 +178,7 @@ class FigureView:
         return panels, self._rms_changes(_WINDOWED)
 
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
-        """Compute the RMS of the details `names` without and with the leak, and its change [%]."""
+        """Compute the RMS of the details `names` of `chamber` without and with the leak, and its change [%]."""
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:

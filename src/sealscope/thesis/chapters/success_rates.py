@@ -150,7 +150,7 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
 
 
 def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate Table 5.1 with false alarms, the sign tests of all columns, and the rules with thresholds."""
+    """Build three tables: Table 5.1 recounted, sign tests of all columns, and Table 5.1's rules with thresholds."""
     leak_runs, leak = simulated_sheet(context, "leak")
     no_leak, drift = (simulated_sheet(context, runs)[1] for runs in ("no-leak", "drift"))
     measured, resolved = context.sheet, leak_runs.resolved

@@ -45,12 +45,12 @@ def duty_tests(recording: Recording) -> list[StepTest]:
 
 
 def time_in_motion(speeds: Array, max_speed: float) -> Array:
-    """Compute the fraction of its time (K,) that a block of speeds (K, length) moves; NaN counts as rest."""
+    """Compute the fraction of time (K,) for which blocks of speeds (K, length) move; NaN counts as rest."""
     return np.asarray((np.abs(speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag blocks (K,) that move almost as long as the busiest, by their `time_in_motion`."""
+    """Flag the blocks that move for almost as long as the busiest; `fractions` (K,): their `time_in_motion`."""
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 
@@ -82,7 +82,7 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test the features that change with a sensor alone for a step; return the tests with their names."""
+    """Test the features that only a change of a sensor shifts for a step; return the tests with their names."""
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
     length = len(recording) // BLOCKS
@@ -108,7 +108,10 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
 
 
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield the names and the values in blocks (K,) of features of the sensors: wiring, noise and hum."""
+    """Yield name and values (K,) of each feature that only a change of a sensor shifts: wiring, noise, and hum.
+
+    `blocks`: channels (K, length), among them p_A and p_B, NaN for missing samples; `rate` [Hz].
+    """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if name := next((channel for channel in ("omega", "u", "theta", "x") if channel in blocks), None):
         # 1 if p_A - p_B is in phase with the flow into A, as friction makes it, else -1: sensors exchanged or reversed
@@ -125,9 +128,10 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 
 
 def _log_hum(blocks: Array, frequency: float) -> Array:
-    """Compute the log power (K,) of a line in blocks (K, n) relative to neighbouring bins, since ringing is wider.
+    """Compute the log power (K,) of a spectral line in blocks (K, n), relative to that of the neighbouring bins.
 
-    Welch's estimate from both halves of each block; `frequency` over the sampling rate.
+    Ringing is wider than a line and raises both. Welch's estimate from both halves of each block; `frequency`: over the
+    sampling rate.
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
@@ -139,7 +143,7 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
 
 
 def _row_statistic(statistic: Callable[..., Array], values: Array) -> Array:
-    """Compute a statistic of each row (K, n) without missing values; NaN for a row without any."""
+    """Compute a statistic that ignores NaN, like np.nanmean, of each row (K, n) of values; NaN for an all-NaN row."""
     has_values = np.isfinite(values).any(axis=1)
     results = np.full(len(values), np.nan)
     results[has_values] = statistic(values[has_values], axis=1)

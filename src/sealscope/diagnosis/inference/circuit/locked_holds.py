@@ -218,7 +218,9 @@ class HeldChambers:
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
         """Build the regression of displaced volumes on the oil's coefficients (`_OilRegression`).
 
-        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold.
+        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold; a reading is
+        a mean of samples (`LockedHold.edges`). `is_refilled`: check valves keep a chamber at the charge pressure, so
+        that displacement counts only while the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
         volumes, columns = [], []
@@ -261,7 +263,7 @@ class HeldChambers:
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
-        """Fit the coefficients of leak columns (r, c) together with those of the oil.
+        """Fit the coefficients of leak columns (r, c) together with those of the oil; `is_refilled`: see `UnitLeak`.
 
         The variance of a reading, which weights the oil's priors against the readings, is found by iteration.
         """
@@ -342,7 +344,7 @@ class HeldChambers:
         return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Build the regression's columns (r, o): the readings of the volume that has leaked since each onset (o,)."""
+        """Build the regression's columns (r, o), with the readings of the volume leaked since each onset (o,)."""
         columns = []
         for hold, flow in zip(self.holds, leak.flows, strict=True):
             increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)

@@ -44,8 +44,8 @@ class ResponseLeak:
 
     `parameters`: likelihood of each parameter of the response in K blocks, all others eliminated, "G" the conductance
     past the piston [m^3/(s Pa)]; `pressure` (K,): mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean absolute flow of the
-    pump [m^3/s], also as that while it delivers; `stated`: the rig states the sizes that convert a conductance to
-    L/min; `healthy`: conductance of healthy recordings of the machine [m^3/(s Pa)].
+    pump [m^3/s] over the recording and while it delivers, here equal; `stated`: the rig states the sizes that convert a
+    conductance to L/min; `healthy`: conductance of healthy recordings of the machine [m^3/(s Pa)].
     """
 
     parameters: Mapping[str, Information]
@@ -68,7 +68,7 @@ class ResponseLeak:
 
     @property
     def information(self) -> Information:
-        """Likelihood of the conductance in the blocks."""
+        """Likelihood of the conductance past the piston [m^3/(s Pa)] in each of the K blocks."""
         return self.parameters["G"]
 
     @property
@@ -79,12 +79,12 @@ class ResponseLeak:
 
     @cached_property
     def step(self) -> StepTest | None:
-        """Test of a step of the conductance."""
+        """Test of a step of the conductance; None if too few blocks have information."""
         return step_test(self.information)
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of the step after its onset, midway between the laws of a worn seal and of an orifice."""
+        """Mean flow [m^3/s] of the step after its onset, midway between the laws of a worn seal and of an orifice."""
         if self.step is None:
             return Flow(0.0, np.inf)
         size, deviation = self.step.fitted
@@ -100,7 +100,7 @@ class ResponseLeak:
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the mean conductance beyond the healthy recordings; None without any."""
+        """Rise of the mean conductance over that of the healthy recordings; None without healthy recordings."""
         healthy, count = self.healthy, len(self.healthy)
         if not count:
             return None
@@ -120,9 +120,9 @@ class ResponseLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leak above that of the healthy recordings, with the log likelihood ratio of the part that the step explains.
+        """Rise over the healthy recordings; None without any.
 
-        None without healthy recordings.
+        With the log likelihood ratio, to no rise, of the rise that the fitted step would cause in the mean.
         """
         if self.rise is None:
             return None

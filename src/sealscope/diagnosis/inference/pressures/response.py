@@ -71,10 +71,10 @@ def _geometric_grid(middle: float, factor: float, count: int) -> Array:
 class Segment:
     """Consecutive samples that are fitted with one set of parameters.
 
-    `command` (n + 1,) [V] with that of the previous sample; `dp` (n,) [Pa]; `states` (8, 12) at the previous sample, by
-    the parameters and by each perturbed set; `waves` (m, n): mains waves, which are projected out; `sample_weights`
-    (n,): 1 for a recorded sample, 0 for a missing one. With `smooth` [samples] > 0 only the part that a Gaussian of
-    that width passes is fitted.
+    `command` (n + 1,) [V] with that of the previous sample; `dp` (n,) [Pa]; `states` (8, 12): simulated at the
+    previous sample, with the parameters and with each perturbed set; `waves` (m, n): mains waves, which are projected
+    out; `sample_weights` (n,): 1 for a recorded sample, 0 for a missing one. `smooth` [samples] > 0: width of a
+    Gaussian that smooths the residual before it is fitted.
     """
 
     machine: Machine
@@ -180,7 +180,7 @@ class Segment:
         return low, high
 
     def residual_variance(self, squares: float) -> float:
-        """Compute the residual variance [Pa^2] from a sum of squares, by the number of independent samples.
+        """Compute the variance [Pa^2] of a residual from its sum of squares and the number of independent samples.
 
         2 sqrt(pi) sigma is the correlation length of noise smoothed by a Gaussian of width sigma [samples].
         """
@@ -209,7 +209,11 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     priors = segment.priors
 
     def rank_starts(section: Segment, theta: Array, n_groups: int, values: dict[int, Array]) -> Array:
-        """Sort 16 variants of `theta`, with `values` by parameter, in each group: (16/n_groups, n_groups, p)."""
+        """Sort 16 variants of the parameters `theta` (p,) by their residual squares, the best first, within each group.
+
+        `values`: index of a parameter -> its value in each variant (16,). Consecutive variants form the `n_groups`
+        groups. Return (16/n_groups, n_groups, p): row 0 has the best variant of each group.
+        """
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, column in values.items():
             sets[:, parameter] = column
@@ -244,9 +248,9 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 class Follower:
     """Iterated Kalman filter of the parameters of the response, from block to block.
 
-    `machine`, `priors`; `sense`: sign by which p_A - p_B follows the command. State: parameters `theta` (p,), their
-    `covariance` (p, p) in units, `variance` of the noise [Pa^2], simulated `states` (8, 12), `last` command [V], and
-    `excess`: (chi squared - n) / sqrt(2 n) of the last block.
+    `machine`, `priors`; `sense`: 1 if p_A - p_B rises with the command, -1 if it falls. State: parameters `theta` (p,),
+    their `covariance` (p, p) in units, `variance` of the noise [Pa^2], simulated `states` (8, 12), `last` command [V],
+    and `excess`: (chi squared - n) / sqrt(2 n) of the last block.
     """
 
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
@@ -315,7 +319,7 @@ class Follower:
         return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
-        """Compute the prior on a block of `block_s` [s]; a `jumped` parameter is as uncertain as at the start."""
+        """Compute the prior on the parameters in a block of `block_s` [s]; `jumped`: as uncertain as at the start."""
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
             variance[jumped] += self.priors.variance[jumped]

@@ -200,7 +200,7 @@ class BalanceLeak:
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit of the rig's file, in standard deviations; None if not stated."""
+        """Total leakage above the limit in the rig's file, over its standard deviation; None if no limit applies."""
         balance = self.balance
         limit = healthy_leakage(balance.rig)
         # without a measured flow, the drive's droop under load looks like leakage

@@ -51,14 +51,14 @@ _NO_BALANCE = {
     "that what leaks moves it: record its position x",
 }
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
-#: Minimum number of healthy recordings whose scatter decides between the hypotheses of rests.
+#: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
 #: Minimum number of samples between neighbouring test functions.
 MIN_STRIDE = 2
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Test whether the pump delivers more than the minimum leakage of any pump, as if a loop holds the piston."""
+    """Test whether the pump delivers more than any pump's minimum leakage, as it does if a loop holds the piston."""
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
 
@@ -101,8 +101,8 @@ class VolumeBalance:
     def balance(self, recording: Recording, odds: float = 0.0, *, is_locked: bool = False) -> RecordedBalance | None:
         """Set up the volume balance that the recorded channels allow; None if they allow none.
 
-        `odds`: log odds by healthy recordings that the pump is cut off at rest; `is_locked`: surely so, whatever this
-        recording's rests show.
+        `odds`: log odds, from healthy recordings, that valves cut the pump off at rest; `is_locked`: they surely do,
+        whatever this recording shows.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
@@ -137,7 +137,7 @@ class VolumeBalance:
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the balance of a recording from its blocks under one hypothesis of rests."""
+        """Build the balance of a recording for valves that are open, or shut, while the pump rests (`regime`)."""
         offset = float(regime.blocks.zero[0])
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
@@ -179,10 +179,10 @@ class VolumeBalance:
         return rise(judged, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
-        """Compute the log odds, by healthy recordings, that the pump is cut off at rest.
+        """Compute the log odds, by healthy recordings, that valves cut the pump off at rest.
 
-        With enough recordings: the likelihood ratio of the scatter of their leakage under either hypothesis, for an
-        unknown scale. With fewer: the sum of the odds of each.
+        With `MIN_FOR_SCATTER` recordings or more it is the log likelihood ratio of their leakage's scatter, with the
+        pump cut off and with it connected, for an unknown scale; with fewer it is the sum of the log odds of each.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -198,7 +198,7 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the columns of the machine's balances under one hypothesis of rests."""
+        """Return the columns of each balance of the machine; `shut`: for valves that cut the pump off at rest."""
         balances = equations(self.rig, channels)
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
@@ -222,7 +222,7 @@ class VolumeBalance:
         )
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Observe a recording without healthy ones, under both hypotheses of what valves do while the machine rests.
+        """Observe a recording without healthy ones, under both hypotheses on what valves do while the pump rests.
 
         Key False: they leave the pump in the circuit; True: they cut it off, if the recording has rests.
         """
@@ -268,21 +268,24 @@ def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) 
 
 
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
-    """Test whether healthy recordings show, by their mean log odds, that valves shut the cylinder from a resting pump.
+    """Test whether the mean log odds of healthy recordings show that valves cut the pump off at rest.
 
-    `odds_key`: "shut_odds", by the balance of all rests, or "held_odds", by holds of a load alone.
+    `odds_key`: of the summaries, "shut_odds" (balance over all rests) or "held_odds" (holds of a load alone).
     """
     log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
     return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Compute the date [s] of a recording, if known, shifted by so many times the maximum age of a machine."""
+    """Shift the start [s since 1970] of a recording by `n_ages` times the maximum age of a machine; None if undated."""
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the sums of a recording from its summary under one hypothesis of rests, with its holds if `locked`."""
+    """Restore the sums of a recording from its summary.
+
+    `shut`: for valves that cut the pump off at rest; `locked`: with the leaks during holds, if there are any.
+    """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:
         sums = (

@@ -31,7 +31,11 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
 
 def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series in a value of any type, called `name` in `group`; `clock`: for series without times."""
+    """Yield the series in a value of any type, called `name`.
+
+    `group`: path of the structs that contain the value; `clock`: times of series that state none, None if unknown;
+    `depth`: number of structs around the value.
+    """
     if depth > _MAX_DEPTH:
         return
     if (fields := _struct_fields(value)) is not None:
@@ -62,7 +66,7 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 
 
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct: a time series, a signal with unit, a signal of a Simulink log, or a group."""
+    """Yield the series in a struct, which is a time series, a signal, or a group (arguments as of `_iter_value`)."""
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
     samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)
@@ -80,7 +84,7 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct with times: signals of a Simulink scope, samples, or a group of vectors."""
+    """Yield the series in a struct with times, the `clock`; `by_name`: its fields by lower-case name."""
     data = by_name.get("data")
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
@@ -95,7 +99,7 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 
 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in each field of a struct, with names and units from fields that describe others."""
+    """Yield the series in each field of a struct; fields such as `units` and `names` describe the others."""
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
         head, _, last = key.rpartition("_")
@@ -120,7 +124,7 @@ def _is_vector(value: Any) -> bool:
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first of these fields, empty if it is no text; None if no field has such a name."""
+    """Return the text of the first field in `names` that is present, "" if it is no text; None if none is present."""
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
 
@@ -133,7 +137,7 @@ def _find_field_units(fields: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
-    """Return the names of a matrix's columns from a cell array of texts in the same struct; empty without one."""
+    """Return the names of a matrix's columns from a cell array of texts in the same struct; [] if there is none."""
     for key, value in fields.items():
         if (
             key.casefold() in ("name", "names", *_COLUMN_NAME_FIELDS)
