@@ -6,78 +6,81 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class ClockPriors(PriorTable):
-    """Limits for the clock of a logger."""
+    """The clock of a logger: `scatter` [sampling steps]; `near` [usual intervals]; the others are numbers."""
 
-    scatter: float  # rms deviation of intervals from which sampling is irregular [sampling steps]
-    rate: float  # relative error of a stated rate
-    near: float  # longest interval that is interpolated [usual intervals]
-    lost: float  # largest fraction of samples lost in gaps
-    late: float  # largest fraction of samples out of order
+    scatter: float
+    rate: float
+    near: float
+    lost: float
+    late: float
 
 
 class StalePriors(PriorTable):
-    """Limits for samples that repeat the one before."""
+    """Samples that repeat the one before: `shortest` [s]; the others are numbers."""
 
-    runs: int  # fewest runs, or samples, for an estimate
-    spread: float  # largest relative deviation of a run's duration from the median
-    share: float  # smallest fraction of runs within `spread`
-    repeats: float  # smallest ratio of repeated rows to those expected by chance
-    fewest: float  # smallest fraction of rows expected by chance
-    moves: float  # fraction of a channel's range that is motion
-    leap: float  # quantile of a channel's changes that a jump exceeds
-    stuck: float  # largest fraction of stuck samples in a pressure that is used
-    shortest: float  # shortest period for which a channel holds a sample [s]
+    runs: int
+    spread: float
+    share: float
+    repeats: float
+    fewest: float
+    moves: float
+    leap: float
+    stuck: float
+    shortest: float
 
 
 class SpikePriors(PriorTable):
-    """Limits for samples that leap and return."""
+    """Samples that leap and return."""
 
-    times: float  # smallest ratio of a spike to other changes
-    share: float  # largest fraction of spikes in a channel
+    times: float
+    share: float
 
 
 class UnsignedPriors(PriorTable):
-    """Limits for a speed that counts pulses and so has no sign."""
+    """A speed that counts pulses: `half` [s]; the others are numbers."""
 
-    noise: float  # noise on the other side of zero, as a fraction of the largest value
-    half: float  # half the time over which the piston's speed is taken [s]
-    least: float  # smallest ratio of the motion one way to that the other way
-    correlation: float  # smallest correlation with the speed of the piston
+    noise: float
+    half: float
+    least: float
+    correlation: float
 
 
 class HumPriors(PriorTable):
-    """Limits for hum of the mains."""
+    """Hum of the mains: `lowest`, `around` [Hz]; the others are numbers."""
 
-    loud: float  # fraction of the power over `lowest` from which hum disturbs
-    alone: float  # the same, from which there is little else
-    lowest: float  # frequency from which the power counts [Hz]
-    around: float  # frequencies on either side that a line is compared with [Hz]
-    over_rest: float  # smallest ratio of a line to the largest amplitude there
-    over_median: float  # smallest ratio of a line to the median amplitude there
+    loud: float
+    alone: float
+    lowest: float
+    around: float
+    over_rest: float
+    over_median: float
 
 
 class CreepPriors(PriorTable):
-    """Limits for a drift of the mean pressure of both chambers."""
+    """A mean pressure of both chambers that creeps: `rate` [Pa/s]; `seconds` [s]."""
 
-    rate: float  # smallest drift that is reported [Pa/s]
-    seconds: float  # shortest recording in which it is searched for [s]
+    rate: float
+    seconds: float
 
 
 class HoldPriors(PriorTable):
-    """Longest run of equal readings of a pressure; a longer one, by both limits, is held."""
+    """Equal samples that are no reading of a pressure: `seconds` [s]; `samples` [samples]."""
 
     seconds: float
     samples: int
 
 
 class ReadingPriors(PriorTable):
-    """Limits for pressures and speeds of one machine."""
+    """Pressures and speeds of one machine.
 
-    noise: float  # largest fraction of white noise in the variance of a pressure
-    rate: float  # rate at which speed and angle are compared [Hz]
-    samples: int  # fewest samples at this rate
-    correlation: float  # smallest correlation of the speed with the angle's derivative
-    misfit: float  # largest ratio of the two speeds
+    `noise` [share of the variance]; `rate` [Hz]; `samples` [samples]; the others are numbers.
+    """
+
+    noise: float
+    rate: float
+    samples: int
+    correlation: float
+    misfit: float
 
 
 class OilRange(PriorTable):
@@ -88,18 +91,18 @@ class OilRange(PriorTable):
 
 
 class CyclePriors(PriorTable):
-    """Limits for the cycle of a duty."""
+    """The cycle of a duty: `longest` [s]; `rate` [Hz]; the others are numbers."""
 
-    longest: float  # longest period [s]
-    correlation: float  # smallest autocorrelation at the period
-    rate: float  # rate at which cycles are compared [Hz]
+    longest: float
+    correlation: float
+    rate: float
 
 
 class GapPriors(PriorTable):
-    """Lengths of gaps [s]."""
+    """Gaps that are filled by a line: `motion`, `hole` [s]."""
 
-    motion: float  # longest gap of a position, angle, speed or flow that is filled by a line
-    hole: float  # longest bridged gap whose rows are weighted in full
+    motion: float
+    hole: float
 
 
 class RecordingPriors(PriorTable):

@@ -60,7 +60,7 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file of `package`, or of this package if that one lacks it, as text that templates do not escape."""
+    """Read a file of `package`, else of this package, as text that templates do not escape."""
     from markupsafe import Markup
 
     file = resources.files(package) / name

@@ -41,7 +41,7 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an announced event as a line, without the buffer, which would keep what a full disk refuses."""
+        """Write an announced event as a line, unbuffered: a buffer would keep the lines that a full disk refuses."""
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:

@@ -50,7 +50,7 @@ def time_in_motion(speeds: Array, max_speed: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks that move for almost as long as the busiest; `fractions` (K,): their `time_in_motion`."""
+    """Flag the blocks in motion, by the `fractions` (K,) of their time (`time_in_motion`) relative to the largest."""
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 

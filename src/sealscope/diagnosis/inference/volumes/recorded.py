@@ -162,7 +162,7 @@ class RecordedBalance:
         holds = [
             hold
             for hold in find_locked_holds(channels, rests, recording.rate)
-            if self._is_pump_off(hold, pumped) and self.is_loaded(hold)
+            if self._is_pump_off(hold, pumped) and self._is_loaded(hold)
         ]
         begin, end = float(recording.t[0]), float(recording.t[-1])
         return HeldChambers(holds, sides, begin, end, charge + to_absolute) if holds else None
@@ -180,23 +180,17 @@ class RecordedBalance:
         holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
         return rest_log_odds(abs(float(flow.mean())), variance, holding_flow, variance) > 0.0
 
-    def is_loaded(self, hold: LockedHold) -> bool:
+    def _is_loaded(self, hold: LockedHold) -> bool:
         """Test whether p_A - p_B in a hold is surely a load, and not the sensors' offset under equal pressures.
 
         A leak equalises the pressures that no load maintains, so that a hold of equal pressures shows none. Loads up to
-        the largest pressure difference of the recording are equally likely.
+        twice the mean pressure difference of the recording are equally likely.
         """
         prior = INFERENCE.zero
         pressure = float(np.abs(hold.mean(hold.p_A - hold.p_B)).max())
         log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
-        log_load_density = -float(np.log(max(self.largest_pressure, np.finfo(float).tiny)))
+        log_load_density = -float(np.log(max(2.0 * self.mean_pressure(), np.finfo(float).tiny)))
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
-
-    @cached_property
-    def largest_pressure(self) -> float:
-        """Largest abs(p_A - p_B) [Pa], without the rarest samples; a leak makes the mean small, but not the largest."""
-        differences = np.abs(self.recording["p_A"] - self.recording["p_B"])
-        return float(np.nanquantile(differences, 1.0 - END_QUANTILE))
 
     def locked_odds(self) -> float | None:
         """Compute the log odds, by the leaks in holds, that valves shut the chambers; None without holds.
