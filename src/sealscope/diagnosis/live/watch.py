@@ -143,7 +143,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Conditions of the baseline: rig, whether it states L/min for each way of watching, and learning time [h]."""
+        """Rig of the baseline, whether it states L/min for each way of watching, and its learning time [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
