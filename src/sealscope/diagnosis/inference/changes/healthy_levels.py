@@ -50,9 +50,9 @@ class HealthyLevels:
         if judged is None:
             return
         changes = [_compare_friction(judged, summaries)]
-        if "tilt" in judged:
-            octaves = [_octaves(summary) for summary in (judged, *summaries) if "tilt" in summary]
-            changes.append(compare_spectra(octaves[0], octaves[1:]))
+        if (octaves := _octaves(judged)) is not None:
+            healthy = [day for day in map(_octaves, summaries) if day is not None]
+            changes.append(compare_spectra(octaves, healthy))
         yield from (change for change in changes if change is not None)
         prior, entries = CHANGES.healthy, [*summaries, judged]  # the judged one is the last
         drift_A, drift_B = (np.array([float(entry[name]) for entry in entries]) for name in ("drift_A", "drift_B"))
@@ -64,9 +64,11 @@ class HealthyLevels:
             yield from _describe_drifts(*drifts)  # type: ignore[arg-type]
 
 
-def _octaves(summary: Summary) -> Octaves:
-    """Restore the comparison of the spectra from a summary."""
-    return Octaves(float(summary["ratio"]), float(summary["tilt"]))
+def _octaves(summary: Summary) -> Octaves | None:
+    """Restore the comparison of the spectra from a summary; None if it lacks one of its numbers."""
+    if not set(Octaves._fields) <= set(summary):
+        return None
+    return Octaves(*(float(summary[name]) for name in Octaves._fields))
 
 
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:

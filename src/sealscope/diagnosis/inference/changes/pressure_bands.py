@@ -61,9 +61,11 @@ def compare_octaves(recording: Recording) -> Octaves | None:
 def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
     """Compute the logarithm of the RMS of values (n,) in octaves between `edges` (k + 1,) [Hz], from windows, (k,)."""
     starts = range(0, len(values) - length + 1, max(length // 2, 1))
-    windows = np.stack([values[start : start + length] for start in starts])
-    spectra = np.fft.rfft((windows - windows.mean(axis=1, keepdims=True)) * np.hanning(length), axis=1)
-    power, frequencies = (np.abs(spectra) ** 2).mean(axis=0), np.fft.rfftfreq(length, 1.0 / rate)
+    power, taper = np.zeros(length // 2 + 1), np.hanning(length)
+    for start in starts:  # one at a time: all windows of a recording of hours would fill the memory
+        window = values[start : start + length]
+        power += np.abs(np.fft.rfft((window - window.mean()) * taper)) ** 2 / len(starts)
+    frequencies = np.fft.rfftfreq(length, 1.0 / rate)
     octave = np.searchsorted(edges, frequencies, side="right") - 1
     return np.array([0.5 * np.log(power[octave == k].sum() + MIN_POWER) for k in range(len(edges) - 1)])
 
