@@ -37,10 +37,13 @@ class SpikePriors(PriorTable):
 
 
 class UnsignedPriors(PriorTable):
-    """A speed that counts pulses: `half` [s]; the others are numbers."""
+    """A speed that counts pulses: `half`, `nearby` [s], `changes` [1/s]; the others are numbers."""
 
     noise: float
     half: float
+    nearby: float
+    error: float
+    changes: float
     least: float
     correlation: float
 

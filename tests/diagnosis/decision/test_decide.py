@@ -73,6 +73,14 @@ def test_the_onset_of_a_rise_is_stated_where_something_dates_it() -> None:
         assert evidence.onset_interval_s == (None if onset is None else (onset.low, onset.high))
 
 
+@pytest.mark.parametrize(("rise", "begins_within"), [(4.0, True), (60.0, False)])
+def test_a_rise_that_no_step_makes_is_older_than_the_recording(rise: float, begins_within: bool) -> None:
+    """A step of 8 half-way raises the mean by 4; a rise of 60 was there from the start, whatever else stepped."""
+    evidence = judge_leak(MeasuredLeak(step(8.0), rise=Rise(rise, 1.0, 30.0)))
+    assert evidence.verdict == "leak"
+    assert (evidence.onset_s is not None) == begins_within
+
+
 def test_a_noise_step_changes_neither_verdict_nor_size_nor_onset() -> None:
     """3 leaks of 60 passed for none above a tenth of them where the noise of the pressures had stepped by 4 %."""
     leak = MeasuredLeak(step(8.0))

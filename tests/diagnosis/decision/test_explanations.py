@@ -126,6 +126,16 @@ def test_the_likelier_of_two_rivals_is_the_more_probable() -> None:
         assert ratios == sorted(ratios)
 
 
+def test_healthy_recordings_do_not_set_terms_of_one_residual_apart() -> None:
+    """A healthy step of the leak's coefficient makes steps rarer news, but tells nothing on which term has stepped."""
+    leak, rival = observable("volumes: leak", 1e-12), observable("volumes: external leak B", 1e-10)
+    calibrated = {leak: 1e-4, rival: 1e-5}
+    by_likelihood = explain([leak, rival])
+    after_healthy_step = explain([leak, rival], calibrated.__getitem__)
+    for explained in (by_likelihood, after_healthy_step):
+        assert probability_of(explained, *LEAK_EVENTS, data_kind="volumes") > 0.5
+
+
 def explained_by(data: str, name: str) -> object:
     return observable(f"{data}: {name}", 0.5)
 

@@ -14,6 +14,7 @@ from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     Explanation,
     explain,
+    log_bayes_factor,
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
@@ -96,8 +97,21 @@ class Case:
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests whose score exceeds the threshold."""
-        return tuple(test for test in self.tests if test.chance < test.probability)
+        """Tests whose score exceeds the threshold; the rise comes before the step if the leak is older."""
+        alarms = [test for test in self.tests if test.chance < test.probability]
+        return tuple(alarms if self._has_onset_within else reversed(alarms))
+
+    @property
+    def _has_onset_within(self) -> bool:
+        """Test whether a leak that began within the recording explains step and rise better than an older one.
+
+        The older one explains the rise alone, the younger one the step and the rise that this step causes.
+        """
+        leak = self.leak
+        if leak is None or leak.step_rise is None:
+            return True
+        step_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)
+        return step_factor + leak.step_rise.step_log_ratio > log_bayes_factor(leak.step_rise.rise.chance)
 
     @cached_property
     def other_event(self) -> OtherEvent | None:

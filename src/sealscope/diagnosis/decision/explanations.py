@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.decision.events import Event, load_events
+from sealscope.diagnosis.inference.changes.volumes import VOLUMES
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
@@ -65,7 +66,7 @@ def explain(
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
-    factors = _correct_for_misfit(log_factors)
+    factors = _correct_for_misfit(_compare_by_likelihood(log_factors))
     gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}
     supported = [
         event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
@@ -78,6 +79,25 @@ def explain(
     weights /= weights.sum()
     order = np.argsort(-weights, kind="stable")
     return tuple(Explanation(groups[k], float(weights[k]), posteriors[k].data) for k in order)
+
+
+def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
+    """Set the log Bayes factors of a balance's terms apart by their likelihoods in the judged recording alone.
+
+    The terms are rival descriptions of the same residual. Healthy recordings calibrate how rare the best of them is;
+    the few of them say nothing on which term describes it best.
+    """
+    likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
+    volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
+    if not volumes:
+        return list(log_factors)
+    best = max(volumes, key=likelihoods.__getitem__)
+    level, factors = log_factors[best][1], list(log_factors)
+    misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * likelihoods[best]
+    for k in volumes:
+        difference = (likelihoods[best] - likelihoods[k]) / misfit_divisor
+        factors[k] = (log_factors[k][0], max(level - difference, 0.0))
+    return factors
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:

@@ -1,9 +1,12 @@
 """Speeds and flows without a sign: an encoder or a flow meter that counts pulses does not measure the direction.
 
 If a speed is never negative while the piston moves both ways, it has no sign, or the pump turns one way and a valve
-chooses the side. In both cases the flow into A has the sign of a v + c (p_A - p_B), fitted iteratively to the signed
-magnitude; the pressure term is the flow that replaces leakage while the piston stands. Without a position the sign is
-that of the command. Called by the inspection.
+chooses the side. In both cases the flow into A is about a v + c (p_A - p_B), fitted iteratively to the signed
+magnitude; the pressure term is the flow that replaces leakage while the piston stands. A sign changes only where the
+magnitude passes zero: the signs are the most likely path of a hidden Markov chain with two states. Without a position
+the sign is that of the command. Called by the inspection.
+
+Source: A. J. Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260 (most likely path).
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.unsigned
 #: Most iterations of the fit; each uses the signs of the previous one.
-_MAX_ITERATIONS = 5
+_MAX_ITERATIONS = 10
 _NAMES = {"omega": "speed", "q_pump": "flow"}
 
 
@@ -89,24 +92,70 @@ def _correlation(first: Array, second: Array) -> float:
 
 
 def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
-    """Estimate the signs (n,) of the flow into A: fit a v + c (p_A - p_B) to sign x magnitude, take the fit's sign.
+    """Estimate the signs (n,) of the flow into A: fit a v + c (p_A - p_B) to sign x magnitude, then find the signs.
 
     `a` depends on the direction. The first signs are those of the piston's `speed` v [m/s]; the fit is repeated until
     no sign changes.
     """
-    columns = [np.maximum(speed, 0.0), np.minimum(speed, 0.0)]
-    if {"p_A", "p_B"} <= recording.channels.keys():
-        columns.append(recording["p_A"] - recording["p_B"])
-    design = np.column_stack(columns)
-    known = np.isfinite(design).all(axis=1) & np.isfinite(magnitude)
-    scale = np.sqrt(np.mean(design[known] ** 2, axis=0))
-    design = design / np.where(scale > 0.0, scale, 1.0)
+    has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
+    difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
+    known = np.isfinite(speed) & np.isfinite(difference) & np.isfinite(magnitude)
+    speed, difference, magnitude = (np.where(known, values, 0.0) for values in (speed, difference, magnitude))
+    motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
+    step_scale = np.maximum(_average_nearby(np.abs(np.diff(magnitude)), recording.rate), np.finfo(float).tiny)
+    # log odds against a change of sign after a sample: changes are rare, and the steps of the signed values have a
+    # Laplace density
+    cost_of_change = 2.0 * np.minimum(magnitude[1:], magnitude[:-1]) / step_scale
+    cost_of_change += max(0.0, np.log(recording.rate / _PRIORS.changes))
+    speed_variance = _noise_variance(speed, recording.rate)
     sign = np.where(speed < 0.0, -1.0, 1.0)
+    leak_flow = magnitude * np.sign(difference)  # at first all flow without motion replaces leakage
     for _ in range(_MAX_ITERATIONS):
-        fit = np.linalg.lstsq(design[known], (sign * magnitude)[known], rcond=None)[0]
-        fit = np.maximum(fit, 0.0)  # the pump replaces leakage, so that no coefficient is negative
-        predicted = np.where(known, design @ fit, speed)
-        sign, previous = np.where(predicted < 0.0, -1.0, 1.0), sign
+        # the pump moves the piston and replaces leakage, so that no coefficient is negative
+        areas = np.maximum(np.linalg.lstsq(motion, sign * magnitude, rcond=None)[0], 0.0)
+        by_motion = motion @ areas
+        # noise of the position, and errors in proportion to the flow, as by delays
+        variance = areas.max() ** 2 * speed_variance + (_PRIORS.error * magnitude) ** 2 + np.finfo(float).tiny
+        energy = max(float(np.sum(difference**2 / variance)), np.finfo(float).tiny)
+        conductance = max(float(np.sum(difference * leak_flow / variance)) / energy, 0.0)
+        predicted = by_motion + conductance * difference
+        # log of the ratio of two normal densities, of a positive over a negative sign
+        log_odds = 2.0 * magnitude * predicted / variance
+        sign, previous = _most_likely_signs(log_odds, cost_of_change), sign
         if np.array_equal(sign, previous):
             break
+        leak_flow = sign * magnitude - by_motion
     return sign
+
+
+def _noise_variance(speed: Array, rate: float) -> float:
+    """Estimate the variance of a piston speed's noise (n,) by its steps between differences of other samples."""
+    n_lag = max(1, round(2.0 * _PRIORS.half * rate))
+    steps = speed[n_lag:] - speed[:-n_lag]
+    return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0
+
+
+def _average_nearby(values: Array, rate: float) -> Array:
+    """Average values (n,) over `_PRIORS.nearby` [s] on either side."""
+    n_half = max(1, round(_PRIORS.nearby * rate))
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    first = np.maximum(np.arange(values.size) - n_half, 0)
+    after = np.minimum(np.arange(values.size) + n_half + 1, values.size)
+    return np.asarray((sums[after] - sums[first]) / (after - first))
+
+
+def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
+    """Find the most likely signs (n,) of a chain, by the `log_odds` (n,) of a positive sign in each sample.
+
+    `cost_of_change` (n - 1,): log odds against a change of sign after each sample. The log odds of the paths that end
+    in either sign are clipped to the cost of a change, then the next sample's are added.
+    """
+    path_odds, odds = np.empty(log_odds.size), 0.0
+    for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):
+        odds = min(max(odds, -cost), cost) + evidence
+        path_odds[k] = odds
+    # a sample whose odds exceed the cost of the next change keeps its sign whatever follows; the others take the next
+    decided = np.abs(path_odds) > np.append(cost_of_change, 0.0)
+    decided[-1:] = True
+    following = np.flatnonzero(decided)[np.searchsorted(np.flatnonzero(decided), np.arange(log_odds.size))]
+    return np.where(path_odds[following] < 0.0, -1.0, 1.0)

@@ -184,12 +184,14 @@ class RecordedBalance:
         """Test whether p_A - p_B in a hold is surely a load, and not the sensors' offset under equal pressures.
 
         A leak equalises the pressures that no load maintains, so that a hold of equal pressures shows none. Loads up to
-        twice the mean pressure difference of the recording are equally likely.
+        the largest pressure difference of the recording are equally likely.
         """
         prior = INFERENCE.zero
         pressure = float(np.abs(hold.mean(hold.p_A - hold.p_B)).max())
         log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
-        log_load_density = -float(np.log(max(2.0 * self.mean_pressure(), np.finfo(float).tiny)))
+        difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
+        max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
+        log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
 
     def locked_odds(self) -> float | None:

@@ -1,0 +1,47 @@
+"""Speeds without a sign: the sign changes only where the magnitude passes zero."""
+
+import numpy as np
+import pytest
+
+from sealscope.recordings.corrections.unsigned import _most_likely_signs, restore_speed_sign
+from sealscope.recordings.recording import Recording
+
+RPM = 2.0 * np.pi / 60.0
+
+
+def held_lift(hold_speed: float, noise: float) -> tuple[Recording, np.ndarray]:
+    """Make a lift that moves up and down between holds; return it with an unsigned speed, and the signed speed.
+
+    The pump turns at `hold_speed` [rpm] in holds, to replace what leaks; `noise` [rpm] of the speed. The position has
+    steps of 0.1 mm, as coarse as 2 rpm over the time of a difference.
+    """
+    rate, random = 100.0, np.random.default_rng(3)
+    t = np.arange(0.0, 120.0, 1.0 / rate)
+    phase = t % 20.0
+    v = 0.05 * ((phase > 5.0) & (phase < 7.0)) - 0.05 * ((phase > 15.0) & (phase < 17.0))
+    v = np.convolve(v, np.ones(20) / 20.0, "same")
+    speed = (v / 0.05 * 1000.0 + hold_speed) * RPM
+    measured = speed + noise * RPM * random.standard_normal(t.size)
+    x = np.round(np.cumsum(v) / rate + 2e-5 * random.standard_normal(t.size), 4)
+    channels = {"omega": np.abs(measured), "x": x, "p_A": np.full(t.size, 8e6), "p_B": np.full(t.size, 1e6)}
+    return Recording(t, channels, {"omega": "rad/s", "x": "m", "p_A": "Pa", "p_B": "Pa"}, rate), speed
+
+
+@pytest.mark.parametrize("hold_speed", [2.0, 5.0, 20.0])
+def test_a_pump_that_holds_a_load_turns_one_way(hold_speed: float) -> None:
+    recording, speed = held_lift(hold_speed, noise=0.5)
+    restored, (finding,) = restore_speed_sign(recording)
+    in_hold = np.abs(speed - hold_speed * RPM) < 1e-9
+    assert finding.code == "unsigned_speed"
+    assert np.mean(restored["omega"][in_hold]) == pytest.approx(hold_speed * RPM, rel=0.03)
+    assert np.mean(restored["omega"][~in_hold] * speed[~in_hold] > 0.0) > 0.98
+
+
+def test_signs_are_those_of_the_most_likely_path() -> None:
+    """Every path of a short chain, one by one."""
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        odds, cost = random.standard_normal(8), random.exponential(1.0, 7)
+        paths = 1.0 - 2.0 * ((np.arange(2**8)[:, None] >> np.arange(8)) & 1)
+        value = 0.5 * paths @ odds - (paths[:, 1:] != paths[:, :-1]) @ cost
+        assert np.array_equal(_most_likely_signs(odds, cost), paths[np.argmax(value)])
