@@ -105,10 +105,11 @@ class Case:
     def _has_onset_within(self) -> bool:
         """Test whether a leak that began within the recording explains step and rise better than an older one.
 
-        The older one explains the rise alone, the younger one the step and the rise that this step causes.
+        The older one explains the rise alone, the younger one the step and the rise that this step causes. Holds that
+        date the rise within the recording leave no question.
         """
         leak = self.leak
-        if leak is None or leak.step_rise is None:
+        if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
         step_factor = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)
         return step_factor + leak.step_rise.step_log_ratio > log_bayes_factor(leak.step_rise.rise.chance)
