@@ -35,7 +35,15 @@ def watched(recording: Recording, size: int = 10**9) -> tuple[ss.Watch, list[obj
     return watch, estimates
 
 
-@pytest.mark.parametrize("seed", [2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1, 4, 5, 6, 7))])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        2,
+        3,
+        *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)),
+        *(pytest.param(k, marks=[pytest.mark.slow, pytest.mark.long]) for k in (4, 5, 6, 7)),
+    ],
+)
 @pytest.mark.parametrize("seconds", [0.1, 15.0])
 def test_zeros_in_all_channels_are_no_leak(seed: int, seconds: float):
     recording = machine(seed, duration=240.0, rate=200.0).only(VOLUMES)
