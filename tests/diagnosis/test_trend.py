@@ -152,7 +152,14 @@ def test_the_rate_of_false_alarms_is_at_most_the_stated_one() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tails", "lasting"), [(np.inf, 0.0), (4.0, 0.0), (np.inf, 0.6)], ids=["", "tails", "lasting"])
+@pytest.mark.parametrize(
+    ("tails", "lasting"),
+    [
+        pytest.param(np.inf, 0.0, id="", marks=pytest.mark.long),  # as the test above, of more days
+        pytest.param(4.0, 0.0, id="tails"),
+        pytest.param(np.inf, 0.6, id="lasting"),
+    ],
+)
 def test_the_rate_holds_for_other_scatter(tails: float, lasting: float) -> None:
     """Heavy tails, and scatter that lasts from day to day, within 60 days at 1 in 0.5 years."""
     machines, days, years = 60, 61, 0.5

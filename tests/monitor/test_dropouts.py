@@ -35,7 +35,15 @@ def watched(recording: Recording, size: int = 10**9) -> tuple[ss.Watch, list[obj
     return watch, estimates
 
 
-@pytest.mark.parametrize("seed", [2, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1, 4, 5, 6, 7))])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        2,
+        3,
+        *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)),
+        *(pytest.param(k, marks=[pytest.mark.slow, pytest.mark.long]) for k in (4, 5, 6, 7)),
+    ],
+)
 @pytest.mark.parametrize("seconds", [0.1, 15.0])
 def test_zeros_in_all_channels_are_no_leak(seed: int, seconds: float):
     recording = machine(seed, duration=240.0, rate=200.0).only(VOLUMES)
@@ -45,8 +53,15 @@ def test_zeros_in_all_channels_are_no_leak(seed: int, seconds: float):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("names", [VOLUMES, PRESSURES], ids=["volumes", "pressures"])
-@pytest.mark.parametrize("value", [0.0, None], ids=["zeros", "last values"])
+@pytest.mark.parametrize(
+    ("value", "names"),
+    [
+        pytest.param(0.0, VOLUMES, id="zeros-volumes", marks=pytest.mark.long),
+        pytest.param(0.0, PRESSURES, id="zeros-pressures"),
+        pytest.param(None, VOLUMES, id="last values-volumes"),
+        pytest.param(None, PRESSURES, id="last values-pressures", marks=pytest.mark.long),
+    ],
+)
 def test_fifteen_seconds_of_a_simulated_machine_are_no_leak(names: tuple[str, ...], value: float | None):
     for seed in (0, 4):
         recording = ss.simulate(command="3 sin(4t)", duration="5 min", seed=seed).only(names)

@@ -324,8 +324,14 @@ SIZES = {"omega": 10.0, "x": 1e-3, "v": 1e-2, "V_up": 1e-6, "x_s": 1e-5, "v_s": 
 SIZES |= dict.fromkeys(("p_A", "p_B", "p_1", "p_2"), 1e4)
 
 
+#: Variants whose laws another one has, too.
+CONTAINED = ("free", "single-rod-eha, one side carries")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    "variant", [pytest.param(name, marks=pytest.mark.long) if name in CONTAINED else name for name in VARIANTS]
+)
 def test_an_independent_program_finds_the_same_over_20_s(check_rig, drive, variant):
     """Within 1e-6 m and 100 Pa rms, with the step that is chosen where none is stated."""
     name, values, theirs, arguments, states, (volts, omega), options = VARIANTS[variant]

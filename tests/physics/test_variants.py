@@ -204,9 +204,10 @@ class Account:
 
 
 def examples(default: int, slow: int):
-    """Few examples of a property in the default tests, more in the slow ones."""
+    """Few examples of a property in the default tests, more in the long ones."""
     return pytest.mark.parametrize(
-        "count", [pytest.param(default, id="few"), pytest.param(slow, id="many", marks=pytest.mark.slow)]
+        "count",
+        [pytest.param(default, id="few"), pytest.param(slow, id="many", marks=[pytest.mark.slow, pytest.mark.long])],
     )
 
 

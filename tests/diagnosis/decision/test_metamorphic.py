@@ -154,15 +154,21 @@ def test_a_healthy_machine_by_the_balance_stays_healthy(kind: str, two_methods: 
     check_healthy(BY_BALANCE, kind)
 
 
+#: Machines that differ from the first by their duty or their numbers alone take long.
+EACH = [
+    pytest.param(name, marks=pytest.mark.long) if name in ("thesis, slow", "calibrated") else name for name in MACHINES
+]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", EACH)
 def test_a_leak_stays(name: str, kind: str) -> None:
     check_leak(name, kind)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", EACH)
 def test_a_healthy_machine_stays_healthy(name: str, kind: str) -> None:
     check_healthy(name, kind)

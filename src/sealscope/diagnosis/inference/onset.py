@@ -41,7 +41,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -278,7 +278,8 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     if whitened is None:
         return []
     steps = whitened.transform @ whitened.step_shapes(whitened.positions, shape)
-    return [_test_step_up(whitened._replace(z=sign * whitened.z), steps) for sign in signs]
+    fits = _fit_steps(whitened.z, steps, whitened.eigen)
+    return [_test_step_up(whitened, steps, fits if sign > 0.0 else fits.upside_down()) for sign in signs]
 
 
 class StepSizes(NamedTuple):
@@ -331,6 +332,12 @@ class _StepFits(NamedTuple):
     energies: Array
     residual_squares: Array
 
+    def upside_down(self) -> _StepFits:
+        """Return the fits of a step up to the negative of z."""
+        return self._replace(
+            moments=-self.moments, residual_squares=_residual_squares(self.total, -self.moments, self.energies)
+        )
+
 
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
@@ -341,8 +348,12 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
     moments, energies = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
-    residual_squares = np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None])
-    return _StepFits(weight, total, moments, energies, residual_squares)
+    return _StepFits(weight, total, moments, energies, _residual_squares(total, moments, energies))
+
+
+def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
+    """Compute the sums of squares (w, o) that steps up leave of `total` (w,); see `_StepFits`."""
+    return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
 class _Whitened(NamedTuple):
@@ -382,12 +393,60 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     return np.asarray(steps * (1.0 + growth * grown_fraction))
 
 
+class _Whitening(NamedTuple):
+    """What whitens K blocks of a coefficient, whatever their readings; `transform` to `walk_log_priors`: `_Whitened`.
+
+    `root` (r,) and `vectors` (K, r): square roots of the eigenvalues of the precision that have information, and their
+    eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 reading for a prior on
+    the slope, else 0; `basis` (n, n): eigenvectors of the walk's covariance.
+    """
+
+    root: Array
+    vectors: Array
+    complement: Array
+    basis: Array
+    transform: Array
+    eigen: Array
+    unit: float
+    positions: Array
+    walk_log_priors: Array
+
+    def whiten(self, time: Array, vector: Array) -> _Whitened:
+        """Whiten the readings of blocks: their middles `time` (K,) [s] and `vector` (K,)."""
+        z = (self.vectors.T @ vector) / self.root
+        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # the prior on the slope is one more reading
+        return _Whitened(
+            z=self.basis.T @ (self.complement @ z),
+            transform=self.transform,
+            eigen=self.eigen,
+            unit=self.unit,
+            positions=self.positions,
+            onsets=_onset_times(time, self.positions),
+            walk_log_priors=self.walk_log_priors,
+        )
+
+
 def _whiten_blocks(information: Information) -> _Whitened | None:
     """Whiten the blocks of a coefficient and project out level and slope; None if too few blocks have information."""
     time, precision, vector = _prepend_level_prior(information)
-    count = len(time)
     if not np.isfinite(precision).all():
         return None
+    is_unit = np.array_equal(precision, np.eye(len(time)))
+    design = (
+        _unit_whitening(len(time), *information[4:6]) if is_unit else _build_whitening(precision, *information[4:6])
+    )
+    return None if design is None else design.whiten(time, vector)
+
+
+@lru_cache(maxsize=16)
+def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
+    """Build the whitening of `count` blocks with independent readings of unit variance, which many tests share."""
+    return _build_whitening(np.eye(count), slope, walk)
+
+
+def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
+    """Build the whitening of blocks with a precision (K, K); None if too few have information."""
+    count = len(precision)
     # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
     values, vectors = np.linalg.eigh(precision)
     is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
@@ -395,28 +454,27 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
         return None
     root = np.sqrt(values[is_informative])
     design = (vectors[:, is_informative] * root).T
-    z = (vectors[:, is_informative].T @ vector) / root
     index = np.arange(count)
     fixed = design @ np.column_stack([np.ones(count), (index - index.mean()) / count])
-    if np.isfinite(information.slope):  # the prior on the slope is one more reading
-        fixed = np.vstack([fixed, [0.0, 1.0 / information.slope]])
-        design, z = np.vstack([design, np.zeros(count)]), np.append(z, 0.0)
+    if np.isfinite(slope):  # the prior on the slope is one more reading
+        fixed = np.vstack([fixed, [0.0, 1.0 / slope]])
+        design = np.vstack([design, np.zeros(count)])
     complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T  # orthogonal to level and slope
     transform = complement @ design
     covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T  # of the walk: min(k, l)
     # in this unit of its variance the walk changes z as much as the noise does, on average
     unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
-    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)
-    walk_log_priors = -np.log1p(WALKS * unit * count / information.walk**2)
-    return _Whitened(
-        z=basis.T @ (complement @ z),
+    return _Whitening(
+        root=root,
+        vectors=vectors[:, is_informative],
+        complement=complement,
+        basis=basis,
         transform=basis.T @ transform,
         eigen=np.maximum(eigen, 0.0),
         unit=unit,
-        positions=positions,
-        onsets=_onset_times(time, positions),
-        walk_log_priors=walk_log_priors,
+        positions=np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS),
+        walk_log_priors=-np.log1p(WALKS * unit * count / walk**2),
     )
 
 
@@ -445,14 +503,14 @@ def _onset_times(time: Array, positions: Array) -> Array:
     return np.asarray(np.interp(positions, np.arange(len(edges)), edges))
 
 
-def _test_step_up(whitened: _Whitened, steps: Array) -> StepTest:
+def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTest:
     """Test whitened readings z (n,) for a step up at any of o onsets, by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps. Both likelihoods are maximised over the variances of walk and noise, with the
-    prior on the walk.
+    `steps` (n, o): whitened unit steps; `fits`: of z or its negative. Both likelihoods are maximised over the variances
+    of walk and noise, with the prior on the walk.
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
-    weight, total, moments, energies, residual_squares = _fit_steps(whitened.z, steps, whitened.eigen)
+    weight, total, moments, energies, residual_squares = fits
     determinant = np.log(weight).sum(axis=1) + 2.0 * walk_log_priors
     log_likelihood = 0.5 * determinant - 0.5 * n * np.log(total / n)
     log_likelihood_with_step = 0.5 * determinant[:, None] - 0.5 * n * np.log(residual_squares / n)

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.evaluation.scalar_search import find_root
+from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
 
 #: `Observable.data` of the leakage against healthy recordings.
@@ -59,6 +60,8 @@ MAX_LOG = 4.0
 TINY = 1e-300
 #: Normal laws that a law of z is split into, their relative width, limit of abs(z), and negligible log weight.
 PARTS, PART_WIDTH, MAX_Z, NEGLIGIBLE = 7, 0.5, 30.0, 16.0
+#: Number of normal laws of a large mixture whose quantile begins the search for its own, and the step of their slope.
+SAMPLED, SLOPE_STEP = 1000, 1e-3
 
 
 class Mixture(NamedTuple):
@@ -73,14 +76,24 @@ class Mixture(NamedTuple):
         from scipy.special import ndtr, ndtri
 
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
-        centres, deviations = self.centres / scale, self.deviations / scale
+        scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
-        def excess(value: float) -> float:
-            return float(self.weights @ ndtr((value - centres) / deviations)) - probability
+        def excess(value: float, laws: Mixture = scaled) -> float:
+            return float(laws.weights @ ndtr((value - laws.centres) / laws.deviations)) - probability
 
-        part_quantiles = centres + ndtri(probability) * deviations
+        part_quantiles = scaled.centres + ndtri(probability) * scaled.deviations
         low, high = float(part_quantiles.min()), float(part_quantiles.max())
-        return scale * (low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high))
+        root = None
+        if len(self.weights) > 4 * SAMPLED:  # begin at the quantile of a sample of the laws
+            weights, deviations, centres = (part[:: len(part) // SAMPLED] for part in scaled)
+            sample = partial(excess, laws=Mixture(weights / weights.sum(), deviations, centres))
+            if sample(low) < 0.0 < sample(high):
+                start = find_root(sample, low, high)
+                slope = (sample(start + SLOPE_STEP) - sample(start - SLOPE_STEP)) / (2.0 * SLOPE_STEP)
+                root = find_near_root(excess, start, slope, low, high)
+        if root is None:
+            root = low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high)
+        return scale * root
 
 
 class Rise(NamedTuple):

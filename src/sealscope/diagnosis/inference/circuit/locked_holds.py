@@ -273,12 +273,13 @@ class HeldChambers:
         scale[~(scale > 0.0)] = 1.0
         degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
         variance = max(float(left @ left) / len(left), min_variance)
+        gram, moments, scales = design.T @ design, design.T @ left, np.outer(scale, scale)
         for _ in range(MAX_ITERATIONS):
             prior = np.concatenate([np.zeros(n_leaks), variance * inflation / deviations**2])
-            matrix = (design.T @ design + np.diag(prior)) / np.outer(scale, scale)
+            matrix = (gram + np.diag(prior)) / scales
             matrix.flat[:: len(scale) + 1] += RIDGE
-            inverse = np.linalg.inv(matrix) / np.outer(scale, scale)
-            solution = inverse @ (design.T @ left)
+            inverse = np.linalg.inv(matrix) / scales
+            solution = inverse @ moments
             residual = left - design @ solution
             cost = float(residual @ residual) + float(prior @ solution**2)
             previous, variance = variance, max(cost / len(left) * self.n_readings / degrees_of_freedom, min_variance)
@@ -289,6 +290,12 @@ class HeldChambers:
         gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
         by_oil = gain @ covariance[n_leaks:, :n_leaks]
         return _LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
+
+    @cached_property
+    def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
+        """Fits of the oil alone, to each of `_regressions`."""
+        without, refilled = (np.empty((len(regression.left), 0)) for regression in self._regressions)
+        return self._fit(without, False), self._fit(refilled, True)
 
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
         """Fit a leak past the piston from `onset` [s] on, by a power of p_A - p_B minus its offset [Pa]."""
@@ -315,13 +322,13 @@ class HeldChambers:
         """Fit a leak from `onset` [s] on, with a coefficient >= 0; its deviation is `UNKNOWN` if nothing would flow."""
         column = self._leak_columns(leak, np.array([onset]))
         has_flow = column.any()
-        fit = self._fit(column if has_flow else column[:, :0], leak.is_refilled)
+        fit = self._fit(column, leak.is_refilled) if has_flow else self._fits_without_leak[leak.is_refilled]
         value, deviation, by_oil = 0.0, UNKNOWN, 0.0
         if has_flow:
             value, deviation = float(fit.coefficients[0]), float(fit.by_noise[0, 0]) ** 0.5
             by_oil = float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
         if value < 0.0:  # a leak flows from the higher to the lower pressure only
-            value, fit = 0.0, self._fit(column[:, :0], leak.is_refilled)
+            value, fit = 0.0, self._fits_without_leak[leak.is_refilled]
         return LeakFit(value, deviation, by_oil, -0.5 * self.n_readings * float(np.log(fit.variance)))
 
     @cached_property
@@ -362,7 +369,7 @@ class HeldChambers:
         """
         left, oil, deviations, inflation, min_variance = self._regressions[leak.is_refilled]
         design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
-        variance = self._fit(design[:, :0], leak.is_refilled).variance
+        variance = self._fits_without_leak[leak.is_refilled].variance
         precision = oil.T @ oil + np.diag(variance * inflation / deviations**2)
         scale = np.sqrt(np.diag(precision))
         coupling = (oil / scale).T @ design
