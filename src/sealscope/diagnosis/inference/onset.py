@@ -394,7 +394,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """What whitens K blocks of a coefficient, whatever their readings; `transform` to `walk_log_priors`: `_Whitened`.
+    """Whitening of K blocks of a coefficient, for any readings; `transform` to `walk_log_priors` as in `_Whitened`.
 
     `root` (r,) and `vectors` (K, r): square roots of the eigenvalues of the precision that have information, and their
     eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 reading for a prior on
