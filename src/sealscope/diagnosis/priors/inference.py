@@ -58,6 +58,7 @@ class ConditionPriors(PriorTable):
 
     ratio: float
     oil: float
+    motion: float
     leak: float
 
 

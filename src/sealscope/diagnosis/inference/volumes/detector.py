@@ -23,7 +23,14 @@ from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, co
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import duplicate_leak_column
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
-from sealscope.diagnosis.inference.scatter import RecordingSums, Rise, leak_deviations_from_mean, motion_change, rise
+from sealscope.diagnosis.inference.scatter import (
+    RecordingSums,
+    Rise,
+    find_unusual_conditions,
+    leak_deviations_from_mean,
+    motion_change,
+    rise,
+)
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
     LOCKED,
@@ -253,7 +260,10 @@ class VolumeBalance:
 
 
 def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Iterator[Observable]:
-    """Compare the flow explained by motion with the healthy recordings; a change means another machine or scale."""
+    """Compare the flow explained by motion with the healthy recordings; a change means another machine or scale.
+
+    Load and speed outside of the range of the healthy recordings make it less certain.
+    """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
@@ -262,6 +272,8 @@ def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) 
         return Estimate(change, float(np.hypot(prior.error, error)))
 
     judged = estimate(balance.recording_sums)
+    excess = sum(condition.log_excess for condition in find_unusual_conditions(balance.recording_sums, healthy))
+    judged = judged._replace(deviation=float(np.hypot(judged.deviation, INFERENCE.conditions.motion * excess)))
     scatter = PriorScatter(prior.scatter, prior.recordings)
     observable = compare_estimates("motion", "motion", judged, [estimate(sums) for sums in healthy], scatter)
     yield from () if observable is None else (observable,)
