@@ -19,6 +19,7 @@ from sealscope.diagnosis.inference.scatter import (
     rise,
 )
 from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
+from sealscope.diagnosis.inference.volumes.detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 PRESSURE, FLOW = 1e5, 1e-5
@@ -415,6 +416,19 @@ def test_the_flow_that_motion_takes_does_not_depend_on_what_leaks() -> None:
         assert np.ptp(changes[:-1]) < 10.0 * max(deviations)
         errors.append((changes[-1] - np.mean(changes[:-1]) - np.log(scale)) / deviations[-1])
     assert np.std(errors) == pytest.approx(np.sqrt(1.0 + 1.0 / 3.0), rel=0.3)
+
+
+def test_a_scale_is_another_machine_only_at_speeds_that_are_known() -> None:
+    """Another 5 % is rare at the speed of the healthy recordings; at half of it the slip of the pump may be as much."""
+    random = np.random.default_rng(8)
+    healthy, day = (
+        [RecordingSums(moving(random, 0.04, scale)[None], FLOW, PRESSURE) for scale in scales]
+        for scales in ([1.0] * 5, [1.05])
+    )
+    (usual,) = compare_motion(day[0], healthy, MOVING)
+    (slow,) = compare_motion(day[0]._replace(flow=0.5 * FLOW), healthy, MOVING)
+    assert usual.chance < 1e-3 and slow.chance > 0.05
+    assert usual.size == pytest.approx(slow.size)
 
 
 def test_conditions_that_no_healthy_recording_had_are_named() -> None:

@@ -254,12 +254,14 @@ class VolumeBalance:
         judged_until = (np.flatnonzero(rows > 0.0)[-1] + 1.0) / len(rows) if has_position and rows.any() else 1.0
         observables = balance.observables
         if healthy and len(balance.columns) == 1 and has_position:
-            observables += tuple(_compare_motion(balance, healthy))
+            observables += tuple(compare_motion(balance.recording_sums, healthy, balance.columns[0]))
             observables += rival_rises(balance.recording_sums, healthy, balance.columns, balance.volume_ratio)
         return Observed(self.name, observables, leak, share=share, judged_until=float(judged_until))
 
 
-def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Iterator[Observable]:
+def compare_motion(
+    judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
+) -> Iterator[Observable]:
     """Compare the flow explained by motion with the healthy recordings; a change means another machine or scale.
 
     Load and speed outside of the range of the healthy recordings make it less certain.
@@ -268,11 +270,11 @@ def _compare_motion(balance: RecordedBalance, healthy: Sequence[RecordingSums]) 
 
     def estimate(sums: RecordingSums) -> Estimate:
         """Estimate the log ratio of a recording's flow to the healthy one."""
-        change, error = motion_change(sums.sums[0], healthy_sums, balance.columns[0])
+        change, error = motion_change(sums.sums[0], healthy_sums, roles)
         return Estimate(change, float(np.hypot(prior.error, error)))
 
-    judged = estimate(balance.recording_sums)
-    excess = sum(condition.log_excess for condition in find_unusual_conditions(balance.recording_sums, healthy))
+    judged = estimate(judged_sums)
+    excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
     judged = judged._replace(deviation=float(np.hypot(judged.deviation, INFERENCE.conditions.motion * excess)))
     scatter = PriorScatter(prior.scatter, prior.recordings)
     observable = compare_estimates("motion", "motion", judged, [estimate(sums) for sums in healthy], scatter)
