@@ -38,7 +38,10 @@ class LeakTest(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """An event other than a leak: its `probability`, the rarest `observable` it explains, and that one's `chance`."""
+    """Event other than a leak that explains a rare change, with its `probability`.
+
+    `observable`: the rarest one that it explains; `chance`: of this observable in a healthy recording.
+    """
 
     cause: Cause
     description: str
@@ -97,16 +100,19 @@ class Case:
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests whose score exceeds the threshold; the rise comes before the step if the leak is older."""
+        """Tests whose chance is below the allowed false-alarm probability, in order of precedence.
+
+        A step comes before a rise, unless the leak is older than the recording.
+        """
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self._has_onset_within else reversed(alarms))
 
     @property
     def _has_onset_within(self) -> bool:
-        """Test whether a leak that began within the recording explains step and rise better than an older one.
+        """True if a leak that began within the recording explains step and rise better than an older one.
 
-        The older one explains the rise alone, the younger one the step and the rise that this step causes. Holds that
-        date the rise within the recording leave no question.
+        The older one explains the rise alone, the younger one the step and the rise that this step causes. Without a
+        rise to explain, or if holds date the rise within the recording, there is no question.
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -116,9 +122,9 @@ class Case:
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """The event other than a leak that explains a rare change with sufficient probability, or None.
+        """Event other than a leak that explains a rare change with sufficient probability, or None.
 
-        Observables are tried from the rarest on, as long as they are too rare for a healthy recording.
+        The observables are tried in the order of their chances, up to the chance that a healthy recording allows.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -167,7 +173,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the null distribution's key of a step of the leak within a recording, as measured by a provider."""
+    """Return the key of the null distribution for a provider's test of a step of the leak."""
     return f"{provider}: step"
 
 

@@ -26,7 +26,10 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the place of a detector in the order in which they judge, 0 first; all plug-ins share one place."""
+    """Return the place of a detector in the order of judging, 0 first.
+
+    All plug-ins share one place, after the detectors that measure the leak and before the change of the RMS.
+    """
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
     return ORDER.index(detector) if detector in ORDER else len(ORDER)
@@ -65,7 +68,10 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """State `cannot tell`, with the reason of the first usable detector, else of the one needing fewest channels."""
+    """State `cannot tell`, with the reason of the first usable detector.
+
+    If none is usable, the reason is that of the detector that needs the fewest channels.
+    """
     if usable:
         undecided = usable[0]
         needs = next((decision.reason for decision in ranked if decision.detector == ORDER[0]), "")

@@ -126,9 +126,10 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 
 
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
-    """Compute the 95 % upper bound [m^3/s] of a leak; inf if it exceeds the pump's mean flow, or nothing bounds it.
+    """Compute the 95 % upper bound of a leak [m^3/s].
 
-    If an alarm may be due to a leak, the bound is at least the upper end of that leak's interval.
+    If an alarm may be due to a leak, the bound is at least the upper end of that leak's interval. It is infinite if it
+    reaches the pump's mean flow, or nothing bounds the leak.
     """
     leak = case.leak
     if leak is None:
@@ -143,10 +144,10 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 
 
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
-    """Return the 95 % bound of a leak, and the largest bound that allows `no leak`, both [m^3/s].
+    """Return the 95 % bound of a leak, and the largest bound that allows `no leak`.
 
-    If no leak is measured, both are changes of the ringing's log RMS. The bound is then infinite after an alarm, or at
-    a sampling rate too low for the ringing to exclude a leak.
+    Both are flows [m^3/s] or, if no leak is measured, changes of the ringing's log RMS. The bound of the ringing is
+    infinite if none was measured, after an alarm, or at a sampling rate too low for it to exclude a leak.
     """
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
@@ -166,9 +167,9 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add the provider's name and shares, the result of the `judging` test, and all tests as `parts` to the evidence.
+    """Add the provider's name, shares and ratio of sizes, and the results of the tests, to the evidence.
 
-    A single test is not repeated as a part. If `judging` is None, no results of tests are added.
+    `judging`: test whose result is stated, None to add no results. All tests are added as `parts` if there are several.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

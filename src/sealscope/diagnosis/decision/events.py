@@ -30,7 +30,10 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if the sizes of its observables count (`Observable.advantage`): a prior exists for named events only."""
+        """True if the sizes of the event's observables count (`Observable.advantage`).
+
+        A prior on the sizes exists only for events that a verdict names.
+        """
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:

@@ -59,10 +59,12 @@ def explain(
     chance: Callable[[Observable], float] = lambda observable: observable.chance,
     rise: LeakRise | None = None,
 ) -> tuple[Explanation, ...]:
-    """Compute the posterior probability of every set of events, given that something changed; most probable first.
+    """Compute the posterior probabilities of sets of events, the most probable first.
 
-    `chance`: predictive chance of an observable in a healthy recording (`null.HealthyNull.chance`); `rise`: of the
-    leakage over healthy recordings, which a leak causes in proportion to its size and the time since its onset.
+    They are conditional on some event having happened. The sets are each single event, and combinations of the events
+    that the observables support. `chance`: predictive chance of an observable in a healthy recording
+    (`null.HealthyNull.chance`); `rise`: of the leakage over healthy recordings, which a leak causes in proportion to
+    its size and the time since its onset.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -82,10 +84,10 @@ def explain(
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Set the log Bayes factors of a balance's terms apart by their likelihoods in the judged recording alone.
+    """Reduce the log Bayes factors of the balance's terms by their likelihoods relative to the best.
 
-    The terms are rival descriptions of the same residual. Healthy recordings calibrate how rare the best of them is;
-    the few of them say nothing on which term describes it best.
+    The terms are rival descriptions of the same residual. Healthy recordings calibrate how rare the best of them is,
+    but are too few to tell which term describes it best: for that the likelihoods in the judged recording alone count.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -101,7 +103,10 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Divide the log Bayes factors of each kind of data by 1 + 2 m B: B is the largest of them, m the misfit."""
+    """Reduce the log Bayes factors of each kind of data for the misfit of its model.
+
+    Each is divided by 1 + 2 m B, where B is the largest factor of that kind and m the misfit.
+    """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:
         max_factor[observable.data] = max(factor, max_factor.get(observable.data, 0.0))
@@ -185,7 +190,10 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
 
 
 def log_bayes_factor(chance: float) -> float:
-    """Compute the logarithm of the largest Bayes factor that a chance under the null allows."""
+    """Compute the logarithm of the largest Bayes factor that a chance c under the null allows.
+
+    It is -log(-e c log c) for c < 1/e, else 0.
+    """
     if chance >= np.exp(-1.0):
         return 0.0
     chance = max(chance, np.finfo(float).tiny)

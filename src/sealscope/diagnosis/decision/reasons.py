@@ -64,7 +64,7 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Describe the bound of a leak, and what recording would bound it more closely."""
+    """Describe the bound of a leak, and a recording that would bound it more closely."""
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
@@ -83,7 +83,7 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """Describe the largest drop of the pressure ringing that the data do not exclude, and what may hide a leak."""
+    """Describe the largest drop of the ringing that the data allow, and reasons why a leak may hide."""
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
     percent = -100.0 * np.expm1(-ringing.bound)
@@ -116,7 +116,10 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
-    """Name the most probable explanation other than a leak, and the recording that would distinguish them."""
+    """Name the most probable explanation other than a leak, and a recording that would separate the two.
+
+    If that is a change of the operating point, only its time is stated. The text is empty without such an explanation.
+    """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:

@@ -16,10 +16,10 @@ def _texts() -> Mapping[str, Mapping[str, str]]:
 
 
 def text_of(table: str, key: str, **values: Any) -> str:
-    """Format the text of a key with its values."""
+    """Return the text `key` of a `table` in `texts.toml`, with `values` filled in."""
     return _texts()[table][key].format(**values)
 
 
 def has_text(table: str, key: str) -> bool:
-    """Test whether a table has a text of a key."""
+    """Test whether a `table` in `texts.toml` has a text `key`."""
     return key in _texts()[table]

@@ -15,5 +15,8 @@ def decide_without_leak(bound: float, max_bound: float) -> Verdict:
 
 
 def bound_worth_stating(flow: float) -> float:
-    """Compute the largest bound of a leak that allows the verdict `no leak`: a fraction of the pump's flow."""
+    """Compute the largest bound of a leak that allows the verdict `no leak`.
+
+    It is a fraction of the pump's `flow`, in the same unit, and is 0 if `flow` is not positive.
+    """
     return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0

@@ -66,7 +66,7 @@ BATCH_SAMPLES = 8192
 
 
 class BlockStream:
-    """Divide a stream of samples into blocks, the same ones however the samples are divided into pushes.
+    """Division of a stream of samples into blocks, which do not depend on the sizes of the pushes.
 
     `balances`: of the machine (`terms.equations`); `rate` [Hz]; `block_s`: length of a block [s], rounded to whole
     strides of the weak form; `n_first`: number of first blocks that are weighted together, None for all of the first
@@ -169,10 +169,10 @@ class BlockStream:
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Estimate the sign of each left side, as an encoder or the two sides may be connected in reverse.
+        """Estimate the sign of each equation's left side, since sensors may be connected in reverse.
 
-        Three symptoms of correct wiring add their log odds: friction dissipates, so that p_A - p_B correlates with the
-        flow into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
+        Three symptoms of correct wiring add their log odds: friction dissipates, and p_A - p_B correlates with the flow
+        into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
         probability Phi(z) of a correct sign, except for a fraction of machines in which something else causes it.
         """
         signs = []
@@ -218,7 +218,10 @@ class BlockStream:
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
     def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate absolute minus gauge pressure from the first `n_samples`, and limits of rests, once a stream."""
+        """Estimate the limits of rests, and absolute minus gauge pressures, once for a stream.
+
+        The pressures are estimated from the first `n_samples`.
+        """
         if self._absolute_offsets is None:
             self._absolute_offsets = {
                 name: _absolute_offset(samples[name][:n_samples]) for name in ("p_A", "p_B") if name in samples
@@ -277,7 +280,10 @@ def _z_score(products: Array) -> float:
 
 
 def _sign_log_odds(z: float, other_cause: float) -> float:
-    """Compute the log odds that a sign with the score `z` is right; `other_cause`: probability of another cause."""
+    """Compute the log odds that a sign with the z score `z` is right.
+
+    `other_cause`: probability that something else than the sign causes the score.
+    """
     from scipy.special import ndtr
 
     return float(np.log((ndtr(z) + 0.5 * other_cause) / (ndtr(-z) + 0.5 * other_cause)))
@@ -299,7 +305,10 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float) -> float:
-    """Compute the rate below which `increments` (n,) are at rest: a fraction of that in motion, or noise if larger."""
+    """Compute the rate below which a volume or a position counts as resting.
+
+    It is a fraction of the mean rate in motion, or the noise of an averaged rate if that is larger. `increments` (n,).
+    """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
@@ -340,11 +349,11 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
 def derive_drive_signals(
     samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
 ) -> dict[str, Array]:
-    """Add signals of the drive's model to samples: the decay `START` of its initial state, and the pump's speed.
+    """Add signals of the drive's model to samples: `START`, and the pump's speed if only u shows it.
 
-    The speed "omega" [rad/s] is added only if the pump is known by the command u alone: it is the drive's response to
-    u, NaN where u is missing. `loaded`: under the load p_A - p_B; otherwise without load, so that the droop of the real
-    speed under load counts as leakage.
+    `START` is the decay of the drive's initial state. The speed "omega" [rad/s] is added only if the pump is known by
+    the command u alone: it is the drive's response to u, NaN where u is missing. `loaded`: under the load p_A - p_B;
+    otherwise without load, and the droop of the real speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}

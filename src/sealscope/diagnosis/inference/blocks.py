@@ -111,7 +111,10 @@ class Blocks:
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags (K,) of the blocks in motion, whose mean flow exceeds the one that holds a load."""
+        """Flags (K,) of the blocks in motion.
+
+        Their mean flow is at least a fraction of `moving_flow`, more than is needed to hold a load.
+        """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
@@ -134,14 +137,17 @@ class Blocks:
         )
 
     def mean_pressure(self, offset: float | None = None) -> Array:
-        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, (K,); by default with the offset `zero`.
+        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block (K,).
 
-        A laminar leak's coefficient times it is the leak's mean flow.
+        By default the offset is `zero`. The mean flow of a laminar leak is its coefficient times this pressure.
         """
         return np.asarray(np.abs(self.pressures - (self.zero[:, None] if offset is None else offset)).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), as of an orifice's flow."""
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,).
+
+        The mean flow of an orifice is its coefficient times this mean.
+        """
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     @classmethod
@@ -182,7 +188,10 @@ class ColumnRoles:
         self.healthy_conductance = equation.healthy
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return the roles with the column `name` tested in place of the leak, whose changes then have a prior."""
+        """Return the roles for a test of the column `name` in place of the leak.
+
+        The leak's changes between recordings then have a prior.
+        """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
         roles.between_deviation[self.leak] = INFERENCE.between.pump
@@ -199,9 +208,10 @@ class ColumnRoles:
         return self.healthy_conductance * per_conductance[driver]
 
     def offset_deviation(self, test: int, blocks: Blocks) -> float:
-        """Return the prior standard deviation of a sensor offset in the unit of a leak's column; 0 for other columns.
+        """Return the prior standard deviation of a sensor offset, in the unit of a leak's column.
 
-        `test`: index of the column. It is at most the mean pressure itself, since recordings may be in counts.
+        `test`: index of the column; the result is 0 for other columns than a leak's. The offset's deviation is at most
+        the mean pressure, since recordings may be in counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))

@@ -45,7 +45,10 @@ class Estimate(NamedTuple):
 
 
 class PriorScatter(NamedTuple):
-    """Prior standard deviation of a number between recordings, and the number of recordings that it counts as."""
+    """Prior on the scatter of a number between recordings.
+
+    `deviation`: its standard deviation; `recordings`: number of recordings with the same weight.
+    """
 
     deviation: float
     recordings: float
@@ -66,7 +69,7 @@ def compare_with_healthy(
     Return None for fewer than `MIN_HEALTHY` recordings, or if a number is not finite. `name`, `data`: of the
     observable; `error`: standard error of a single value; `above`: only a value above the healthy ones counts;
     `prior_change`: standard deviation of a true change. The chance is at least the inverse of the Bayes factor of such
-    a change, so that a value that it explains no better than chance does counts for nothing.
+    a change: it is 1 if a true change explains the value no better than scatter does.
     """
     from scipy.special import stdtr
 
@@ -131,7 +134,7 @@ def compare_estimates(
 
 
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
-    """Compute the standard error that a value has in addition to that in the scatter of the healthy values.
+    """Compute the part of a standard error that the scatter of the healthy values does not contain.
 
     The scatter contains the median of `healthy_errors`, the standard errors of the healthy values. The result is
     sqrt(`error`^2 - median^2), at least 0; it is `error` if there are no healthy values.
@@ -142,6 +145,9 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
 
 
 def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
-    """Compute -2 log of a step's log-normal prior density over its maximum; `above`: penalise only steps above it."""
+    """Compute -2 log of the log-normal prior density of log(abs(`step`)), relative to its maximum.
+
+    `above`: penalise only steps that are larger than the most probable size, `prior.size`.
+    """
     deviation = float(np.log(max(abs(step), TINY) / prior.size)) / prior.spread
     return float(max(deviation, 0.0) ** 2 if above else deviation**2)

@@ -39,9 +39,10 @@ _TINY = np.finfo(float).tiny
 
 
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
-    """Compute the conductance (K,) that a leak of unit coefficient adds in each block, for each of `EXPONENTS`.
+    """Compute the conductance (K,) that a leak of unit coefficient adds in each block, by leak law.
 
-    For an orifice by the regression of its flow on p_A - p_B; between the two laws its logarithm is interpolated.
+    The keys are `EXPONENTS`. For an orifice it is the regression coefficient of the flow on p_A - p_B; for the laws
+    between laminar and orifice flow its logarithm is interpolated.
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -67,7 +68,7 @@ def law_priors() -> Array:
 
 
 def _growth_priors() -> list[tuple[float, float]]:
-    """Return the possible growths of a step from onset to end, relative to it, each with its prior probability."""
+    """List the possible relative growths of a step after its onset, with their prior probabilities."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     return [(0.0, prior.steady), *((float(growth), (1.0 - prior.steady) / N_GROWTHS) for growth in growths)]
@@ -110,7 +111,7 @@ class LawWeight(NamedTuple):
 def estimate_rise_flow(
     leak: Information, test: StepTest | None, value: float, deviation: float, laws: Sequence[LawWeight], max_flow: float
 ) -> Flow:
-    """Estimate the mean flow of a leak after its onset from the rise of its coefficient over healthy recordings.
+    """Estimate the mean flow of a leak after its onset, from its rise over healthy recordings.
 
     The value is that of the most probable law; the other laws contribute to its standard deviation. `leak`: likelihood
     of the coefficient in the blocks; `test`: of its step, or None; `value`, `deviation`: mean rise over the whole
@@ -130,10 +131,11 @@ def estimate_rise_flow(
 
 
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
-    """Compute log weight and fraction of information after each possible onset of a rise, the recording's start first.
+    """Compute the log weight of each possible onset of a rise, and the fraction of information after it.
 
-    `value`: rise of the coefficient over the whole recording, which is that fraction of the step after the onset. The
-    weight is the likelihood of such a step, relative to no step, over the number of onsets.
+    The first onset is the recording's start, with fraction 1. `value`: rise of the coefficient over the whole
+    recording, which is the step after the onset times this fraction. The weight is the likelihood of such a step,
+    relative to no step, over the number of onsets.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
@@ -148,7 +150,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
-    """Compute mean and standard deviation of a mixture of flows, or of other sizes of a leak, (k,) each."""
+    """Compute the mean and the standard deviation of a mixture of k flows.
+
+    `weights`, `flows` (or other sizes of a leak) and their standard `deviations`: (k,) each.
+    """
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)
     return Flow(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))

@@ -53,7 +53,10 @@ class Observable:
 
     @property
     def surprisal(self) -> float:
-        """Minus the natural logarithm of the chance, exponential in a healthy machine if the law is right."""
+        """Minus the natural logarithm of the chance.
+
+        In a healthy machine it is exponentially distributed if the provider's law is right.
+        """
         return float(-np.log(max(self.chance, np.finfo(float).tiny)))
 
     @classmethod
@@ -83,7 +86,7 @@ class Flow(NamedTuple):
 
 
 class Remark(NamedTuple):
-    """A key of `decision/texts.toml` with its values."""
+    """Remark on a recording: the key of a text in `decision/texts.toml`, and the values to fill in."""
 
     key: str
     values: Mapping[str, float]
@@ -92,7 +95,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Rise of the leakage over healthy recordings.
 
-    `step_log_ratio`: log likelihood ratio of the rise that the step within the recording would cause to no rise.
+    `step_log_ratio`: log likelihood ratio of two sizes of the rise, the one that the step within the recording would
+    cause and zero.
     """
 
     rise: Rise
@@ -145,7 +149,7 @@ class LeakMeasure(Protocol):
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest ratio of the leak's flow to the stated one, by other paths and laws of the leak."""
+        """Smallest and largest factor on the stated flow, for other paths and laws of the leak."""
 
     @property
     def flow_per_conductance(self) -> float:
@@ -157,7 +161,7 @@ class LeakMeasure(Protocol):
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow of the rise, or of the total leakage without one; None if unknown."""
+        """Mean flow of the rise [m^3/s], or the total leakage without healthy recordings; None if unknown."""
 
     @property
     def rise_onset(self) -> Interval | None:
@@ -165,7 +169,7 @@ class LeakMeasure(Protocol):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit in the rig's file, over its standard deviation; None if no limit applies."""
+        """Total leakage above the limit in the rig's file, in standard deviations; None if no limit applies."""
 
     @property
     def bound_flow(self) -> float:

@@ -192,7 +192,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
 
 
 class History(NamedTuple):
-    """A coefficient over the blocks under the model of the test: `mean` (K,) and `covariance` (K, K)."""
+    """Estimate of a coefficient over K blocks: `mean` (K,) and `covariance` (K, K)."""
 
     mean: Array
     covariance: Array
@@ -210,7 +210,10 @@ class History(NamedTuple):
 
 
 def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
-    """Estimate the coefficient in each block: level, slope and random walk, `with_step` also the step of `test`."""
+    """Estimate a coefficient in each block, as the sum of level, slope and random walk.
+
+    `test` gives the variances of walk and noise; without it there is no walk. `with_step` adds the best step of `test`.
+    """
     count, time = len(information.time), information.time
     noise = 1.0 if test is None else test.noise[with_step]  # indexed by False or True
     columns = [np.ones(count)]
@@ -352,7 +355,10 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute the sums of squares (w, o) that steps up leave of `total` (w,); see `_StepFits`."""
+    """Compute the residual sums of squares (w, o) after the fit of a step up at each onset.
+
+    `total` (w,), `moments` and `energies` (w, o): see `_StepFits`.
+    """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
@@ -440,7 +446,10 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
 
 @lru_cache(maxsize=16)
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the whitening of `count` blocks with independent readings of unit variance, which many tests share."""
+    """Build the whitening of `count` blocks with independent readings of unit variance.
+
+    It is cached, as many tests share it.
+    """
     return _build_whitening(np.eye(count), slope, walk)
 
 

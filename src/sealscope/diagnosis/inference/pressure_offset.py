@@ -36,9 +36,9 @@ N_GRID = 21
 
 
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
-    """Subtract the likeliest offset of p_A - p_B (maximum a posteriori) in the blocks' sums.
+    """Subtract the most probable sensor offset of p_A - p_B from the blocks' sums (maximum a posteriori).
 
-    Return the blocks unchanged if the balance has no flow offset, or there are too few blocks.
+    Return the blocks unchanged if the balance has no flow offset, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -129,10 +129,11 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
 
 
 def _walk_likelihoods(steps: Array, z: Array, walks: Array) -> Array:
-    """Compute the log likelihood of z (n,) for each variance q of the random walk, with the best step up and noise.
+    """Compute the log likelihood of z (n,) for each variance q of the random walk.
 
-    cov z = kappa (I + q S S'), S = `steps` (n, K): a walk is a unit step of independent size in each block. Along the
-    eigenvectors of S' S it is diagonal. `walks`: q, of which 1 changes z as much as the noise does, on average.
+    The best step up and the variance kappa of the noise are fitted for each q. cov z = kappa (I + q S S'), S = `steps`
+    (n, K): a walk is a unit step of independent size in each block. Along the eigenvectors of S' S it is diagonal.
+    `walks`: values of q; a walk of q = 1 changes z as much as the noise does, on average.
     """
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)

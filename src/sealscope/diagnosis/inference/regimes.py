@@ -40,7 +40,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 
 
 def shut_at_rest_matrix(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) that combines a balance's m columns to the n of one with the pump cut off at rest.
+    """Build the matrix (m, n) from a balance's m columns to the n columns for a pump cut off at rest.
 
     With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`): the column of
     the offset becomes bias - rest bias, that of the leak at rest becomes leak - rest leak, and the rest bias is left

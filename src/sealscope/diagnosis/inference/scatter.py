@@ -110,7 +110,10 @@ class Rise(NamedTuple):
     may_be_partial: bool = False
 
     def widen(self, variance: float) -> Rise:
-        """Add a variance to each normal law of the mixture; return the rise unchanged without one, or if it is <= 0."""
+        """Add a variance to that of the rise and of each normal law of its mixture.
+
+        Return the rise unchanged if it has no mixture, or if the variance is not positive.
+        """
         if self.mixture is None or not variance > 0.0:
             return self
         mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
@@ -266,9 +269,10 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the piston's leakage from holds with shut valves; None if too few recordings have holds.
+    """Estimate the rise of the piston's leakage from holds with shut valves.
 
-    The leak may have begun within the recording, whose mean then contains only a part of it.
+    The leak may have begun within the recording, whose mean then contains only a part of it. Return None if too few
+    recordings have holds.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
@@ -356,10 +360,11 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
 def _candidate_covariances(
     sessions: Sequence[int], oil: _Oil, relative_slope: float, *, session_deviation: float, condition_deviation: float
 ) -> tuple[Array, Array]:
-    """Build candidate covariances (g, n + 1, n + 1) of z between recordings, the judged one last, and their log priors.
+    """Build candidate covariances of z between recordings, with their log priors.
 
-    `relative_slope`: dz over a relative change of the level. Standard deviations of z: `session_deviation`, between
-    sessions by the prior; `condition_deviation`, of the judged recording by its unusual load and speed.
+    Shapes (g, n + 1, n + 1) and (g,); the judged recording is the last. `relative_slope`: dz over a relative change of
+    the level. Standard deviations of z: `session_deviation`, between sessions by the prior; `condition_deviation`, of
+    the judged recording by its unusual load and speed.
     """
     # grid of the deviation between sessions over its prior, denser near zero; half-normal prior, times the spacing
     ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
@@ -618,13 +623,13 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Compute the log ratio of the flow explained by motion in a recording to the healthy one, and its standard error.
+    """Compute the log ratio of the flow explained by motion to that of healthy recordings, with its error.
 
     `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones. The flow is the sum
-    of the coefficients of motion, weighted by the energies of their columns in the recording. The leak is fitted beside
-    the motion, which otherwise takes what leaks in proportion to the speed; the other coefficients differ from the
-    healthy ones by a normal prior (`between`). The ratio differs from 1 if area over displacement changed: another
-    machine, or another scale. The error is that of the recording alone.
+    of the coefficients of motion, weighted by the energies of their columns in the recording. The leak is fitted
+    together with the motion, which otherwise takes the part that leaks in proportion to the speed; the other
+    coefficients differ from the healthy ones by a normal prior (`between`). The ratio differs from 1 if area over
+    displacement changed: another machine, or another scale. The standard error is that of the recording alone.
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -642,7 +647,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
-    """Estimate the distribution of a rise as Student's t, by the scatter of n healthy recordings.
+    """Make a rise of the size `value` with Student's t as its law, by the scatter of n healthy recordings.
 
     `deviations` (n,): of each healthy recording from the mean of the others; `prior_scatter`: prior standard deviation.
     """
@@ -686,7 +691,7 @@ def compare_laws(
     """Fit a recording's residual by a leak through an orifice and by a laminar one, and compare the fits.
 
     The residual is that under the coefficients of the healthy recordings, `baseline`. Return None if the balance has no
-    column of an orifice, or the recording has no information on both.
+    column of an orifice, or the recording has no information on one of the two leaks.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -710,11 +715,11 @@ def compare_laws(
 def compare_with_leak(
     judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles], rival: str
 ) -> float | None:
-    """Compute the log likelihood ratio of a rise described by the column `rival` to one described by the leak.
+    """Compute the log likelihood ratio of a rise of the column `rival` to a rise of the leak.
 
     The ratio is that of one independent reading, from the residual sums of squares. With the rival, the leak may differ
     as it does between healthy recordings. Return None if the balance has no such column, or the recording has no
-    information on one of both.
+    information on the leak or on the rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None
@@ -750,7 +755,7 @@ class _Residual(NamedTuple):
 
 
 def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> _Residual:
-    """Compute the residual of a recording under the coefficients of others, as its products with every column.
+    """Compute the products of each column with a recording's residual under the coefficients of others.
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the others, whose `compared` coefficients are
     used. All but the leak's may differ by a prior (`nuisance`); with `has_leak` the leak's may, too, by `between.pump`.

@@ -135,7 +135,10 @@ class Signals:
         return np.asarray(self.speed >= 0.0)
 
     def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Return 1 for each interval (n - 1,) in which the piston, or the pump by its volume, stands still, else 0."""
+        """Flag the sampling intervals (n - 1,) in which the piston or the pump stands still, by 1 or 0.
+
+        `pump_volume` computes the increments of the pump's volume. Without `rest_limits` all flags are 0.
+        """
         limits = self._rest_limits
         if limits is None:
             return np.zeros_like(self.time_step)
@@ -279,7 +282,10 @@ def _motion_term(outward: bool, by_A: bool) -> Term:
 
 
 def _chamber_terms(side: str) -> tuple[Term, ...]:
-    """Make the terms of one chamber's compliance, dp and x dp, and of its free air, d(1/p), and dissolved, d ln p."""
+    """Make the terms of the compliance of one chamber and of the air in its oil.
+
+    Increments: dp and x dp of the compliance, d(1/p) of free air, d ln p of air that dissolves.
+    """
     p, name = f"p_{side}", f"compliance {side}"
     cause: Cause = "air in the oil"
     return (
@@ -441,10 +447,11 @@ _STANDSTILL = (
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of a pump's delivery while the piston displaces nothing; None if no channel gives it.
+    """Return the balance of a pump's delivery while the piston displaces nothing.
 
-    It is used over whole cycles or at standstill, so that motion and position do not enter. An offset of the flow
-    cannot be separated from leakage under a steady load, and is assumed to be zero.
+    It is used over whole cycles or at standstill, where motion and position do not enter. An offset of the flow cannot
+    be separated from leakage under a steady load, and is assumed to be zero. None if the pump does not feed the
+    chambers, or if its delivery or a chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(_PRESSURES):

@@ -50,7 +50,10 @@ def time_in_motion(speeds: Array, max_speed: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks in motion, by the `fractions` (K,) of their time (`time_in_motion`) relative to the largest."""
+    """Flag the blocks whose fraction of time in motion is large, compared with the largest one.
+
+    `fractions` (K,): of each block (`time_in_motion`).
+    """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 
@@ -85,7 +88,10 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test the features that only a change of a sensor shifts for a step; return the tests with their names."""
+    """Test features for a step that only a change of a sensor causes; return the named tests.
+
+    The result is empty without both chamber pressures, or if a block has no samples.
+    """
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
     length = len(recording) // BLOCKS
@@ -148,10 +154,10 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
 
 
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
-    """Compute a statistic of each row (K, n) of values without its missing ones; NaN for an all-NaN row.
+    """Compute a statistic of the known values of each row (K, n); NaN for a row without any.
 
-    `statistic`, `without_missing`: of complete rows, as `np.median`, and the same of others, as `np.nanmedian`, which
-    takes ten times as long.
+    `statistic`: function for complete rows, such as `np.median`; `without_missing`: function for the others, such as
+    `np.nanmedian`, which takes ten times longer.
     """
     results = np.full(len(values), np.nan)
     has_values, is_complete = (test(np.isfinite(values), axis=1) for test in (np.any, np.all))

@@ -41,7 +41,10 @@ class HealthyLevels:
     name = SIGNALS
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Estimate friction, drifts of p_A and p_B [Pa] and how unlike their spectra are, once for a recording."""
+        """Estimate friction, drifts of p_A and p_B [Pa] and the ratio of their spectra, once for a recording.
+
+        Return None without a channel or enough motion.
+        """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
@@ -72,10 +75,10 @@ def _octaves(summary: Summary) -> Octaves | None:
 
 
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
-    """Compare the logarithm of the friction with those of healthy recordings; None if too few show any.
+    """Compare the logarithm of the friction with that of healthy recordings.
 
     Friction resists the motion: its sign is that of most healthy recordings, and a value that is not clearly of that
-    sign says nothing.
+    sign says nothing. Return None if the recording, or too many of the healthy ones, have no such value.
     """
     keys, prior = ("friction_pressure", "friction_error"), CHANGES.healthy
     pressures = [tuple(float(summary[key]) for key in keys) for summary in healthy if set(keys) <= set(summary)]

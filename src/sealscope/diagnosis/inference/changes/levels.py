@@ -72,9 +72,11 @@ class LevelChange(NamedTuple):
 
 
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
-    """Compute speed, acceleration and, if recorded, position (n, 2 or 3), NaN if missing; None without a channel.
+    """Compute the columns of a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
-    Speed and acceleration are differences over a fixed time, the position is relative to its mean.
+    The speed is the difference of x or theta over a fixed time, or else omega or u itself; the acceleration is the
+    difference of the speed over that time; the position is relative to its mean. Missing values are NaN. Return None if
+    none of these channels is recorded.
     """
     name = next((name for name in ("x", "theta", "omega", "u") if name in channels), None)
     if name is None:
@@ -104,10 +106,11 @@ def _central_difference(values: Array, half_length: int) -> Array:
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate in each block the mean of p_A and of p_B, and half their differences between the directions of motion.
+    """Estimate the level of each pressure in blocks, and half its difference between directions of motion.
 
     Least squares over the moving samples: the four are free in each block, the slopes b, c and d are common to the
-    recording. Without a recorded motion the levels are means and the halves zero. Return None if a pressure is missing.
+    recording. Without a recorded motion the levels are means and the halves zero. Return None if a pressure is missing,
+    or if no length of the blocks has enough samples of both directions in each.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -150,9 +153,10 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit level_A, level_B, half_A and half_B (K, 4) to blocks of `length` samples; None if one moves one way only.
+    """Fit level_A, level_B, half_A and half_B (K, 4) to blocks of `length` samples.
 
-    `gram` (K, m, m): products of `pressure_level_rows`; `means` (2,) were subtracted from the pressures.
+    Return None if a block has too few samples of one direction. `gram` (K, m, m): products of `pressure_level_rows`;
+    `means` (2,) were subtracted from the pressures.
     """
     n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
     if n_free == 2:
@@ -171,7 +175,10 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the pressure levels of a recording for a step of each pattern, the highest rank first."""
+    """Test the pressure levels of a recording for a step of each pattern, the highest rank first.
+
+    The result is empty if the levels cannot be estimated.
+    """
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 

@@ -88,7 +88,7 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
 
 
 class DifferenceFit(NamedTuple):
-    """Fit of p_A - p_B: the pressure `friction` that reverses with the motion, and the `drop` over the speed.
+    """Fit of p_A - p_B by friction, which reverses with the motion, and a viscous drop.
 
     `friction` [Pa] and `drop` [Pa over the unit of the speed], each with its standard error.
     """

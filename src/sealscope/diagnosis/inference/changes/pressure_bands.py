@@ -42,7 +42,10 @@ class Octaves(NamedTuple):
 
 
 def compare_octaves(recording: Recording) -> Octaves | None:
-    """Compare the spectra of p_A and p_B by the module's numbers; None if the recording has too few octaves."""
+    """Compare the spectra of p_A and p_B by the log ratio of their octaves and its tilt.
+
+    Return None without both pressures, or if the recording is too short or has too few octaves.
+    """
     priors = CHANGES.octaves
     if not set(CHAMBERS) <= set(recording.channels):
         return None
@@ -59,7 +62,10 @@ def compare_octaves(recording: Recording) -> Octaves | None:
 
 
 def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
-    """Compute the logarithm of the RMS of values (n,) in octaves between `edges` (k + 1,) [Hz], from windows, (k,)."""
+    """Compute the log RMS (k,) of values (n,) in the octaves between `edges` (k + 1,) [Hz].
+
+    The spectrum is the mean over windows of `length` samples.
+    """
     starts = range(0, len(values) - length + 1, max(length // 2, 1))
     power, taper = np.zeros(length // 2 + 1), np.hanning(length)
     for start in starts:  # one at a time: all windows of a recording of hours would fill the memory
@@ -71,14 +77,15 @@ def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Ar
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
-    """Test for a filter of one pressure by both numbers and those of healthy recordings; None for too few of them.
+    """Test for a filter of one pressure, by ratio and tilt of the spectra against healthy recordings.
 
-    A change smaller than those that filters make counts against a filter.
+    A filter changes both in the same direction; a tilt smaller than filters cause counts against one. Return None for
+    too few healthy recordings.
     """
     prior, filtered = CHANGES.octaves, CHANGES.filtered
 
     def compare(values: Sequence[float], value: float) -> Observable | None:
-        """Compare one of the numbers with those of the healthy recordings."""
+        """Compare the ratio or the tilt with those of the healthy recordings."""
         estimates = [Estimate(healthy_value, prior.error) for healthy_value in values]
         scatter = PriorScatter(prior.scatter, prior.recordings)
         return compare_estimates(BESIDE, SIDES, Estimate(value, prior.error), estimates, scatter)

@@ -41,7 +41,7 @@ def _test_signals(recording: Recording) -> Observed:
 
 
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
-    """Collect the observables of tests, without those of a test that fails on values that overflow."""
+    """Collect the observables of all tests; a test that fails on overflowing values stops there."""
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
@@ -54,9 +54,9 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield the step of the duty, if command and motion change by similar ratios; a leak changes only one of them.
+    """Yield the step of the duty, if command and motion change by similar ratios.
 
-    `tests`: of the log amplitudes of command and motion.
+    A leak changes only one of them. `tests`: of the log amplitudes of command and motion.
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -73,7 +73,7 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 
 
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert the named tests of `sensor_tests` to observables; each test is one of a rise and a fall."""
+    """Convert the named tests of `sensor_tests`, each the better of a rise and a fall, to observables."""
     for name, test in tests:
         data = name.split()[0]
         yield Observable.from_test(name, data if data in ("noise", "hum") else "sense", test, n_tests=2.0)

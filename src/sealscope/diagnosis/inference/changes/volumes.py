@@ -47,12 +47,12 @@ def volume_observables(
     oil_loss: Mapping[str, StepTest],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Test every term's coefficient for a step, up or down; leaks only grow.
+    """Test the coefficients of the balance's terms for a step, up or down, or only up for leaks.
 
-    `blocks`, with the offset of p_A - p_B removed, are for the tests of leaks, `plain` ones, with the pressures as
-    recorded, for all other terms; `oil_loss`: tests of the oil that the accumulator lost, by the name of the external
-    leak's term; `volume_ratio`: measured over assumed ratio of area to displacement. The result with the largest score
-    is the first.
+    Leaks are also tested under other laws, the motion by its scale. `blocks`, with the offset of p_A - p_B removed, are
+    for the tests of leaks, `plain` ones, with the pressures as recorded, for all other terms; `oil_loss`: tests of the
+    oil that the accumulator lost, by the name of the external leak's term; `volume_ratio`: measured over assumed ratio
+    of area to displacement. The result with the largest score is the first.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -77,7 +77,10 @@ def volume_observables(
 
 
 def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, volume_ratio: float) -> float:
-    """Compute -2 log of the prior of a step's size, relative to its maximum, for the term `name`; 0 without a prior."""
+    """Compute -2 log of the prior density of a step's size, relative to its maximum, for the term `name`.
+
+    It is 0 for a term without a prior on the size.
+    """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
     if name == AIR:
@@ -129,14 +132,21 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
 
 
 def _observable_name(term: Term) -> str:
-    """Return the name of the observable of a term: the flow offset is a loss if the flow has no sensor offset."""
+    """Return the name of the observable of a term.
+
+    A step of the flow offset is an external leak if the flow's sensor has no offset, else a zero error of the flow.
+    """
     if term.name != BIAS:
         return term.name
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
 
 
 def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
-    """Compute the root mean square of a term's increments over that of time: a mean pressure [Pa]."""
+    """Compute the root mean square of the pressure [Pa] that drives a term.
+
+    It is that of the term's increments over that of the sampling intervals; if the balance has no flow offset, the mean
+    of abs(p_A - p_B) instead.
+    """
     if roles.bias is None:
         return float(np.mean(blocks.mean_pressure()))
     energy = np.einsum("keii->i", blocks.gram)
@@ -144,7 +154,7 @@ def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
 
 
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
-    """Compute twice the log likelihood ratio of the accumulator's data with an external leak's step against without it.
+    """Compute twice the log likelihood ratio of an external leak to none, by the accumulator's data.
 
     `balance_test`: of the step by the balance; `accumulator_test`: by the oil that the accumulator lost.
     """

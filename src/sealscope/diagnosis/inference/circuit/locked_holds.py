@@ -79,14 +79,17 @@ class LockedHold(NamedTuple):
         return np.asarray(sums / np.diff(self.edges))
 
     def steepest_time(self) -> float:
-        """Return the time [s] after which p_A - p_B changes most within the time of equalisation by a large leak."""
+        """Find the time [s] after which p_A - p_B changes most.
+
+        The change is taken over the time in which a large leak equalises the pressures.
+        """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.p_A - self.p_B
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
-    """Find the holds of a recording: rests of the pump without the time in which valves shut or open.
+    """Find the holds of a recording: rests of the pump, less the time in which valves shut or open.
 
     `channels`: time, absolute pressures of A and B, and position, (n,) each; `rests` (n - 1,): flags of the intervals
     at rest. Holds too short for `MIN_READINGS`, or with missing samples, are omitted.
@@ -156,7 +159,10 @@ class _LeakRegression(NamedTuple):
 
 
 class HeldLeaks(NamedTuple):
-    """Mean leaks during holds, past the `piston` and from A and B to the outside, each with its standard deviation."""
+    """Mean leaks in a recording with holds, each with its standard deviation [m^3/(s Pa)].
+
+    They lead past the `piston`, and from A and B to the outside; flows are those by the assumed displacement.
+    """
 
     piston: float
     deviation: float
@@ -298,12 +304,18 @@ class HeldChambers:
         return self._fit(without, False), self._fit(refilled, True)
 
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
-        """Fit a leak past the piston from `onset` [s] on, by a power of p_A - p_B minus its offset [Pa]."""
+        """Fit a leak past the piston from `onset` [s] on.
+
+        Its flow is a power of p_A - p_B minus the `offset` [Pa], of the given `exponent`.
+        """
         fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
         return fit._replace(likelihood=fit.likelihood - 0.5 * offset_cost(offset))
 
     def leaks_since(self, onset: float) -> Array | None:
-        """Return `leaks` (6,) with the piston's leak since `onset` [s] instead of its mean; None if no hold follows."""
+        """Return `leaks` (6,) with the piston's leak since `onset` [s] instead of its mean.
+
+        Return None if no hold shows a flow after the onset.
+        """
         fits = self._fits_over_offsets(onset)
         if not fits:
             return None
@@ -333,9 +345,10 @@ class HeldChambers:
 
     @cached_property
     def onsets(self) -> Array:
-        """Possible onsets [s]: the beginning of the recording, between the holds, and within each.
+        """Possible onsets of a leak [s], in order of time.
 
-        As a large leak equalises the pressures at once, each hold has an onset where p_A - p_B changes most.
+        They are the beginning of the recording, and times between the holds and within each. As a large leak equalises
+        the pressures at once, each hold has an onset where p_A - p_B changes most.
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
@@ -346,7 +359,7 @@ class HeldChambers:
 
     @cached_property
     def _onset_log_priors(self) -> Array:
-        """Log prior of each onset: half of all leaks are there from the start."""
+        """Log prior of each of `onsets`, as half of all leaks are there from the start."""
         n_later = len(self.onsets) - 1
         return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
 
@@ -383,7 +396,11 @@ class HeldChambers:
 
     @cached_property
     def _offset_grid(self) -> Array:
-        """Grid of offsets of p_A - p_B [Pa], and the last difference of each hold, which a leak makes the offset."""
+        """Candidates of the offset of p_A - p_B [Pa], in ascending order.
+
+        They are a fixed grid and the last difference of each hold, since a leak equalises the pressures down to the
+        offset.
+        """
         ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
@@ -423,7 +440,10 @@ class HeldChambers:
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Leaks past the piston and to the outside, means over the recording, each weighted by its probability."""
+        """Mean leaks over the recording, past the piston and to the outside, weighted by their probabilities.
+
+        The standard deviations are not weighted.
+        """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
             mean = leak.fraction_after * leak.fit.value
@@ -435,7 +455,7 @@ class HeldChambers:
 
     @property
     def piston_leak(self) -> LeakHypothesis:
-        """Hypothesis of a leak past the piston."""
+        """Hypothesis of a leak past the piston, with its probability and fit."""
         return self._leak_hypotheses[0]
 
     @property

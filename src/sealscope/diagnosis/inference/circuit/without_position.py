@@ -44,7 +44,7 @@ _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
 
 class CycleBalance(NamedTuple):
-    """A balance without a position, or without flow, over a recording.
+    """Balance over whole cycles or over holds, of a recording without a position or without the flow.
 
     `oil_loss`: step tests of the external leak of either side by the accumulator, by term name.
     """
@@ -58,7 +58,8 @@ class CycleBalance(NamedTuple):
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     """Build the balances of a recording over whole cycles and over holds.
 
-    With a position but no channel for the flow, over holds by shut valves only. Empty if none is possible.
+    A recording with a position needs shut valves, and gives the balance over holds alone. The list is empty if no
+    balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
@@ -142,10 +143,11 @@ def _build_blocks(
 
 
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
-    """Average the increments of c columns, (n,) each, over triangular windows of a `half_width` [s], as mean rates.
+    """Average the increments of c columns, (n,) each, over triangular windows, as mean rates.
 
-    Neighbouring windows are half of it apart; a row with samples that are not `is_used` is flagged as not whole. The
-    integral over a triangle is the second difference of the twice integrated increments.
+    The windows have a `half_width` [s], and neighbours are half of that apart; a row with samples that are not
+    `is_used` is flagged as not whole. The integral over a triangle is the second difference of the twice integrated
+    increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)

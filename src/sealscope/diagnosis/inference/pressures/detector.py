@@ -25,7 +25,7 @@ RESPONSE = "response"
 
 
 class PressureResponse:
-    """Leakage from both chamber pressures and the command, by how p_A - p_B responds to the command."""
+    """Leak detector without a position, by the response of p_A - p_B to the command."""
 
     name = PRESSURE_RESPONSE
 
@@ -33,7 +33,7 @@ class PressureResponse:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the recording has what the response needs, else the reason why not."""
+        """Return the reason why the recording does not suffice for the response; None if it does."""
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:

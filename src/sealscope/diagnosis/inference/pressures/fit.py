@@ -33,7 +33,7 @@ class Normal(NamedTuple):
     unit: Array
 
     def deviations(self, theta: Array) -> Array:
-        """Compute the differences of parameters (..., p) from the mean, in units."""
+        """Compute the differences of parameters (..., p) from the prior mean, in multiples of `unit`."""
         return (theta - self.mean) / self.unit
 
 
@@ -51,16 +51,16 @@ class Priors(NamedTuple):
 
     @property
     def normal(self) -> Normal:
-        """Prior on a machine before its first block."""
+        """Normal prior on the parameters before the first block."""
         return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)
 
     @property
     def variance(self) -> Array:
-        """Variances (p,) of the mean, in units."""
+        """Prior variances (p,) of the parameters before the first block, in squares of `unit`."""
         return np.asarray((self.width / self.unit) ** 2)
 
     def wander_variance(self, seconds: float) -> Array:
-        """Return the variances (p,), in units, that the parameters' random walks add in a time [s]."""
+        """Return the variances (p,) that random walks add in a time [s], in squares of `unit`."""
         return np.asarray((self.wander / self.unit) ** 2 * (seconds / PRESSURE.blocks.wander))
 
 
@@ -158,9 +158,10 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the residual variance [Pa^2] at `deviations` (K p,), and its inflation by correlation of the noise.
+    """Compute the variance of the residual [Pa^2], and its inflation by the correlation of the noise.
 
-    The inflation is the variance of the scores of one `parameter`, relative to that under white noise, at least 1.
+    `deviations` (K p,): of the parameters from those of the blocks, in units. The inflation is the variance of the
+    scores of one `parameter`, relative to that under white noise, at least 1.
     """
     # (1, -deviation) times residual and Jacobian is the residual at these deviations
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

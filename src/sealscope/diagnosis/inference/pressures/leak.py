@@ -95,7 +95,7 @@ class ResponseLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a conductance of one, at the recording's pressures."""
+        """Mean flow [m^3/s] of a leak of 1 m^3/(s Pa) at the recording's pressures."""
         return float(self.pressure.mean())
 
     @cached_property
@@ -111,7 +111,10 @@ class ResponseLeak:
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the mean flow [m^3/s] of a leak through an orifice: of its rise, else of a step."""
+        """95 % upper bound of the mean flow [m^3/s] of a leak through an orifice.
+
+        With healthy recordings it bounds the rise over them, otherwise a step; infinite if nothing was tested.
+        """
         test = self.step if self.rise is None else self.rise
         if test is None:
             return np.inf
@@ -120,9 +123,10 @@ class ResponseLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Rise over the healthy recordings; None without any.
+        """Rise over the healthy recordings, and the evidence that the fitted step caused it.
 
-        With the log likelihood ratio, to no rise, of the rise that the fitted step would cause in the mean.
+        `step_log_ratio` compares the rise of the mean that the step would cause with no rise. None without healthy
+        recordings.
         """
         if self.rise is None:
             return None
@@ -157,7 +161,10 @@ class ResponseLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage [L/min] above that before an onset [s], with its 95 % interval; None without an onset."""
+        """Return the growth of the leakage since an onset [s], in L/min with its 95 % interval.
+
+        Return None without an onset or a step test, or if the rig does not state the sizes.
+        """
         if onset_s is None or self.step is None or not self.stated:
             return None
         time = self.information.time

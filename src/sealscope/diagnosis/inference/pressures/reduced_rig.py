@@ -57,7 +57,10 @@ _MAX_STEP, _SEGMENT = 1.01e-3, 256
 
 @contracted
 def _direction_factor(v: float, theta: Parameters) -> float:
-    """Compute the friction's factor of direction: 1 + theta[SIDE] for motion out, 1 - theta[SIDE] for motion in."""
+    """Compute the factor by which friction depends on the direction of motion.
+
+    It is 1 + theta[SIDE] for motion out, 1 - theta[SIDE] for motion in.
+    """
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
 

@@ -136,7 +136,10 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the slopes of lead, lag and scale (3, n) from the simulated p_A - p_B (n,), without a simulation."""
+        """Compute the slopes (3, n) of lead, lag and scale from the simulated p_A - p_B (n,).
+
+        They need no further simulation.
+        """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
         by_lead = theta[SCALE] * self.machine.rate * change
@@ -261,7 +264,10 @@ class Follower:
 
     @staticmethod
     def fit_start(recording: Recording, rig: Rig) -> Follower:
-        """Fit a follower to the first seconds of a recording, with the law of friction that fits better."""
+        """Fit a follower to the first seconds of a recording.
+
+        The friction is Stribeck's, or LuGre's if Stribeck's does not explain the samples and LuGre's fits better.
+        """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
@@ -301,7 +307,7 @@ class Follower:
         return follower
 
     def interrupt(self, gap_s: float) -> None:
-        """Widen the covariance after a gap of `gap_s` [s] without samples, at most by that of the prior."""
+        """Widen the covariance after a gap of `gap_s` [s] without samples, by at most the prior variance."""
         added = np.minimum(self.priors.wander_variance(gap_s), self.priors.variance)
         self.covariance, self.last = self.covariance + np.diag(added), math.nan
 
@@ -319,7 +325,10 @@ class Follower:
         return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
-        """Compute the prior on the parameters in a block of `block_s` [s]; `jumped`: as uncertain as at the start."""
+        """Compute the prior on the parameters in the next block, of `block_s` [s].
+
+        `jumped`: index of a parameter that may have jumped, whose prior variance at the start is added.
+        """
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
             variance[jumped] += self.priors.variance[jumped]

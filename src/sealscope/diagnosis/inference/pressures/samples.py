@@ -48,15 +48,16 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
 
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:
-    """Return the sample indices (K + 1,) between which the blocks of a recording lie."""
+    """Return the sample indices (K + 1,) at which the blocks of a recording begin and end."""
     n_blocks = max(1, min(PRESSURE.blocks.most, int(recording.duration / PRESSURE.blocks.shortest)))
     return np.round(np.linspace(0, len(recording), n_blocks + 1)).astype(np.int64)
 
 
 def mains_waves(total: Array, rate: float) -> Array:
-    """Build cosines and sines (2 m, n) of the mains hum: of 50 and 60 Hz, as found in p_A + p_B, and their harmonics.
+    """Build cosines and sines (2 m, n) of the mains hum and its harmonics.
 
-    `total` (n,): p_A + p_B, whose spectrum has the exact frequencies; only those below half the `rate` are built.
+    The fundamentals are the strongest lines near 50 and 60 Hz in the spectrum of p_A + p_B, `total` (n,). Only waves
+    below half the `rate` [Hz] are built.
     """
     n_padded = 4 * total.size  # zero-padded for a finer grid of frequencies
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), n_padded))

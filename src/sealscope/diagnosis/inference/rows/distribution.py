@@ -21,10 +21,10 @@ _ORDER = 6
 
 
 def sorted_part_means(pressure: Array, rate: float) -> Array:
-    """Compute the means of `PARTS` equal parts of the sorted samples of a pressure [Pa]; zeros if all are missing.
+    """Compute the means of `PARTS` equal parts of the sorted samples of a pressure [Pa].
 
-    White noise is removed from the samples before. `pressure` (n,): NaN where missing; samples after the last whole
-    stride of the weak form are omitted.
+    White noise is first removed. `pressure` (n,): NaN where missing; samples after the last whole stride of the weak
+    form are omitted. The means are zeros if all samples are missing.
     """
     # lengths [samples] of the means of the pressure, and of the strides within which the noise is removed
     piece, stride = max(1, round(SMOOTHED * rate)), min(stride_samples(rate), max(len(pressure), 1))

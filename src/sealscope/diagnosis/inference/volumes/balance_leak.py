@@ -37,10 +37,10 @@ from sealscope.units import LITRE_PER_MINUTE
 
 
 class _HoldLaws(NamedTuple):
-    """Leak past the piston fitted to holds, under each of `EXPONENTS` (k,).
+    """Leak past the piston, fitted to the holds under each leak law of `EXPONENTS` (k,).
 
-    `weights`: likelihoods, normalised; `units`: mean flow of a unit coefficient; `flows` and their `deviations`
-    [m^3/s].
+    `weights`: likelihood of each law, of sum 1; `units`: mean flow for a coefficient of 1; `flows`: fitted mean flows
+    and their standard `deviations` [m^3/s].
     """
 
     weights: Array
@@ -71,7 +71,11 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak: the piston, if behind a servo valve or if holds show the rise; else piston or pump."""
+        """Cause of a leak, either the piston alone or "piston or pump".
+
+        The piston alone is named behind a servo valve, and if holds measure the rise while either the pump is cut off
+        at rest or the rise is too rare for a healthy machine.
+        """
         hold_rise = self._hold_rise
         in_holds = hold_rise is not None and (self.balance.shut or hold_rise.chance < INFERENCE.held_oil.rare)
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
@@ -79,12 +83,15 @@ class BalanceLeak:
 
     @property
     def step(self) -> StepTest | None:
-        """Test of a step of the leakage."""
+        """Test of a step of the leakage; None if too few blocks have information."""
         return self.balance.test
 
     @cached_property
     def step_flow(self) -> Flow:
-        """Mean flow of the step after its onset, averaged over laws, growths and onsets."""
+        """Mean flow [m^3/s] of the step after its onset, averaged over leak laws, growths and onsets.
+
+        Without a step test it is 0 with an infinite standard error.
+        """
         balance, test = self.balance, self.balance.test
         if test is None:
             return Flow(0.0, np.inf)
@@ -94,7 +101,7 @@ class BalanceLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a conductance of one, at the recording's pressures."""
+        """Mean flow [m^3/s] of a leak of 1 m^3/(s Pa) at the recording's pressures."""
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
@@ -129,7 +136,7 @@ class BalanceLeak:
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow of the rise after its onset; the total leakage if there are no healthy recordings."""
+        """Mean flow [m^3/s] of the rise after its onset; the total leakage without healthy recordings."""
         balance = self.balance
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * end for end in balance.conductance)
@@ -153,7 +160,10 @@ class BalanceLeak:
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset of the rise within the recording, dated by holds; None if it may have been there from the start."""
+        """Onset [s] of the rise within the recording, dated by holds.
+
+        None if holds do not clearly show the rise, or if the leak may have been there from the start.
+        """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
             return None
@@ -179,7 +189,7 @@ class BalanceLeak:
         return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
-        """Compute mean flow of a unit rise of the leak coefficient and log weight of each leak law of `EXPONENTS`.
+        """Compute the mean flow per unit rise, and the log weight, of each leak law of `EXPONENTS`.
 
         A law of exponent n lies the fraction f = 2 (1 - n) of the way from laminar to orifice flow: its flow is
         laminar^(1 - f) orifice^f, its log weight log prior + f N (log likelihood ratio of one reading), N the number of
@@ -200,7 +210,11 @@ class BalanceLeak:
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit in the rig's file, over its standard deviation; None if no limit applies."""
+        """Total leakage above the limit in the rig's file, in standard deviations of the leakage.
+
+        None if the file states no limit or no size, if no channel measures the flow of a pump-controlled cylinder, or
+        if healthy recordings are compared instead.
+        """
         balance = self.balance
         limit = healthy_leakage(balance.rig)
         # without a measured flow, the drive's droop under load looks like leakage
@@ -263,9 +277,10 @@ class BalanceLeak:
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Rise over healthy recordings, with the log likelihood ratio of the step's part; None without recordings.
+        """Rise over healthy recordings, and the evidence that the step within the recording caused it.
 
-        Holds after the step's onset show the whole step; without such holds, the whole recording shows a part of it.
+        `step_log_ratio` compares the rise that the step would cause with no rise. Holds after the step's onset show the
+        whole step; without such holds, the mean of the recording shows a part of it. None without healthy recordings.
         """
         step, rise, motion_rise = self.step, self.rise, self._motion_rise
         if rise is None or motion_rise is None or step is None:
@@ -302,11 +317,14 @@ class BalanceLeak:
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured displacement over area, relative to the assumed ratio."""
+        """Measured ratio of displacement to area, relative to the assumed one; None if it is not measured."""
         return self.balance.size.ratio
 
     def relative(self, flow: Flow) -> RelativeLeak:
-        """Return a flow relative to the pump's mean flow, and as a creep speed of the piston."""
+        """Convert a flow to a fraction of the pump's mean flow and to a creep speed of the piston.
+
+        Each has a 95 % interval. They are None if the pump's flow is zero or the piston's area unknown.
+        """
         pump_flow, area = self.balance.mean_flow, self.balance.size.area
         half_width = WITHIN_95 * flow.deviation
         interval = (flow.value - half_width, flow.value + half_width)
@@ -318,7 +336,10 @@ class BalanceLeak:
         )
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return the total leakage of pump and piston; `detectable_flow`: smallest step that is detected [m^3/s]."""
+        """Return the total leakage of pump and piston.
+
+        `detectable_flow`: smallest step that would be detected [m^3/s], None if no step was tested.
+        """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
         value, low, high = balance.conductance
@@ -339,7 +360,10 @@ class BalanceLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the history of the leakage: its growth since the onset, or the total leakage without an onset."""
+        """Return the history of the leakage [L/min] with its 95 % interval; None if no size is stated.
+
+        After an onset [s] it is the growth of the leak since then; without an onset, the total leakage.
+        """
         balance = self.balance
         if not balance.size.stated:
             return None
@@ -393,7 +417,10 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
 
 def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
-    """Divide an interval, cut off at zero, by a divisor; None if the divisor is None or not positive."""
+    """Divide an interval by a divisor, after raising a negative lower end to zero.
+
+    Return None if the divisor is None or not positive.
+    """
     if divisor is None or not divisor > 0.0:
         return None
     return max(interval[0], 0.0) / divisor, interval[1] / divisor

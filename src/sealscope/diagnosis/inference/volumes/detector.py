@@ -65,13 +65,16 @@ MIN_STRIDE = 2
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Test whether the pump delivers more than any pump's minimum leakage, as it does if a loop holds the piston."""
+    """Test whether the leakage surely exceeds a minimum fraction of the pump's mean flow.
+
+    It does if a control loop holds the piston, since the pump then delivers little more than the leakage.
+    """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
 
 
 class VolumeBalance:
-    """Leakage from the balance of volumes: what the pump delivers and the piston does not displace.
+    """Leak detector by the volume balance, the flow of the pump that the piston does not displace.
 
     It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
     position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
@@ -84,7 +87,7 @@ class VolumeBalance:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the recording has what the balance needs, else the reason why not."""
+        """Return the reason why the recording does not suffice for the balance; None if it does."""
         channels = frozenset(recording.channels)
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             if self.rig.circuit.valve_controlled:
@@ -140,7 +143,7 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks of a recording once."""
+        """Compute the blocks of a recording, only once; None if it allows no balance with a position."""
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
@@ -229,9 +232,9 @@ class VolumeBalance:
         )
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Observe a recording without healthy ones, under both hypotheses on what valves do while the pump rests.
+        """Report on a recording without healthy ones, under both hypotheses on the valves at rest.
 
-        Key False: they leave the pump in the circuit; True: they cut it off, if the recording has rests.
+        Key False: the valves leave the resting pump in the circuit; True: they cut it off, if the recording has rests.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         blocks = self._recorded(recording) if has_position_balance else None
@@ -243,7 +246,10 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Report the observables and the leak of a balance, and how much of the recording it judges."""
+        """Report the tests and the leak of a balance, and the fraction of the recording that it judges.
+
+        The report is empty, with the reason, if neither a step nor a rise of the leak can be tested.
+        """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
@@ -282,9 +288,10 @@ def compare_motion(
 
 
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
-    """Test whether the mean log odds of healthy recordings show that valves cut the pump off at rest.
+    """Test whether healthy recordings show that valves cut the pump off at rest.
 
-    `odds_key`: of the summaries, "shut_odds" (balance over all rests) or "held_odds" (holds of a load alone).
+    Their mean log odds must exceed a limit. `odds_key`: entry of the summaries, "shut_odds" (balance over all rests) or
+    "held_odds" (holds of a load alone); False if no summary has it.
     """
     log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
     return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked

@@ -59,9 +59,10 @@ END_QUANTILE = 0.02
 
 
 class Size(NamedTuple):
-    """Factor `scale` from a flow by the assumed displacement to the machine's, with its relative standard `deviation`.
+    """Scale of the machine's flows, and the sizes that it follows from.
 
-    `stated`: whether L/min can be stated; `ratio`: measured displacement over area relative to the assumed ratio, None
+    `scale`: flow of the machine over that by the assumed displacement, with its relative standard `deviation`;
+    `stated`: True if L/min can be stated; `ratio`: measured displacement over area relative to the assumed ratio, None
     if the position has no unit; `area` of the piston by the assumed displacement [m^2]; `disagrees`: stated
     displacement and area contradict each other.
     """
@@ -95,7 +96,7 @@ class RecordedBalance:
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
-        """Channels with their units."""
+        """Pairs of the name and the unit of each channel."""
         return frozenset(self.recording.units.items())
 
     @cached_property
@@ -108,23 +109,24 @@ class RecordedBalance:
     def running_blocks(self) -> Blocks:
         """Blocks from the first motion on, in which steps are sought.
 
-        Before it a machine may be off, its valves shut; that the pump then begins to hold the load is no leak.
+        Before the first motion the machine may be off with its valves shut. The flow with which the pump then begins to
+        hold the load is no leak.
         """
         return self.blocks[self._first_motion :]
 
     @cached_property
     def leak(self) -> Information:
-        """Likelihood of the leak's coefficient in the `running_blocks` blocks."""
+        """Likelihood of the leak's coefficient in each of the `running_blocks`."""
         return information(self.running_blocks, self.columns, self.columns[0].leak)
 
     @cached_property
     def test(self) -> StepTest | None:
-        """Test of a step of the leak's coefficient."""
+        """Test of a step of the leak's coefficient; None if too few blocks have information."""
         return step_test(self.leak)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
-        """Steps of all terms' coefficients, the most likely first."""
+        """Tests of steps of the terms' coefficients, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         return volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio
@@ -195,9 +197,10 @@ class RecordedBalance:
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
 
     def locked_odds(self) -> float | None:
-        """Compute the log odds, by the leaks in holds, that valves shut the chambers; None without holds.
+        """Compute the log odds that valves shut the chambers in holds; None without holds.
 
-        Without such valves the oil passes the resting pump as it passes the turning one.
+        The leaks in holds are compared with the total leakage: through open valves the resting pump would leak like the
+        turning one.
         """
         if self.chambers is None:
             return None
@@ -250,12 +253,15 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Offset of p_A - p_B [Pa], estimated from a change of the leak."""
+        """Sensor offset of p_A - p_B [Pa], which only a change of the leak reveals."""
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
     def position_delay(self) -> Estimate | None:
-        """Delay of x behind the flow [s]: coefficient of the lag over the area."""
+        """Delay of x behind the flow [s], from the coefficient of the lag over the area.
+
+        None if the balance has no lag or no motion, or if the measured area is not positive.
+        """
         roles = self.columns[0]
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
         if LAG not in roles.names or not motion:
@@ -265,7 +271,7 @@ class RecordedBalance:
         return Estimate(value / area, deviation / area) if area > 0.0 else None
 
     def mean_pressure(self, since: float = -np.inf) -> float:
-        """Compute the mean of abs(p_A - p_B), offset removed [Pa], over the blocks whose middle is `since` or later."""
+        """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, sensor offset removed."""
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     @cached_property
@@ -274,7 +280,10 @@ class RecordedBalance:
         return self.mean_of_blocks(self.blocks.flow)
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average values of the blocks (K,), by number of rows, over those whose middle is `since` or later."""
+        """Average values of the blocks (K,) from the time `since` [s] on, weighted by their numbers of rows.
+
+        A block counts if its middle is `since` or later; if none is, the last block counts.
+        """
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
@@ -282,7 +291,7 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Scale from a flow by the assumed displacement to that of the machine."""
+        """Scale of the machine's flows, relative to those by the assumed displacement."""
         return _flow_scale(self)
 
     @cached_property
@@ -309,7 +318,7 @@ class RecordedBalance:
 
 
 def _flow_scale(balance: RecordedBalance) -> Size:
-    """Determine the scale of flows and its uncertainty from what the rig states of displacement and area.
+    """Determine the scale of flows and its uncertainty from the stated displacement and area.
 
     A flow meter needs no scale. Otherwise the balance measures the ratio of displacement and area: a stated
     displacement scales every flow directly, a stated area through that ratio; if both are stated and disagree, the

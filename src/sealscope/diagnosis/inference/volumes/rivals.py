@@ -32,9 +32,10 @@ def rival_rises(
     columns: Sequence[ColumnRoles],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Compare the coefficients of external leaks, the turning pump's leak and free air with the healthy recordings.
+    """Compare the coefficients of rival causes with their values in healthy recordings.
 
-    `volume_ratio`: measured over assumed ratio of area to displacement.
+    The rivals are external leaks, the leak of the turning pump, and free air. If holds show the external leaks, these
+    are compared during holds (`held_rivals`). `volume_ratio`: measured over assumed ratio of area to displacement.
     """
     names, hold_rivals = columns[0].names, held_rivals(judged, healthy)
     turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
@@ -90,7 +91,7 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Set the advantage of an external leak to minus the penalty of its flow, as a large leak would be noticed."""
+    """Set the advantage of an external leak by the prior on its flow, as a large leak would be noticed."""
     return replace(
         observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
     )
