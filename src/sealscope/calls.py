@@ -22,7 +22,10 @@ _MAX_WORD = 200
 
 
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
-    """Find up to `count` of the known words with a similarity to `word` of at least `share` (difflib's ratio)."""
+    """Find up to `count` known words that are similar to `word`, the most similar first.
+
+    `share`: smallest similarity, as ratio of difflib. Empty if none is similar, or if `word` is very long.
+    """
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
 
@@ -65,16 +68,19 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
-    """Declare an argument as a dataclass field; `kind`: type in words, `text`: meaning, `unit`: SI unit of a number."""
+    """Declare an argument of a function as a dataclass field.
+
+    `kind`: its type in words; `text`: its meaning; `unit`: SI unit of a number, else empty.
+    """
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
     )
 
 
 def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
-    """Build a decorator that lets a function of the dataclass `declared` take its fields as arguments.
+    """Build a decorator that makes a function of one dataclass take its fields as arguments.
 
-    The fields, declared by `argument`, replace the dataclass in signature and docstring.
+    `declared`: the dataclass. Its fields, declared by `argument`, replace it in signature and docstring.
     """
     lines: list[str] = []
     for declared_field in fields(declared):  # type: ignore[arg-type]

@@ -57,7 +57,7 @@ def is_known_version(version: str) -> bool:
 
 @cache
 def _compiler() -> ModuleType:
-    """Import the module that compiles: with numba's private classes if this version's are known, else without."""
+    """Import the compiler, `numba_private` for a known version of numba, else `numba_pipeline`."""
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -81,7 +81,10 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Choose the folder for compiled code; None if caching is turned off."""
+    """Choose the folder for compiled code.
+
+    None if caching is turned off or the user has no home folder.
+    """
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
         return Path(setting) if setting else None
@@ -90,7 +93,10 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove the folders in `kernels` except `current` and the `_MAX_GENERATIONS` - 1 most recently used others."""
+    """Remove old folders of compiled code in `kernels`.
+
+    Keeps `current` and the `_MAX_GENERATIONS` - 1 most recently used others.
+    """
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
         key=lambda entry: entry.stat().st_mtime,
@@ -101,7 +107,10 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a directory, no link, of this user, without `forbidden` mode bits."""
+    """Raise PermissionError unless `folder` is a private directory of this user, and no link.
+
+    `forbidden`: mode bits that must not be set. On Windows all folders pass.
+    """
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
         return
@@ -151,7 +160,10 @@ def cache_directory() -> Path | None:
 
 
 def kernel(function: _F, fastmath: Any = False) -> _F:
-    """Compile `function` without Python objects and GIL, with the safe cache; float errors follow IEEE 754."""
+    """Compile a function that runs without Python objects and the GIL, and cache its code.
+
+    By default floating-point errors follow IEEE 754; `fastmath`: numba's flags that relax it.
+    """
     return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
 
 
@@ -182,7 +194,7 @@ def contracted(function: _F) -> _F:
 
 
 class Entry:
-    """A function double f(double *memory, double *input), compiled when its address is first requested, and cached."""
+    """A function double f(double *memory, double *input), compiled when its address is first requested."""
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
@@ -232,7 +244,10 @@ def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
 
 
 def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> np.recarray[Any, Any]:
-    """Make a record array (1,); each field is from `values`, else from the attribute of `source`, else zero."""
+    """Make a record array (1,) with the dtype `layout`.
+
+    Each field is taken from `values`, else from the attribute of `source` with its name, else zero.
+    """
     record = np.zeros(1, layout).view(np.recarray)
     for name in layout.fields or ():
         record[name] = values.get(name, getattr(source, name, 0.0))

@@ -25,7 +25,11 @@ LEAK = "0.0042 L/min from 30 s"
 
 @dataclass(frozen=True)
 class Demo:
-    """Results of the demo: the machine, diagnoses of a healthy and a leaking recording, the truth, and the files."""
+    """Results of the demo.
+
+    `healthy`, `diagnosis`: diagnoses of a healthy and of the leaking recording; `truth`: the simulated leak; then the
+    files of machine, leaking recording and page.
+    """
 
     machine: CommissionedMachine
     healthy: Diagnosis

@@ -11,7 +11,10 @@ _MAX_BEGINNING, _MAX_END = 1500, 2500
 
 
 def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
-    """Replace unprintable characters, which may control a terminal, by `instead`, except those in `kept`."""
+    """Replace unprintable characters, which may control a terminal, by `instead`.
+
+    Those in `kept` stay.
+    """
     return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
 

@@ -53,9 +53,10 @@ _simulation_lock = Lock()
 
 
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
-    """Build a source for each actuator that has `simulate`; raise InputError if its settings make no experiment.
+    """Build a simulated source for each actuator whose settings contain `simulate`.
 
-    `say`: called when a simulation begins, and when its time is over.
+    `say`: called with a message when a simulation begins, and when its time is over. Raises InputError if the settings
+    make no experiment.
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
@@ -76,7 +77,10 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 
 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
-    """Make an actuator's source: it simulates, and delivers in scaled real time the blocks that are not yet stored."""
+    """Make the source of an actuator that simulates it, and delivers its blocks in scaled real time.
+
+    Blocks that the store already has are left out. `say`: prints messages.
+    """
 
     def play(receiver: BlockReceiver) -> None:
         """Simulate if the store lacks any block, and deliver each missing block when its time has passed."""

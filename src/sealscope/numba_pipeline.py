@@ -36,10 +36,11 @@ EXTENSION_NAMES = {
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
 class ConstantLengths(FunctionPass):  # type: ignore[misc]
-    """Compiler pass that replaces len(p.law) by a constant, for an argument `p` that is a named tuple or record.
+    """Compiler pass that replaces the length of a tuple or array in an argument by a constant.
 
-    `law` is a tuple or array; the len of an argument that is a tuple is replaced, too. Branches on the length are then
-    decided before types are inferred, and an absent law is not compiled.
+    In len(p.law), `p` is an argument that is a named tuple or record, and `law` a tuple or array; the len of an
+    argument that is a tuple is replaced, too. Branches on the length are then decided before types are inferred, and an
+    absent law is not compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -66,7 +67,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return kind.typeof(source.attr) if isinstance(kind, types.Record) and source.attr in kind.fields else None
 
         def find_length(value: Any) -> int | None:
-            """Compute the length in a call of `len`; None for other expressions or unknown lengths."""
+            """Find the constant value of a call of `len`; None for other expressions or unknown lengths."""
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:

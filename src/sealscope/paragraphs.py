@@ -28,7 +28,10 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Format rows (label, text) as paragraphs after labels of width `columns`; empty texts are omitted."""
+    """Format rows (label, text) as paragraphs with labels `columns` wide.
+
+    Rows without a text are omitted.
+    """
     return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]
 
 
@@ -39,7 +42,10 @@ def format_count(count: int, noun: str) -> str:
 
 
 def join_names(names: Iterable[str], most: int = 12) -> str:
-    """Join at most `most` names, and the number of the rest; cut a name to `WIDTH` characters; "none" for no names."""
+    """Join up to `most` names by commas, followed by the number of the rest.
+
+    "none" if there are no names. Each name is cut to `WIDTH` characters.
+    """
     names = list(names)
     joined = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])
     return f"{joined} and {len(names) - most} more" if len(names) > most else joined or "none"

@@ -40,7 +40,10 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 
 
 class Unit(NamedTuple):
-    """SI value = (value + offset) * factor * pi**pi_power, in the product of `powers` of base units."""
+    """A unit of measurement, with an exact conversion to SI.
+
+    SI value = (value + offset) * factor * pi**pi_power, in the product of `powers` of base units.
+    """
 
     factor: Fraction = Fraction(1)
     pi_power: Fraction = Fraction(0)
@@ -69,7 +72,10 @@ def _build_unit(row: Mapping[str, Any]) -> Unit:
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Make the unit of an absolute pressure; its offset subtracts one atmosphere, as all pressures inside are gauge."""
+    """Make the absolute-pressure version of a unit.
+
+    Its offset subtracts one atmosphere, as pressures are gauge.
+    """
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -244,7 +250,10 @@ def is_familiar(unit: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
-    """Compute (factor, power of pi, two offsets): target = (value + first) * factor * pi**power - second."""
+    """Compute the exact conversion between two units: (factor, power of pi, two offsets).
+
+    Target value = (value + first offset) * factor * pi**power - second offset.
+    """
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
         raise InputError(f"got {unit.strip() or 'none'}")

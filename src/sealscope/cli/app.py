@@ -73,7 +73,7 @@ def _root(
 
 
 def normalise_arguments(words: Sequence[str]) -> list[str]:
-    """Bring the arguments of a call into the form that typer parses: `-v` first, and an option for each baseline."""
+    """Rearrange the arguments of a call for typer, with `-v` first and an option for each baseline."""
     end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
     other_words = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
@@ -83,9 +83,10 @@ def normalise_arguments(words: Sequence[str]) -> list[str]:
 
 
 def spread_baselines(words: Sequence[str]) -> list[str]:
-    """Repeat `--baseline` before each of its files, so that `FILE... --baseline FILE...` works with wildcards.
+    """Repeat `--baseline` before each of its files, to allow wildcards in `FILE... --baseline FILE...`.
 
-    All words after `--baseline` up to the next option belong to it; only the first one does if no FILE would be left.
+    All words after `--baseline` up to the next option are its files. If that would leave no FILE, only the first
+    word is one.
     """
     if "--baseline" not in words or words[0] not in ("diagnose", "report"):
         return list(words)

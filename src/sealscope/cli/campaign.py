@@ -107,7 +107,10 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Return the campaign's folder, `stated` or the default; raise InputError if the default one is a link."""
+    """Return the folder of a campaign: `stated`, or the default one for None.
+
+    Raises InputError if the default folder is a link.
+    """
     if stated is not None:
         return stated
     folder = Path("sealscope-campaigns") / plan.name
@@ -137,7 +140,10 @@ def _show_progress() -> Iterator[ProgressCallback]:
 
 
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
-    """Write tables and page of a result, and print its main table; return the number of failed records."""
+    """Write the tables and the page of a campaign, and print its main table.
+
+    Returns the number of failed records.
+    """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
@@ -152,7 +158,10 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 
 
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Judge a plan by the rows in its folder, or by the recordings in the folder `data`."""
+    """Judge a simulated plan by the rows in its folder, others by the recordings in the folder `data`.
+
+    Raises InputError if the recordings are needed and `data` is None or no folder.
+    """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign
 

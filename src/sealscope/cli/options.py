@@ -69,9 +69,10 @@ complete_rigs = make_completion(_rig_names)
 
 
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
-    """Build the option for an argument of `Experiment.of`, with the help text declared there.
+    """Build the command-line option for an argument of `Experiment.of`, with the help text declared there.
 
-    `option`: flag, by default from the name; `several`: it may be repeated; `settings`: further arguments of typer's.
+    `name`: the argument; `option`: the flag, by default made from the name; `several`: the option may be repeated;
+    `settings`: further arguments of `typer.Option`.
     """
     text = _argument_text(name) + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
@@ -132,10 +133,11 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """The machine as the options of a call state it.
+    """The machine that the options of a call describe.
 
-    `commissioned`: the machine of `--machine`, which states everything else; otherwise `channel_map` and `rate`: how to
-    read files; `rig`, `limit` and `baseline`: None or () if not stated.
+    `commissioned`: the machine of `--machine`, which determines everything else; None without this option.
+    `channel_map` and `rate`: column choice and sampling rate [Hz] with which files are read. `rig`, `limit` and
+    `baseline`: None or () if not given.
     """
 
     commissioned: CommissionedMachine | None = None
@@ -157,7 +159,10 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Build the machine from the options; raise InputError for an invalid one, or one given with `--machine`."""
+        """Build the machine from the options of a call.
+
+        Raises InputError for an invalid option, and for one that `--machine` excludes.
+        """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
 
@@ -191,7 +196,10 @@ class StatedMachine:
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
-        """Read a file, or standard input for `-`; the channel map of the rig applies to files that have its columns."""
+        """Read the recording in a file, or on standard input for `-`.
+
+        The channel map of the rig applies only to files that have its columns.
+        """
         if self.commissioned is not None:
             return self.commissioned.read(file)
         if file.is_dir():
@@ -235,7 +243,11 @@ class StatedMachine:
     def diagnose(
         self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float
     ) -> Diagnosis:
-        """Diagnose a recording of this machine; `false_alarm`: probability, `file`: its name in the diagnosis."""
+        """Diagnose a recording of this machine.
+
+        `baseline`: healthy recordings, or empty; `file`: name of the recording in the diagnosis; `false_alarm`:
+        probability.
+        """
         from dataclasses import replace
 
         from sealscope.diagnosis.diagnose import diagnose
@@ -249,7 +261,10 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces a command's parameter `stated` by options of a machine, all or just `names`."""
+    """Build a decorator that replaces the parameter `stated` of a command by the options of a machine.
+
+    `names`: the options to offer; by default all of them.
+    """
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
@@ -285,7 +300,10 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces a command's parameter `name` by `options`, from which `make` builds its value."""
+    """Build a decorator that replaces the parameter `name` of a command by `options`.
+
+    `make` builds the parameter's value from the options.
+    """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         """Wrap the command with a signature that has the options in place of the parameter."""
@@ -373,7 +391,10 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return `work()`, or None after a message on standard error if it fails; other files can then be handled."""
+    """Return the result of `work`; if it fails, print a message on standard error and return None.
+
+    `file`: the file that `work` handles, for the message. The command can then go on with other files.
+    """
     try:
         return work()
     except SealscopeError as error:
@@ -387,7 +408,10 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Check before long work that a file can be written; remove temporary files that a killed call left behind."""
+    """Check before a long run that the folder of a file to write exists; raise InputError otherwise.
+
+    Also removes the temporary files that killed calls left for this file.
+    """
     from sealscope.storage import atomic
 
     atomic.check_folder(file)
@@ -404,7 +428,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Print a message on standard error if fewer processes are started than `--jobs` asks for."""
+    """Warn on standard error if fewer processes are started than `--jobs` asks for."""
     from sealscope.campaigns.execution.workers import process_count
 
     if jobs is not None and jobs > (n_processes := process_count(jobs)):
@@ -413,10 +437,10 @@ def say_jobs(jobs: int | None) -> None:
 
 @contextmanager
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
-    """Show progress bars on standard error, which disappear at the end; yield a function of (task, fraction).
+    """Show progress bars on standard error until the block ends; yield a function of (task, fraction).
 
-    `noun`: what is counted, for a single bar. If standard error is no terminal, a line per minute is printed if `noun`
-    is given, else nothing.
+    `noun`: the things that are counted, to show a single bar; by default there is one bar for each task. If standard
+    error is no terminal, a line is printed once a minute with `noun`, and nothing without it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -445,7 +469,7 @@ def _minute_reporter() -> Callable[[str, float], None]:
     start_fraction: float | None = None
 
     def update(task: str, fraction: float) -> None:
-        """Print the task and the time left if the last print is a minute ago."""
+        """Print the task and the time left, unless a line was printed within the last minute."""
         nonlocal last_print, start_fraction
         now = time.monotonic()
         if start_fraction is None:
@@ -460,7 +484,7 @@ def _minute_reporter() -> Callable[[str, float], None]:
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show on standard error the number of `noun` done and the time left; yield a function of (done, total, note)."""
+    """Show `noun` done and time left on standard error; yield a function of (done, total, note)."""
     with progress(noun) as show:
         yield lambda done, total, note: show(
             f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)

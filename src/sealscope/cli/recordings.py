@@ -101,10 +101,11 @@ def diagnose(
 def _diagnose_in_parallel(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
-    """Diagnose each file in one of several processes; yield (messages for standard error, results) of each file.
+    """Diagnose each file in one of several processes.
 
-    On one core all files are diagnosed in this process, and one pair is yielded. `work`: yields the diagnoses of some
-    files, None for an unreadable one.
+    Yields (messages for standard error, diagnoses) of each file. On one core, all files are diagnosed in this process
+    and a single pair is yielded. `work`: function that yields the dated diagnoses of some files, with None for an
+    unreadable file.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -131,13 +132,20 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Test whether `reason`, a word of `--fail-on`, is the verdict, or the leak's level is at least `reason`."""
+    """Test whether a word of `--fail-on` applies to a diagnosis.
+
+    The word `reason` is either a verdict, or a leak level that the diagnosis must reach or exceed.
+    """
     level = None if diagnosis.severity is None else diagnosis.severity.level
     return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
-    """Test whether the files' names differ only in numbers, and all starts are known and an hour or more apart."""
+    """Test whether files are recordings of one machine over time.
+
+    There must be at least `_MIN_SERIES_FILES`, their names may differ only in numbers, and all `starts` [s since 1970]
+    must be known and an hour or more apart.
+    """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
         return False
@@ -156,10 +164,11 @@ def _reads_standard_input(files: Iterable[Path]) -> bool:
 def _iter_diagnoses(
     files: Sequence[Path], machine: opt.StatedMachine, *, joined: bool, false_alarm: float
 ) -> Iterator[DiagnosedRecording | None]:
-    """Yield the diagnosis of each file, None for an unreadable one; a file is never its own baseline.
+    """Yield the diagnosis of each file, or None for an unreadable one.
 
-    `joined`: the files are parts of a single recording; `false_alarm`: probability. An unreadable baseline also yields
-    None. Raises InputError if a file is its only baseline, UnreadableFile if no baseline can be read.
+    A file never serves as its own baseline. `joined`: the files are parts of a single recording; `false_alarm`:
+    probability. An unreadable baseline also yields None. Raises InputError if a file is its only baseline,
+    UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files if baseline else ():
@@ -183,7 +192,10 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield (start [s since 1970], diagnosis) of each recording; None and `options` as for `_iter_diagnoses`."""
+    """Yield (start [s since 1970] or None, diagnosis) of each recording, or None for an unreadable file.
+
+    `options`: as for `_iter_diagnoses`.
+    """
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
@@ -199,7 +211,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Run `work` on files; return its messages on standard error, and its results."""
+    """Run `work` on files; return its messages for standard error, and the list of its results."""
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses
@@ -266,7 +278,7 @@ def report(
 
 
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
-    """Write the page of a commissioned machine, with its newest verdict and the recordings of a folder over time."""
+    """Write the page of a commissioned machine: its newest verdict, and all its recordings over time."""
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count
     from sealscope.reporting.template import parse_page_path

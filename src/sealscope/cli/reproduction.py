@@ -72,7 +72,7 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print the items that match the patterns, and whether they lack the data sheet."""
+    """Print the items that match the patterns, and mark those whose data `sheet` is missing."""
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 

@@ -46,7 +46,7 @@ class Cylinder(Part):
 
     @property
     def single_rod(self) -> bool:
-        """True if the areas differ by more than makers' tolerances do."""
+        """True if the piston areas differ by more than manufacturing tolerances."""
         return self.unevenness > _MAX_DOUBLE_ROD_UNEVENNESS
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class HydraulicCircuit(NamedTuple):
-    """Connection of pump and chambers; a new circuit is a row below, chosen by `Rig.circuit`.
+    """Connection of pump and cylinder chambers, a row of the table below that `Rig.circuit` chooses.
 
     Attributes
     ----------

@@ -18,17 +18,19 @@ from sealscope.storage.plain_values import format_error
 
 
 def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
-    """Declare a number: human `name`, SI `unit` ("1" if it has none), bounds `gt`, `ge`, `lt`, `le` in that unit.
+    """Declare a numeric parameter with its name in words, its SI unit ("1" if it has none) and its bounds.
 
-    `absent`: the value for a rig without the part or effect that the number describes.
+    `bounds`: `gt`, `ge`, `lt` or `le`, in that unit; `absent`: the value for a rig without the part or effect that the
+    number describes, or None if every rig must state it.
     """
     return Field(title=name, json_schema_extra={"unit": unit, "absent": absent}, **bounds)  # type: ignore[call-overload]
 
 
 def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a choice, such as between laws, by its human `name`; the field's annotation is a Literal of its values.
+    """Declare a parameter that selects among named options, such as friction laws.
 
-    `absent`: the value for a rig whose file does not state the choice.
+    `name`: the parameter in words; the field's annotation is a Literal of the options. `absent`: the option for a rig
+    whose file does not state one, or None if every rig must.
     """
     return Field(title=name, json_schema_extra={"unit": "", "absent": absent})
 
@@ -40,7 +42,10 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value at which a parameter is absent from the model; None if it must be stated."""
+    """Return the value that removes a parameter's part or effect from the model.
+
+    None if every rig must state it.
+    """
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
@@ -66,11 +71,14 @@ def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 class PartsDisagreeError(InputError):
-    """A rule on several parameters together is broken, so that no single one can be named as the cause."""
+    """A rule on several parameters is broken, and none of them can be named as the cause."""
 
 
 class Part(BaseModel):
-    """A group of parameters: immutable, finite numbers, no unknown names; breaking a rule raises InputError."""
+    """A group of parameters, immutable and validated; a broken rule raises InputError.
+
+    Numbers must be finite, and unknown names are refused.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -83,7 +91,10 @@ class Part(BaseModel):
             raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy; raise InputError for an `update`, whose values pydantic would not validate."""
+        """Return a copy.
+
+        Raises InputError if `update` is given, because pydantic would not validate its values.
+        """
         if update:
             raise InputError("a rig must be changed by Rig.with_overrides, got model_copy(update=...)")
         return super().model_copy(deep=deep)

@@ -10,7 +10,10 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 
 
 class PressureTransducer(Part):
-    """A pressure channel; its white noise is independent of the other channels' and of `sensors.common_noise`."""
+    """A pressure channel, with white noise of its own.
+
+    The noise is independent of the other channels' noise and of `sensors.common_noise`.
+    """
 
     range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
     range_hi: float = quantity("upper end of the range", "Pa", gt=0, le=1e9)

@@ -133,7 +133,10 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
 
 
 class _RigFile(NamedTuple):
-    """A rig's file: its `[rig]`; entries of its parameters by dotted name; columns of its logs by channel."""
+    """Content of a rig's file.
+
+    These are the table `[rig]`, the parameter entries by dotted name, and the log columns by channel.
+    """
 
     head: dict[str, str]
     entries: dict[str, ParameterEntry]
@@ -141,9 +144,9 @@ class _RigFile(NamedTuple):
 
 
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
-    """Read a rig's file and the files that it extends, whose entries and columns it replaces.
+    """Read a rig's file on top of the files that it extends; its entries and columns replace theirs.
 
-    `place` names the file in messages; `visited`: the files that led to it.
+    `place`: name of the file in messages; `visited`: the files that led to this one, to detect loops.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

@@ -142,12 +142,18 @@ def _read_template(file: str) -> Template:
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute the larger side's volume at mid-stroke, with its dead volume, over that of the rig `base`."""
+    """Compute the chamber volume of a new cylinder relative to that of the rig `base`.
+
+    The volume is that of the larger side at mid-stroke, dead volume included. Areas in m^2, stroke in m.
+    """
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 
 def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
-    """Format the parameters of cylinder and friction, by the keys of the templates, scaled from the rig `base`."""
+    """Format the cylinder and friction parameters for a template, scaled from the rig `base`.
+
+    Returns the keys of the template -> text.
+    """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))
     mass, friction = base.cylinder.M_eq * volume_ratio, base.friction

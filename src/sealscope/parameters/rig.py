@@ -31,7 +31,7 @@ GAS_OVER_ROD = 5.0
 
 
 class ParameterEntry(NamedTuple):
-    """A parameter as stated: number or choice, unit ("" for a choice), source, and the file or option it is from."""
+    """A parameter as stated: value, unit ("" for a choice), source, and the file or option that states it."""
 
     value: Value
     unit: str
@@ -151,7 +151,10 @@ class Rig(Part):
         return self
 
     def _check_valve(self) -> None:
-        """Check that servo valve and supply come together and suit the rest of the rig; raise ValueError otherwise."""
+        """Check that valve and supply are both present or both absent, and suit the rig.
+
+        Raises ValueError otherwise.
+        """
         valve, supply = self.valve, self.supply
         if self.circuit.valve_controlled != (supply.drive != "absent"):
             raise ValueError(
@@ -174,7 +177,10 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Check that valves and filters are in lines, and that warm oil is thinner; raise ValueError otherwise."""
+        """Check the valves and filters of the lines, and the warm oil's viscosity.
+
+        Raises ValueError otherwise. Valves and filters need lines, and warm oil must be thinner than cold oil.
+        """
         line, oil = self.line, self.fluid
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
@@ -248,7 +254,10 @@ class Rig(Part):
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if all these parameters are stated for this machine, and none is assumed (source `assumed:`)."""
+        """Return True if this machine's own values are stated for all the named parameters, with none assumed.
+
+        A value is assumed if its source begins with `assumed:`.
+        """
         return not any(self.entry(name).source.startswith(ASSUMED) for name in names)
 
     def as_assumed(self, reason: str) -> Rig:
@@ -324,9 +333,9 @@ class Rig(Part):
         ]
 
     def present_values(self) -> dict[str, Value]:
-        """Return the SI values by dotted name, without parameters that are absent from the model.
+        """Return the SI values by dotted name, leaving out parameters that are absent from the model.
 
-        They identify a machine in all versions: a parameter that a later version adds is absent from older rigs.
+        They identify a machine across versions, because a parameter added in a later version is absent from older rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -397,7 +406,10 @@ def declared_names() -> tuple[str, ...]:
 
 
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
-    """Build the part whose parameters' names begin with `path`; an InputError names the place of the wrong value."""
+    """Build the part whose parameter names begin with `path`.
+
+    An InputError names the place of the wrong value; for a rule on several parameters together it names `place`.
+    """
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
         kind = field.annotation

@@ -20,30 +20,31 @@ _EQUAL_PEAKS = 0.05
 
 
 def find_cycle(recording: Recording) -> float | None:
-    """Find the period of the duty [s] from the command, or else from the pressures; None if nothing repeats.
+    """Find the period of the duty cycle [s]; None if nothing repeats.
 
-    The command is used if it moves, else the pressure difference, else the only chamber pressure. The result is
-    computed once for a recording and its `Recording.only` views.
+    Uses the command if it moves, else the pressure difference, else the only chamber pressure. The result is cached
+    with the recording and shared by its `Recording.only` views.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
     def compute(recording: Recording) -> float | None:
-        """Estimate the period of the duty's signal."""
+        """Estimate the period of the signal in which the duty repeats."""
         return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
 
     return compute_once(recording, "cycle", compute, names) if names else None
 
 
 def duty_signal(channels: Sequence[Array]) -> Array:
-    """Return the signal (n,) in which a duty repeats: the only channel, or the difference of both."""
+    """Return the signal (n,) in which the duty repeats: the only channel, or the difference of two channels."""
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
 
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    It is the lag of the first high maximum of the autocorrelation after its first zero crossing, refined by a parabola:
-    at least 0.6 high, between 0.2 s and 20 s, and a fifth of the signal at most.
+    The period is the lag of a maximum of the autocorrelation after its first negative value: the first of the nearly
+    highest maxima, refined by a parabola. The maximum must reach 0.6; the period is between 0.2 s and 20 s and at most
+    a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))
     n = signal.size // stride

@@ -202,7 +202,10 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield path and format of a file, or of the file in an archive, whose errors also name the archive."""
+    """Yield the path and format of a file, unpacked first if it is an archive.
+
+    Errors then also name the archive.
+    """
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0

@@ -16,9 +16,9 @@ _COPY_TOLERANCE = 1e-6
 
 
 def find_implausibility(recording: Recording) -> str | None:
-    """Find a reason why pressures and speed cannot be readings of one machine; None if there is none.
+    """Find a reason why pressures and speed cannot come from one machine; None if there is none.
 
-    One chamber may rest at the charge pressure, as in a lift, but p_A - p_B, which drives a leak, must move. Unit,
+    p_A - p_B, which drives a leak, must move, but one chamber may rest at the charge pressure, as in a lift. Unit,
     offset and range of the pressures do not matter; constant and absent channels are ignored.
     """
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -36,7 +36,10 @@ def find_implausibility(recording: Recording) -> str | None:
 
 
 def _describe_speed_mismatch(recording: Recording) -> str | None:
-    """Describe a speed that correlates with the derivative of the angle but has another scale; None otherwise."""
+    """Describe a speed that follows the derivative of the angle at another scale.
+
+    None if there is none.
+    """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
     n_mean = max(1, round(recording.rate / _PRIORS.rate))  # samples averaged to one, against noise
@@ -54,13 +57,20 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array) -> bool:
-    """Test whether the mean square third difference exceeds `noise` (prior) times 20 variances; white noise has 20."""
+    """Test whether a signal (n,) is mostly white noise.
+
+    The mean square of its third difference, which is 20 variances for white noise, must exceed 20 variances times the
+    prior `noise`. Missing samples count as noise.
+    """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Describe that chamber pressures are missing, with unused columns and a map to read them; None if present."""
+    """Describe the lack of chamber pressures; None if at least one is present.
+
+    The text lists the unused columns, with a map for them.
+    """
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

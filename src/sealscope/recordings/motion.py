@@ -40,9 +40,9 @@ def is_moving(values: Array) -> bool:
 
 
 class Holds(NamedTuple):
-    """The held samples of a pressure.
+    """The samples of a pressure at which it is held.
 
-    `flags` (n,): True for held samples; `pending`: index of the first sample that later samples may show to be held.
+    `flags` (n,): True for held samples; `pending`: index of the first sample that later samples may turn into a hold.
     """
 
     flags: NDArray[np.bool_]
@@ -52,8 +52,9 @@ class Holds(NamedTuple):
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     """Find the samples (n,) of a pressure that stay identical for longer than its noise allows.
 
-    A run is a hold if it is longer than 1.5 s and 64 samples; its first sample is a reading and not flagged, unless it
-    continues a hold of the value `before` (NaN: none) that lasts up to the first sample. A short last run is pending.
+    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is not
+    flagged. A run at the beginning also continues a hold at the value `before` (NaN: none), and is then flagged
+    entirely. A last run that is still too short is pending.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -68,10 +69,10 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
 
 def describe_hold(recording: Recording) -> str | None:
-    """Describe a chamber pressure that stops moving in a recording without missing samples; None if there is none.
+    """Describe a chamber pressure that stops moving, in a recording without missing samples.
 
-    A pressure does not move while it is held (`find_holds`), or if it is a straight line to within `ROUNDING`.
-    Recordings too short to tell and constant channels, which `inspect` reports, are not described.
+    None if there is none. A pressure does not move while it is held (`find_holds`), or if it is a straight line to
+    within `ROUNDING`. Short recordings and constant channels, which `inspect` reports, are not described.
     """
     for name in chambers_of(recording):
         values = recording[name]

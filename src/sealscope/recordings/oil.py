@@ -8,9 +8,9 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Return the oil's mean temperature [deg C], else the one stated in the file's header; None if neither is known.
+    """Return the mean oil temperature [deg C], measured or else stated in the file's header.
 
-    Readings outside the range of oil temperatures (`priors.toml`) count as missing.
+    None if unknown. Readings outside the range of oil temperatures (`priors.toml`) count as missing.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
         limits = RECORDINGS.oil

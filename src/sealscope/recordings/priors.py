@@ -6,7 +6,11 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class ClockPriors(PriorTable):
-    """The clock of a logger: `scatter` [sampling steps]; `near` [usual intervals]; the others are numbers."""
+    """Priors on a logger's clock.
+
+    `scatter`: of irregular intervals [sampling steps]; `near`: longest interval without a loss [usual intervals]; the
+    others are dimensionless.
+    """
 
     scatter: float
     rate: float
@@ -16,7 +20,7 @@ class ClockPriors(PriorTable):
 
 
 class StalePriors(PriorTable):
-    """Samples that repeat the one before: `shortest` [s]; the others are numbers."""
+    """Priors on samples that repeat the one before; `shortest` is in s, the others are dimensionless."""
 
     runs: int
     spread: float
@@ -37,7 +41,10 @@ class SpikePriors(PriorTable):
 
 
 class UnsignedPriors(PriorTable):
-    """A speed that counts pulses: `half`, `nearby` [s], `changes` [1/s]; the others are numbers."""
+    """Priors on a speed without a sign.
+
+    `half`, `nearby` in s, `changes` in 1/s, the others dimensionless.
+    """
 
     noise: float
     half: float
@@ -49,7 +56,7 @@ class UnsignedPriors(PriorTable):
 
 
 class HumPriors(PriorTable):
-    """Hum of the mains: `lowest`, `around` [Hz]; the others are numbers."""
+    """Priors on hum of the mains; `lowest`, `around` in Hz, the others dimensionless."""
 
     loud: float
     alone: float
@@ -60,14 +67,17 @@ class HumPriors(PriorTable):
 
 
 class CreepPriors(PriorTable):
-    """A mean pressure of both chambers that creeps: `rate` [Pa/s]; `seconds` [s]."""
+    """Priors on a mean chamber pressure that creeps.
+
+    `rate`: smallest rate [Pa/s]; `seconds`: shortest recording [s].
+    """
 
     rate: float
     seconds: float
 
 
 class HoldPriors(PriorTable):
-    """Equal samples that are no reading of a pressure: `seconds` [s]; `samples` [samples]."""
+    """Lengths beyond which equal pressure samples are no reading, in `seconds` [s] and in `samples`."""
 
     seconds: float
     samples: int
@@ -94,7 +104,7 @@ class OilRange(PriorTable):
 
 
 class CyclePriors(PriorTable):
-    """The cycle of a duty: `longest` [s]; `rate` [Hz]; the others are numbers."""
+    """Priors on the duty cycle; `longest` in s, `rate` in Hz, `correlation` dimensionless."""
 
     longest: float
     correlation: float
@@ -102,7 +112,11 @@ class CyclePriors(PriorTable):
 
 
 class GapPriors(PriorTable):
-    """Gaps that are filled by a line: `motion`, `hole` [s]."""
+    """Lengths of gaps [s].
+
+    `motion`: longest gap of a channel that is interpolated by a line; `hole`: length over which a bridged gap has less
+    weight.
+    """
 
     motion: float
     hole: float

@@ -158,7 +158,10 @@ def _format_repetitions(count: int) -> str:
 
 
 def _creep_findings(recording: Recording) -> list[Finding]:
-    """Find a steady drift of the chambers' mean pressure through the whole recording, which no sealed circuit has."""
+    """Find a steady drift of the mean chamber pressure over the whole recording.
+
+    A sealed circuit shows none. Empty if there is no drift, or if the recording is too short.
+    """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
         return []
@@ -244,7 +247,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 
 
 def _report_missing(report: _ChannelReport, values: Array) -> None:
-    """Report samples (n,) without a value, or that only every k-th row has one."""
+    """Report missing samples (n,), or that only every k-th row has a value."""
     is_missing, rate = np.isnan(values), report.recording.rate
     if not is_missing.any():
         return
@@ -268,7 +271,10 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Return k >= 2 if only every k-th row has a value, else 0; `present`: indices of the rows with a value."""
+    """Return the k >= 2 for which only every k-th row has a value; 0 if there is none.
+
+    `present`: indices of the rows with a value.
+    """
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
     is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
@@ -282,10 +288,10 @@ def _format_ordinal(number: int) -> str:
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
-    """Find the maximal stretches, as slices, that are sampled evenly and have finite values.
+    """Find the maximal stretches, as slices, with even sampling and finite values.
 
-    `channels`: names to consider, by default all but those that change slowly. Each interval of a stretch is between
-    half and one and a half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
+    `channels`: names to consider, by default all but the slow ones. Each interval of a stretch is between half and one
+    and a half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
     """
     n = len(recording)
     is_complete = np.isfinite(recording.t)
@@ -307,9 +313,10 @@ def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
 
 
 class Rail(NamedTuple):
-    """Samples at one end of a clipped channel.
+    """The samples at a clipped end of a channel's range.
 
-    `side`: `low` or `high`; `value`: at that end; `samples`: number with this value; `first`: index of the first.
+    `side`: `low` or `high`; `value`: the value at that end; `samples`: number of samples with this value; `first`:
+    index of the first one.
     """
 
     side: str
@@ -325,12 +332,15 @@ def is_mostly_clipped(values: Array) -> bool:
 
 
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
-    """Find the ends at which finite values (n,) are clipped; the low end only if `low_end`.
+    """Find the ends of the range at which finite values (n,) are clipped.
 
-    A clipped end has far more samples than any of the five nearest values, in runs that the signal enters or leaves by
-    more than three quantisation steps (one, for a long run). The crest of a slow quantised signal also has many
-    samples, but its neighbours have nearly as many and it is entered step by step; a square wave has as many samples at
-    its other level. An end is also clipped if a run of `stuck` (as `find_stuck` returns them) lies there.
+    The low end is tested only if `low_end`.
+
+    A clipped end has far more samples than any of the five nearest values, in runs that
+    the signal enters or leaves by a jump of more than three quantisation steps (one for a long run). The crest of a
+    slow quantised signal does not count: its neighbours have nearly as many samples, and it is entered step by step.
+    Nor does a square wave, with as many samples at its other level. An end is also clipped if a run of `stuck` (from
+    `find_stuck`) lies there.
     """
     if not values.size:
         return []
@@ -359,9 +369,9 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
 
 def fast_length(count: int) -> int:
-    """Return the smallest n >= `count` with no prime factor above 5, a length for which an FFT is fast.
+    """Return the smallest FFT-friendly length n >= `count`, with no prime factor above 5.
 
-    The same as `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
+    Equals `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
     # times the smallest power of two >= count / factor

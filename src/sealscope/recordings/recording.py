@@ -40,7 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Copy values to a read-only array of doubles; return them as they are if they are one that owns its memory."""
+    """Copy values to a read-only array of doubles, unless they already are one that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -50,7 +50,7 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A result that the first thread computes and other threads wait for; `known`: it is computed."""
+    """A result that one thread computes while others wait for it; `known` is True once it is computed."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -198,7 +198,10 @@ class Recording:
         return clean_remarks(self.provenance)
 
     def unit_in_log(self, name: str) -> str | None:
-        """Return the unit of a channel in the log that it was read from; None for SI units, counts or no log."""
+        """Return the unit that a channel had in its log.
+
+        None if it was in SI units or counts, or not read from a log.
+        """
         units = self.provenance.get("log_units")
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
@@ -238,9 +241,10 @@ class Recording:
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
-        """Return the values and the units of the time, `t`, and the channels by name, and a description of JSON values.
+        """Return (values, units, description) of the recording for writers, with the time as series `t`.
 
-        The description contains rate, provenance and history. Raises InputError for values that JSON does not have.
+        `values`: name -> samples (n,); `units`: name -> unit; `description`: rate, provenance and history as JSON
+        values. Raises InputError for values that JSON does not have.
         """
         from sealscope.recordings.formats.table import make_description
 
@@ -357,10 +361,10 @@ def make_recording(fields: RecordingFields) -> Recording:
 def compute_once(
     recording: Recording, key: Hashable, compute: Callable[[Recording], _T], channels: Iterable[str] | None = None
 ) -> _T:
-    """Return `compute(recording)`, computed once for each recording and `key` and cached with the recording.
+    """Compute `compute(recording)` once for each `key`, and cache the result with the recording.
 
-    `channels`: channels that the result depends on (default: all). Views by `Recording.only` share results that depend
-    on the same channels.
+    `channels`: the channels on which the result depends, by default all. Views by `Recording.only` share the results
+    whose channels they have.
     """
     all_channels = frozenset(recording.channels)
     names = all_channels if channels is None else all_channels.intersection(channels)

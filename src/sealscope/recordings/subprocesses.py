@@ -67,7 +67,7 @@ class _Process:
 
     @property
     def is_alive(self) -> bool:
-        """Test whether the process is running."""
+        """True while the process is running."""
         return self._process.poll() is None
 
     def send(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
@@ -154,7 +154,10 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit this process's time [s] (0: none), memory and files [bytes]; it then ends even if its parent is dead."""
+    """Limit the time [s] (0: no limit), memory [bytes] and file size [bytes] of this process.
+
+    A timer of the system ends it when the time is over, even if its parent is dead.
+    """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
         import resource

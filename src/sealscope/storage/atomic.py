@@ -33,10 +33,11 @@ def check_folder(file: Path) -> None:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary file in the folder of `path`; rename it to `path` if the block succeeds, else remove it.
+    """Write a file atomically: yield a temporary file, which replaces `path` if the block succeeds.
 
-    File and folder are synced to the disk, so that a power loss leaves the old file or the new one. A replaced file
-    keeps its mode. Raises InputError if the folder does not exist or cannot be written.
+    The temporary file is in the folder of `path`, and is removed if the block fails. File and folder are synced to the
+    disk, and a power loss leaves either the old or the new file. A replaced file keeps its mode. Raises InputError if
+    the folder does not exist or cannot be written.
     """
     target = Path(path)
     try:

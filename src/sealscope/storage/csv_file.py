@@ -15,7 +15,7 @@ _FORMULA_BEGINNINGS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+
 
 
 def guard_cell(value: Any) -> Any:
-    """Escape a text so that a spreadsheet reads no formula and a terminal obeys no control character; numbers stay.
+    """Escape a text that a spreadsheet would read as a formula or a terminal would obey; numbers stay.
 
     Names and comments may come from outside. A text that begins like a formula gets an apostrophe; unprintable
     characters are escaped.

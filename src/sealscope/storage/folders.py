@@ -60,9 +60,9 @@ def numeric_sort_key(name: str) -> list[str | int]:
 
 @contextmanager
 def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock file of a folder of results while the block runs; the end of the process releases it, too.
+    """Hold a lock file while the block runs; the lock also ends with the process.
 
-    `busy`: message of the InputError if another process has the lock for longer than `wait` [s]; None: wait without
+    `busy`: message of the InputError if another process holds the lock for longer than `wait` [s]; None: wait without
     limit. The file is created if necessary, and never emptied. Raises InputError if it is a link or cannot be created.
     """
     from filelock import FileLock, Timeout

@@ -33,10 +33,11 @@ def special_kind(mode: int) -> str | None:
 
 
 def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
-    """Open a regular file to read; `what` names it in errors ("a recording").
+    """Open a regular file for reading.
 
-    Raises InputError for a folder, pipe, socket or device, and for an empty file. Files in /proc, whose reading may
-    never end, are refused as empty, too. Raises OSError if it cannot be opened.
+    `what`: the file in errors, such as "a recording". Raises InputError for a folder, pipe, socket or device, and for
+    an empty file. Files in /proc, whose reading may never end, are refused as empty, too. Raises OSError if it cannot
+    be opened.
     """
     opened = _open_checked(path, what, "rb", _NO_WAITING)
     if not os.fstat(opened.fileno()).st_size:

@@ -48,7 +48,10 @@ def restore(kind: type[_T], state: Any, name: str) -> _T:
 
 
 def restore_array(value: Any, name: str) -> NDArray[np.float64]:
-    """Restore an array from a mapping by `plain_array`; raise InputError, with `name`, if it is none."""
+    """Restore an array from the mapping that `plain_array` made.
+
+    Raises InputError with `name` for any other value.
+    """
     try:
         shape = tuple(int(size) for size in value["shape"])
         if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:
@@ -60,7 +63,10 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the part `name` of a saved state; raise InputError if it is missing or has the wrong type."""
+    """Return the entry `name` of a saved state.
+
+    Raises InputError if it is missing or not of the type `kind`.
+    """
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -70,7 +76,10 @@ def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
 
 
 def require_count(state: Any, name: str) -> int:
-    """Return a whole number >= 0 of a saved state; raise InputError otherwise."""
+    """Return the entry `name` of a saved state, a whole number >= 0.
+
+    Raises InputError for any other value.
+    """
     value = require_part(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
         raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
@@ -78,7 +87,10 @@ def require_count(state: Any, name: str) -> int:
 
 
 def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return an array of numbers with this shape from a saved state; raise InputError otherwise."""
+    """Return the entry `name` of a saved state as an array of this shape.
+
+    Raises InputError if it does not fit.
+    """
     try:
         values = np.asarray(require_part(state, name, object))
         if values.size and values.dtype.kind not in "fi":
@@ -91,9 +103,10 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 
 
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Convert attributes to plain values for `restore_attributes`; numbers that are not finite become null.
+    """Convert the named attributes of `owner` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a `state`.
+    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a `state`. Numbers that are not finite
+    become null.
     """
     return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
 

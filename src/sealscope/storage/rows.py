@@ -25,7 +25,7 @@ class StoredRow(Protocol):
 
     @property
     def id(self) -> str:
-        """Name of the job."""
+        """Name of the job, by which a later row replaces an earlier one."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain JSON values."""
@@ -66,9 +66,10 @@ def read_rows(
 
 
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
-    """Append each row to the folder's file as its job ends, then yield it; close `rows` at the end.
+    """Append each row to the file in a folder when its job ends, then yield the row.
 
-    Raises ValueError for a row with a number that is not finite, unless `allow_nan`.
+    `rows` is closed at the end; `what`: the folder in errors. Raises ValueError for a row with a number that is not
+    finite, unless `allow_nan`.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)

@@ -78,9 +78,9 @@ def read_model(
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class PriorTable:
-    """A frozen table: a subclass annotates its keys, with a default where one may be absent.
+    """A frozen table of priors; a subclass annotates its keys, with a default for each optional one.
 
-    Type checkers take it for a frozen dataclass, whose creation at import would take ten times as long.
+    Type checkers treat it as a frozen dataclass, whose creation at import would take ten times longer.
     """
 
     def __init__(self, **values: Any) -> None:
@@ -104,7 +104,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert the rows of a table to a `PriorTable` or a mapping, whichever `kind` is."""
+    """Convert the rows of a table to the type `kind`, a `PriorTable` or a mapping."""
     is_mapping, optional = get_origin(kind) is not None, tuple[str, ...]()
     if is_mapping:
         names, value_kind = get_args(kind)
@@ -148,7 +148,7 @@ def _check_keys(rows: Collection[str], names: Collection[str], optional: Collect
 
 
 def _estimate_memory(text: str) -> int:
-    """Estimate an upper limit of the memory [bytes] of the tables and values in a text, without parsing it."""
+    """Estimate an upper limit of the memory [bytes] that a parsed TOML text takes, without parsing it."""
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
         if line.lstrip().startswith("[["):  # an element of an array of tables

@@ -24,10 +24,10 @@ MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 
 
 def resample_evenly(recording: Recording) -> Recording:
-    """Resample to an even clock, with NaN for lost rows; return the same recording if its clock is even.
+    """Resample a recording to an even clock, with NaN for lost rows.
 
-    Rows without a time, and rows no later than a previous one, are dropped. If the clock goes back or leaps because the
-    file contains several recordings, the longest is used.
+    An even recording is returned unchanged. Rows without a time, and rows no later than an earlier row, are dropped. If
+    the clock steps back or leaps because the file contains several recordings, only the longest is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -44,9 +44,9 @@ def resample_evenly(recording: Recording) -> Recording:
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the indices of the rows with increasing times `t` (n,), without those no later than a previous row.
+    """Find the rows whose time is later than that of all rows before; return their indices.
 
-    If these are more than `MAX_LATE_FRACTION`, only the longest run of rows without a step back is used.
+    If more than `MAX_LATE_FRACTION` of the times `t` (n,) are late, only the longest run without a step back is used.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -95,7 +95,10 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 
 
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
-    """Interpolate samples (n,) linearly at `even_times` (m,); NaN outside and, unless `is_slow`, in long intervals."""
+    """Interpolate samples (n,) at times `t` (n,) linearly to `even_times` (m,).
+
+    NaN outside the samples and, unless `is_slow`, in intervals longer than `MAX_INTERVAL` median intervals.
+    """
     if t.size < 2:
         return np.full(even_times.size, np.nan)
     result = np.interp(even_times, t, values, left=np.nan, right=np.nan)

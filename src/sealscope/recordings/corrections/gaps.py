@@ -71,10 +71,11 @@ def remove_impossible(recording: Recording) -> Recording:
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Fill and mark the gaps of the `needed` channels, except at the ends; return the same recording if there are none.
+    """Fill the inner gaps of the `needed` channels and flag them in `bridged`.
 
-    By length and duty, a gap is filled by a spline, another cycle or a line. In its rows the missing values of all
-    other channels are filled as well; recorded values stay. The clock must be even (`clock.resample_evenly`).
+    A gap is filled by a spline if it is short, else from another cycle of the duty or by a line. Missing values of the
+    other channels in these rows are filled as well; recorded values stay. Gaps at the ends remain. Returns the same
+    recording if there is nothing to fill. The clock must be even (`clock.resample_evenly`).
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -126,7 +127,10 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) between sample `bounds` (n + 1,) with over `MAX_BRIDGED_FRACTION` bridged samples."""
+    """Flag the blocks in which more than `MAX_BRIDGED_FRACTION` of the samples are bridged.
+
+    `bounds` (n + 1,): sample indices between the blocks. Returns flags (n,).
+    """
     bounds = np.asarray(bounds)
     if recording.bridged is None:
         return np.zeros(max(bounds.size - 1, 0), dtype=bool)
@@ -135,7 +139,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) in bridged gaps longer than the prior `hole` [s] and than `MAX_INTERVAL` sampling steps."""
+    """Flag the rows (n,) in bridged gaps longer than the prior `hole` [s] and `MAX_INTERVAL` steps."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -151,9 +155,10 @@ def _finite_mean(values: Array) -> float:
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Fill the gap `first` to `stop` of all channels, in place, from the nearest similar cycle; False if there is none.
+    """Fill a gap in all channels, in place, from the nearest similar cycle.
 
-    A cycle is similar if its `_cycle_mismatch` is small. `period`: of the duty [samples], known to within `_SLACK`.
+    Returns False if there is none. The gap has the samples `first` to `stop` - 1. A cycle is similar if its
+    `_cycle_mismatch` is small. `period`: length of a cycle [samples], known to within `_SLACK`.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -171,10 +176,11 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute the rms difference of the duty around a gap and `shift` samples away, relative to the latter's deviation.
+    """Compute the mismatch of the duty around a gap with the duty `shift` samples away.
 
-    The mean is removed from both; they extend up to `half_cycle` samples beyond the gap, `first` to `stop`. inf if too
-    few samples are known, or if a `needed` channel lacks samples to copy.
+    The mismatch is the rms difference of both stretches without their means, divided by the standard deviation of the
+    shifted one. They extend up to `half_cycle` samples beyond the gap, `first` to `stop`. Infinite if too few samples
+    are known, or if a `needed` channel lacks samples to copy.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as it exists here and there
@@ -194,7 +200,10 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill missing values from `first` to `stop` by those `shift` samples away, offset so that both ends meet."""
+    """Fill the missing values from `first` to `stop`, in place, by the values `shift` samples away.
+
+    A linear offset makes both ends meet the values around the gap.
+    """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
         _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends

@@ -33,11 +33,11 @@ from sealscope.recordings.recording import Recording
 
 
 class CorrectedSamples(NamedTuple):
-    """A recording with corrected samples.
+    """A recording after the correction of its samples.
 
     `recording`: on an even clock, from the first to the last sample with all chamber pressures and the command;
-    `findings`: the corrections; `stuck`: chambers whose pressure is stuck too long to be used; `used_fraction`:
-    fraction of the original samples within its time span.
+    `findings`: the corrections; `stuck`: names of chamber pressures that are stuck for too long to be used;
+    `used_fraction`: fraction of the original samples that lie in the time span of `recording`.
     """
 
     recording: Recording
@@ -47,7 +47,7 @@ class CorrectedSamples(NamedTuple):
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
-    """Correct what loggers do to samples: spikes, stale samples, uneven clocks, missing signs, gaps."""
+    """Correct the sample defects of loggers: spikes, stale samples, uneven clocks, missing signs and gaps."""
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
     part = _set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
@@ -83,7 +83,7 @@ def _set_missing(recording: Recording, flags: Mapping[str, NDArray[np.bool_]]) -
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to the part from the first to the last sample that all `needed` channels have."""
+    """Cut a recording to the span from the first to the last row with values in all `needed` channels."""
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording
@@ -92,7 +92,10 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long bridged gaps (`flag_holes`) to NaN and clear `bridged`, for detectors that cannot weight gaps down."""
+    """Set long bridged gaps (`flag_holes`) to NaN, for detectors that cannot give gaps a lower weight.
+
+    The result has no `bridged` flags. Returns the same recording if there are no long gaps.
+    """
     rows = flag_holes(recording)
     if not rows.any():
         return recording

@@ -44,7 +44,11 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def find_spikes(values: Array) -> NDArray[np.intp]:
-    """Find the rows in which a channel (n,) leaps and returns by several times its leaps and its slope nearby."""
+    """Find the rows in which a channel (n,) leaps and returns at once.
+
+    Both changes must be several times larger than usual changes, neighbouring leaps and the local slope. Empty if there
+    are so many rows that the signal itself leaps.
+    """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:
         return np.empty(0, dtype=np.intp)

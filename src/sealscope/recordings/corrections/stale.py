@@ -59,10 +59,11 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 
 
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which a pressure is stuck while the machine moves; at rest it is no defect.
+    """Flag the rows (n,) in which a chamber pressure is stuck while the machine moves.
 
-    The machine's motion is taken from the position, else from the pump's angle, else from the other pressures; these
-    come last, as they may change while valves hold the cylinder, or hardly change while a stiff load moves.
+    Motion is taken from the position, else from the pump's angle, else from the other chamber pressure, which may
+    change while valves hold the cylinder. Without any of them every stuck run is flagged. Runs at the smallest or
+    largest value are clipped and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -77,10 +78,10 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 
 
 def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which a logger repeats its last row for long.
+    """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
-    In these rows all channels are constant or missing, and both chamber pressures are held (`motion.find_holds`). No
-    channel jumps at the beginning and one does at the end; a machine at rest continues smoothly.
+    All channels are then constant or missing, and both chamber pressures are held (`motion.find_holds`). No channel
+    jumps at the beginning, and at least one does at the end; a machine at rest would continue smoothly.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
@@ -111,7 +112,10 @@ def _is_constant_or_missing(values: Array) -> bool:
 
 
 def _jumps_at(values: Array, row: int) -> bool:
-    """Test whether a channel changes across a row by more than a high quantile of its changes elsewhere."""
+    """Test whether a channel changes across a row by more than its usual change.
+
+    The usual change, over as many samples, is a high quantile of all changes in the channel.
+    """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
     return bool(change > usual_change)
@@ -132,7 +136,10 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 
 
 def estimate_holding_period(t: Array, values: Array) -> float | None:
-    """Estimate how long [s] a channel (n,) repeats each sample; None if it does not, or too briefly to matter."""
+    """Estimate the time [s] for which a channel (n,) repeats each sample.
+
+    `t` (n,): times [s]. None if the channel does not repeat samples, or too briefly to matter.
+    """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
     if np.count_nonzero(known) < _PRIORS.runs:

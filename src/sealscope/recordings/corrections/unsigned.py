@@ -27,7 +27,7 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 
 
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Give a speed or flow without a sign the sign of the flow into A; return the recording and the findings."""
+    """Restore the sign of a speed or flow, positive into chamber A; return recording and findings."""
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():
         if name not in recording or not _has_one_sign(recording[name]):
@@ -51,10 +51,10 @@ def _has_one_sign(values: Array) -> bool:
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
-    """Find the sign (n,) of the flow into A and a description of its source.
+    """Find the sign (n,) of the flow into chamber A, and describe the channel that shows it.
 
-    (None, "") if position and command do not determine it, or the motion is one way. `magnitude`: absolute speed or
-    flow (n,).
+    `magnitude` (n,): absolute speed or flow. Returns (None, "") if neither position nor command determines the sign, or
+    if the motion is in one direction only.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -68,7 +68,10 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
-    """Differentiate a position (n,) [m] by central differences over `_PRIORS.half` [s] on either side; return [m/s]."""
+    """Compute the piston speed (n,) [m/s] from its position (n,) [m] sampled at `rate` [Hz].
+
+    Central differences over `_PRIORS.half` [s] on either side; missing positions are interpolated.
+    """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
     x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
@@ -78,13 +81,19 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Test whether the smaller of the sums of positive and of negative values (n,) is over `least` times the larger."""
+    """Test whether a signal (n,) has enough motion in both directions.
+
+    The smaller of the sums of its positive and negative values must exceed the prior `least` times the larger.
+    """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
 
 
 def _correlation(first: Array, second: Array) -> float:
-    """Compute the correlation of the rows known in both channels (n,); 0 if either is constant."""
+    """Compute the correlation of two channels (n,) over the rows known in both.
+
+    0 if fewer than three rows are known, or if either channel is constant in them.
+    """
     known = np.isfinite(first) & np.isfinite(second)
     if np.count_nonzero(known) < 3 or not (np.ptp(first[known]) > 0.0 and np.ptp(second[known]) > 0.0):
         return 0.0
@@ -92,10 +101,10 @@ def _correlation(first: Array, second: Array) -> float:
 
 
 def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
-    """Estimate the signs (n,) of the flow into A: fit a v + c (p_A - p_B) to sign x magnitude, then find the signs.
+    """Estimate the signs (n,) of the flow into chamber A by alternating a fit and a search for signs.
 
-    `a` depends on the direction. The first signs are those of the piston's `speed` v [m/s]; the fit is repeated until
-    no sign changes.
+    The fit is sign x `magnitude` = a v + c (p_A - p_B), with `speed` v [m/s] and a coefficient a for each direction.
+    The first signs are those of the speed. At most `_MAX_ITERATIONS` rounds, fewer if no sign changes.
     """
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
@@ -129,7 +138,10 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the variance of a piston speed's noise (n,) by its steps between differences of other samples."""
+    """Estimate the noise variance of a piston speed (n,) sampled at `rate` [Hz].
+
+    Compares speeds whose position differences do not overlap; the median makes the estimate robust to motion.
+    """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
     return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0
@@ -145,10 +157,11 @@ def _average_nearby(values: Array, rate: float) -> Array:
 
 
 def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
-    """Find the most likely signs (n,) of a chain, by the `log_odds` (n,) of a positive sign in each sample.
+    """Find the most likely sequence of signs (n,).
 
-    `cost_of_change` (n - 1,): log odds against a change of sign after each sample. The log odds of the paths that end
-    in either sign are clipped to the cost of a change, then the next sample's are added.
+    `log_odds` (n,): of a positive sign in each sample; `cost_of_change` (n - 1,): log odds against a change of sign
+    after each sample. The log odds accumulate from sample to sample, clipped to the cost of a change (Viterbi
+    algorithm).
     """
     path_odds, odds = np.empty(log_odds.size), 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):

@@ -66,9 +66,10 @@ def is_value(cell: str, decimal: str) -> bool:
 
 
 def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Parse cells to doubles (n,), NaN for missing samples and words; also return the indices of the words.
+    """Parse cells to doubles (n,), NaN for missing samples and words.
 
-    Raises InputError for an infinite number; `where`: index -> place for the message.
+    Also return the indices of the words. `decimal`: decimal separator; `where`: index -> place of the cell for
+    messages. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -98,9 +99,9 @@ def _parse_number(cell: str, pointed: str, decimal: str) -> float:
 
 
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
-    """Test whether the numbers in the cells of `rows` end in SI prefixes, as `170.3m` does, rather than in units.
+    """Test whether numbers in the cells of `rows` end in SI prefixes, such as `170.3m`, and not in units.
 
-    They do if a column has several different endings, or the ending `k` or `u`, which are no units.
+    The endings are prefixes if a column has several different ones, or the ending `k` or `u`, which is no unit.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -152,7 +153,10 @@ def remove_units(line: str, units: Iterable[str]) -> str:
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add `units`, column -> unit in its cells, to labels without one; raise InputError for another unit in a label."""
+    """Add `units` (column -> unit in its cells) to labels that have none.
+
+    Raises InputError if a label has another unit; `place`: name of the file in the message.
+    """
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)
@@ -166,10 +170,11 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 
 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[int], str]) -> list[str]:
-    """Remove `unit` from the ends of a column's cells; words and zeros without it stay.
+    """Remove `unit` from the ends of a column's cells.
 
-    `is_cut`: the last cell may be incomplete, and is missing if it does not end in `unit`; `where`: index -> place for
-    the message. Raises InputError for a number with another unit or with none.
+    Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and is missing if it
+    does not end in `unit`; `where`: index -> place for the message. Raises InputError for a number with another unit or
+    with none.
     """
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):

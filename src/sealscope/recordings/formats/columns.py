@@ -42,7 +42,10 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Request:
-    """A validated request to a reader: `map`, `rate` [Hz] or None, and `file`, the file's name for the provenance."""
+    """A validated request to a reader.
+
+    `map`: choice of columns; `rate`: sampling rate [Hz] or None; `file`: name of the file for the provenance.
+    """
 
     map: ChannelMap
     rate: float | None = None
@@ -53,7 +56,7 @@ class Request:
 
     @property
     def infers_rate(self) -> bool:
-        """True if the times determine the rate, even where a description states one.
+        """True if the times determine the rate even in a file that states one.
 
         A map may choose other times, and a data frame, which has no `file`, may lack rows.
         """
@@ -62,7 +65,7 @@ class Request:
 
 @dataclass
 class ColumnMap:
-    """The choice of columns to read from a table with these `labels`; columns are numbers from 0.
+    """Choice of the columns to read from a table with these `labels`; columns are numbered from 0.
 
     `time`, `time_label`: the time column, and the name and unit used for it; `channels`: channel -> formula of columns;
     `parts`: part of the time -> column, if several columns form the time; `date`: column of the date, if the time
@@ -163,10 +166,10 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the column with a name or number (`#4`, from 1); None if there is none.
+    """Find the column with a name or a number (`#4`, from 1); None if there is none.
 
-    If `mapped`, the last words of a column's name suffice, such as `ch2`. Raises InputError if several columns match;
-    `description` begins its message.
+    If `mapped`, the last words of a name are enough, such as `ch2`. Raises InputError if several columns match;
+    `description` begins the message.
     """
     folded = name.casefold()
     for matches_name in (  # strict criteria first
@@ -221,10 +224,10 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
-    """Choose the unit in which a channel is read; return it and a note for the history, or None.
+    """Choose the unit in which a channel is read; return the unit, and a note for the history or None.
 
-    `unit`: of the column; None: raw counts; `description`: the column, in the note. Raises InputError for a wrong
-    dimension.
+    `unit`: unit of the column, None for raw counts; `description`: the column in the note. Raises InputError for a unit
+    of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -342,7 +345,10 @@ def _date_columns(choice: ColumnMap) -> list[int]:
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Add a note on the columns that are not `used`, with a map for them; those that are measured become `unused`."""
+    """Note unused columns for the history, and collect the measured ones in `choice.unused`.
+
+    `used`: numbers of the other columns. The note contains a map with which the unused ones could be read.
+    """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
     if not unused:

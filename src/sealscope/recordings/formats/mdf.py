@@ -47,7 +47,10 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _open_file(MDF: Any, path: Path) -> Any:
-    """Open an MDF file; an object that failed to open is marked closed, as its destructor would print an error."""
+    """Open an MDF file with the class `MDF`.
+
+    If that fails, the object is marked as closed, because its destructor would print an error.
+    """
     try:
         return MDF(path)
     except Exception as error:

@@ -139,7 +139,10 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts in chunks: many cells may refer to one text as long as the file, `file_size` [bytes]."""
+    """Read a data set of texts in chunks that bound the memory.
+
+    Many cells may refer to one text, which may be as long as the file, `file_size` [bytes].
+    """
     import h5py
 
     check_texts(data.size, data.dtype.itemsize, name)
@@ -182,7 +185,10 @@ def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write a NetCDF-4 file without loss; it is made in memory, as libhdf5 aborts the process if the disk is full."""
+    """Write a NetCDF-4 file without loss of precision.
+
+    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
+    """
     import h5netcdf
 
     content = BytesIO()

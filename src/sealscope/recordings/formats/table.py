@@ -66,9 +66,10 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 @dataclass(frozen=True)
 class Clock:
-    """The times of samples.
+    """The sampling times of series.
 
-    `key` is equal for series sampled together; `read` returns times (n,) [s] and the time stamp of 0 s, or None.
+    `key`: equal for series sampled together; `read`: function that returns the times (n,) [s] and the time stamp of 0
+    s, which is None if unknown.
     """
 
     key: Hashable
@@ -82,10 +83,10 @@ class Clock:
 
 @dataclass(frozen=True)
 class Series:
-    """A named series of a file.
+    """A named series of samples in a file, read when needed.
 
-    `group`: name of its group, or empty; `count`: number of samples; `values`: reads the samples (n,): doubles, texts
-    or datetime64; `clock`: None if the file does not state when they were taken.
+    `group`: name of its group, or empty; `count`: number of samples; `values`: function that reads the samples (n,) as
+    doubles, texts or datetime64; `clock`: sampling times, None if the file does not state them.
     """
 
     group: str
@@ -111,7 +112,7 @@ def uniform_clock(
 
 
 class RecordingFields(NamedTuple):
-    """The arguments of `Recording` in order, and the `kind` of its file, in words."""
+    """The arguments of `Recording` in order, followed by the `kind` of the file in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -297,7 +298,11 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 
 
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
-    """Read the times (n,) [s] of a time series and the time stamp of 0 s: its first, None in a group, else `start`."""
+    """Read the times (n,) [s] of a time series, and the time stamp of 0 s.
+
+    Time stamps count from the first of them, which is returned, or None for a series in a group. For other times the
+    stamp is `start`. Raises InputError if no row has a time.
+    """
     values = time.values()
     if values.dtype.kind == "m":
         return timedelta_seconds(values), start
@@ -450,9 +455,10 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 
 @dataclass(frozen=True)
 class _LongTable:
-    """The rows of a long table; the rows of each name are read as a recording with one channel, `u` in counts.
+    """The rows of a long table, in which each row is one value of a named channel.
 
-    `columns`: column -> cells (n,); `value`, `time`: columns of values and times.
+    `columns`: column -> cells (n,); `value`, `time`: columns of the values and times. The rows of each name are read as
+    a recording with the single channel `u` in counts.
     """
 
     choice: ColumnMap
@@ -539,7 +545,10 @@ def _pivot_long_table(
 
 
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
-    """Raise InputError for more than `MAX_VALUES` values, or more than a file of `file_size` [bytes] can hold."""
+    """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
+
+    `file_size`: size of the file [bytes]; None: not checked.
+    """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(
             f"a recording must have at most {MAX_VALUES} values in the columns used (2 GiB), got {n_rows} rows of "

@@ -233,12 +233,12 @@ class _Block:
 
 
 class _Log:
-    """Reads the rows of a text log in blocks.
+    """Reader of the rows of a text log, block by block.
 
     `kinds`: column -> kind, and `date`: column of the date or None, as for `table.Prepare`; `min_cells`: cells that a
-    row needs; `n_rows`, `n_repeated`, `n_text_lines`: rows, repeated heading lines and lines of text read so far;
-    `has_stamps`, `has_date`: kind of the time column, None until its first cell; `n_words`: words by column;
-    `last_width`: cells of the last row; `null_values`: texts that pyarrow reads as missing.
+    row needs; `n_rows`, `n_repeated`, `n_text_lines`: rows, repeated heading lines and lines of text read until now;
+    `has_stamps`, `has_date`: kind of the time column, None until its first cell; `n_words`: number of words by column;
+    `last_width`: number of cells in the last row; `null_values`: texts that pyarrow reads as missing.
     """
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
@@ -426,7 +426,10 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Test by its first cell whether the time column has stamps; find out whether a date column completes them."""
+        """Decide from its first cell whether the time column contains stamps.
+
+        Also finds out whether a date column completes these stamps (`has_date`).
+        """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
             self.has_stamps = not is_number(cells[index], self.layout.decimal) and is_stamp(cells[index])

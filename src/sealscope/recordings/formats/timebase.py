@@ -73,8 +73,9 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 class TimeState:
     """The state of a log's time column between two parts of the log.
 
-    `head`: first times of a column without unit; `rate`: sampling rate [Hz]; `resolution`: of times that samples share
-    [s]; `last_time`: the last time as in the file, and `last_seconds`: the same [s].
+    `head`: first times of a column without a unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of coarse times
+    that several samples share; `last_time`: the last time as in the file; `last_seconds`: the same in seconds. None:
+    not known.
     """
 
     head: Array | None = None
@@ -138,7 +139,10 @@ def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Test whether the first date with one number over 12 has the day before the month; None without such a date."""
+    """Decide from the first date with a number over 12 whether the day precedes the month.
+
+    None without such a date.
+    """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((first for first, second in over_12 if first != second), None)
 
@@ -334,7 +338,10 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 
 
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
-    """Convert numbers (n,) without a unit to seconds; size and step of the `finite` ones tell days from seconds."""
+    """Convert numbers (n,) without a unit to seconds.
+
+    The size and the steps of the `finite` numbers show if they are days or seconds.
+    """
     first, is_first_part = float(finite[0]), state.head is None
     state.head = head = finite if state.head is None else state.head
     if (days := _detect_days(head)) is not None:
@@ -361,10 +368,10 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Detect by their steps that numbers (n,) are days; return (origin, meaning in words), or None for seconds.
+    """Detect numbers (n,) that count days.
 
-    Numbers are days if, taken as seconds, they were sampled faster than any logger does; the origin of fractions of a
-    day is None.
+    Returns (origin, meaning in words), or None if they count seconds. They count days if, taken as seconds, their steps
+    are shorter than any logger's. The origin is None for fractions of a day.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -412,9 +419,10 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Space samples that share coarse times (n,) uniformly; return (resolution [s], new times), or None if none do.
+    """Spread samples that share a coarse time evenly.
 
-    A part too short to estimate the resolution, and without a gap, uses the resolution and rate of `state`.
+    Returns (resolution [s], new times (n,)), or None if none do. A part that is too short to estimate the resolution
+    uses that of `state`, and its rate, unless it has a gap.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)

@@ -50,7 +50,7 @@ def _fold(text: str) -> str:
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name for comparison, as the name of its group may stand before it."""
+    """Return the last word of a column's name for comparison, because a group name may precede it."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 

@@ -36,7 +36,7 @@ _MAX_NAME = 80
 
 
 class _Guess(NamedTuple):
-    """The guessed meaning of a column: `kind` of quantity, `side` (`_find_side`), and `unit` or None."""
+    """Guessed meaning of a column, with `kind` of quantity, `side` (`_find_side`), and `unit` or None."""
 
     kind: str
     side: str
@@ -51,9 +51,9 @@ class _Guess(NamedTuple):
 
 
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
-    """Propose a map, channel (or ``t``) -> column, for the columns whose names tell their meaning.
+    """Propose a map, channel (or ``t``) -> column, from columns whose names reveal their meaning.
 
-    Columns with a channel's own name are omitted, and channels that several columns could be. A unit at the end of a
+    Leaves out columns that already have a channel's name, and channels that fit several columns. A unit at the end of a
     name (``PA_bar``) becomes the column's unit.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
@@ -197,7 +197,10 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that "head" stands for: A if other columns are called rod, B if cap; empty if unknown."""
+    """Find the chamber that "head" means in these labels; empty if unknown.
+
+    Chamber A if other columns are called rod, B if they are called cap.
+    """
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
         return ""

@@ -48,10 +48,11 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 
 
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
-    """Combine a column of dates or whole seconds and the `parts` (n,) of its time to time stamps or seconds (n,).
+    """Combine dates or whole seconds with columns of time parts to time stamps or seconds (n,).
 
-    `base`: datetime64, or doubles in `unit`; with hours among the parts, only its dates are used. None if the parts are
-    not parts of this time: fractional hours, or milliseconds since the start next to stamps.
+    `base` (n,): datetime64, or doubles in `unit`; with hours among the parts only its dates are used. `parts`: part of
+    the time -> values (n,). None if the parts do not belong to this time, such as fractional hours, or milliseconds
+    since the start next to stamps.
     """
     second_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = second_parts[-1] if second_parts else "second"

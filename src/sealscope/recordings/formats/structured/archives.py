@@ -80,7 +80,10 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 
 @contextmanager
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
-    """Open the single file of an archive; yield (stream, name, size), "" and 0 if the archive does not state them."""
+    """Open the single file in an archive; yield (stream, name, size [bytes]).
+
+    Name and size are "" and 0 if the archive does not state them.
+    """
     with ExitStack() as stack:
         if kind == "zip":
             zip_archive = stack.enter_context(zipfile.ZipFile(path))

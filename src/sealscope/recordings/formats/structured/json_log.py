@@ -179,7 +179,10 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Return the length of a block of columns: arrays of equal length, one of them the time; None for others."""
+    """Return the number of rows in a block of columns; None if the member is no such block.
+
+    A block is a mapping of arrays of equal length, one of which is the time.
+    """
     if not all(isinstance(value, list) for value in member.values()):
         return None
     lengths = set(map(len, member.values()))

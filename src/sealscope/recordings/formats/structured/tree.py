@@ -26,7 +26,10 @@ _COLUMN_NAME_FIELDS = ("colheaders", "header", "headers", "labels", "channels", 
 
 
 def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
-    """Yield the series in a file's values by name: arrays (n,) or (n, m), structs as mappings, tables, objects."""
+    """Yield the series in the values of a file.
+
+    `fields`: name -> value: an array (n,) or (n, m), a struct as a mapping, a table or an object.
+    """
     yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
 
 
@@ -50,9 +53,9 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
-    """Return the fields of a struct, or the properties of an object; None for other values.
+    """Return the fields of a struct, or the properties of an object, by name; None for other values.
 
-    The fields of an array of structs are its structs, called `(1)`, `(2)`, ...
+    An array of structs has its structs as fields, called `(1)`, `(2)`, ...
     """
     properties = getattr(value, "properties", value)
     if isinstance(properties, Mapping):
