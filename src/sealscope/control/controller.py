@@ -36,9 +36,9 @@ measured_at = record_view(record_dtype(*Measured._fields))
 class CompiledLaw(NamedTuple):
     """A controller's law in machine code, for one run from its beginning.
 
-    `address`: that of a function ``double law(double *memory, double *measured)``, from numba.cfunc or C, that returns
-    the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and parameters; memory[0] is the
-    compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law.
+    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or C, that
+    returns the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and parameters; memory[0] is the
+    compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law, None for none.
     """
 
     address: int
@@ -87,7 +87,10 @@ class _PythonLaw:
         self.law = CompiledLaw(address, self._memory, self)
 
     def _call_voltage(self, _memory: int, measured: int) -> float:
-        """Compute the voltage for the measurements at an address; on an exception store it in `raised`, return NaN."""
+        """Compute the voltage [V] from the numbers of a `Measured` at the address `measured`.
+
+        If the controller raises an exception, store it in `raised` and return NaN.
+        """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
             volts = float(self._voltage(Measured(*numbers)))

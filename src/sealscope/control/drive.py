@@ -31,10 +31,10 @@ DRIVE = record_dtype(
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
-    """Compute the voltage [V] at which a drive gives a flow [m^3/s] against `dp` = p_A - p_B [Pa].
+    """Compute the voltage [V] that makes a drive give a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    It solves the equation of `ValveDrive` for u, or that of `Drive`, in which s/(s + corner) is a high-pass filter of
-    the speed. `m`: a record `DRIVE`; each call advances its filter by one sample.
+    The equation of `ValveDrive` or of `Drive` is solved for u; s/(s + corner) is a high-pass filter of the speed. `m`:
+    a record `DRIVE`; each call advances its filter by one sample.
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
@@ -56,9 +56,10 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that attributes of an object are finite numbers > 0 (`positive`) or >= 0 (`not_negative`).
+    """Check that attributes of `source` are finite numbers in their range.
 
-    Raises InputError otherwise, which calls the object `what`.
+    `positive`, `not_negative`: names of the attributes that must be > 0 and >= 0. Raises InputError otherwise; its
+    message names the object by `what`.
     """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
@@ -74,7 +75,7 @@ class _Invertible(ABC):
         """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` [V]: overlap of a valve."""
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build the function (flow [m^3/s], p_A - p_B [Pa]) that returns a voltage [V], for calls at `rate` [Hz]."""
+        """Build the function (flow [m^3/s], p_A - p_B [Pa]) -> voltage [V], to be called at `rate` [Hz]."""
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 

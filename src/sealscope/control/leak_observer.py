@@ -76,7 +76,8 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 def _update_with_block(m: Any, dp_sum: float) -> None:
     """Update the Kalman filter with the block that ends now; `dp_sum`: sum of p_A - p_B [Pa] over its samples.
 
-    The block is left out if the pressure difference is small, changes its sign, or leaves a check valve open.
+    The block is left out if the pressure difference is small, changes its sign, or leaves a check valve open. It is
+    also left out if it is an outlier, unless the last block was an outlier of the same sign: a leak may have opened.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:

@@ -77,7 +77,10 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 def open_loop(
     rig: Rig, controller: Controller, f: Array, speed: float = 0.0, load: float = 0.0
 ) -> tuple[NDArray[np.complex128], bool]:
-    """Compute the open loop L (n,) at frequencies `f` (n,) [Hz], and whether the rig itself is stable."""
+    """Compute the open loop L (n,) of rig and controller at frequencies `f` (n,) [Hz].
+
+    The second result is True if the rig itself is stable. `speed` [m/s], `load` [N]: see `margins`.
+    """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
     # (z I - A)^-1 B by the eigenvalues of A, for all frequencies at once
@@ -143,9 +146,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
 
 def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
-    """Compute the controller's voltage response to a unit impulse of each measured state: (index, response).
+    """Compute the controller's voltage response to a unit impulse of each measured state.
 
-    Responses that are zero are left out. `state` (14,): the state at which the controller rests.
+    Returns (index of the state, response (n,) [V per unit of the state]), without responses that are zero. `state`
+    (14,): its pressures are those measured before and after the impulse.
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
@@ -171,7 +175,10 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 
 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Compute sum_n a_n z^-n of an impulse response a_n that stays at its last value, as an integrator's does."""
+    """Compute the z-transform sum_n a_n z^-n of an impulse response a_n that stays at its last value.
+
+    `response` (n,): its first n values, the last of which it keeps, as an integrator's response does; `z` (m,).
+    """
     last_value = response[-1]
     transient = response - last_value
     is_relevant = np.abs(transient) > 1e-9 * np.abs(response).max()

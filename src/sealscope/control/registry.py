@@ -45,7 +45,7 @@ def _installed() -> Mapping[str, EntryPoint]:
 
 
 def is_installed(name: str) -> bool:
-    """Return True if a name is that of a built-in or installed controller, False for one of a user."""
+    """Return True if `name` is a built-in or installed controller, False if it can only be a user's own."""
     return name in CONTROLLERS or name in _installed()
 
 
@@ -120,7 +120,10 @@ def _find_module_file(module: str) -> Path | None:
 
 
 def _load_module(place: str) -> Any:
-    """Import a module by its name, or from a Python file under a name made of the file's hash."""
+    """Import a module by its name, or from a Python file; raise InputError for a file that does not exist.
+
+    A file is imported once, under a name that contains the hash of its text.
+    """
     if not place.endswith(".py"):
         return importlib.import_module(place)
     path = Path(place)

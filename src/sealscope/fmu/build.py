@@ -71,7 +71,7 @@ def this_platform() -> str:
 
 
 class Compiler(NamedTuple):
-    """A C compiler's command, and whether it compiles for other systems."""
+    """A C compiler: its command, and True if it also compiles for other systems."""
 
     command: list[str]
     cross_compiles: bool

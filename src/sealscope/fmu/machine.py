@@ -86,9 +86,9 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 class RigChoice(NamedTuple):
     """The laws of a rig that are compiled into its unit; all parameters remain variables of the unit.
 
-    `laws`: which optional laws apply, in the order of `physics.rig.CHOICES`; `exponent`, `literal_metering`: reading of
-    the throttles' equations (`throttle_flow_coefficients`); `implicit`: implicit-explicit method, not Runge-Kutta;
-    `euler`: integral of the speed loop by eq. (4.2).
+    `laws`: choices and optional laws of the rig, in the order of `physics.rig.CHOICES`; `exponent`, `literal_metering`:
+    reading of the throttles' equations (`throttle_flow_coefficients`); `implicit`: implicit-explicit method, not
+    Runge-Kutta; `euler`: integral of the speed loop by eq. (4.2).
     """
 
     laws: tuple[bool | tuple[bool, ...], ...]
@@ -115,7 +115,7 @@ def _build_parameters_law(
 
     @law
     def model_parameters(v: Any, G_ext_A: float, G_ext_B: float) -> Any:
-        """Derive the model's parameters from a unit's values v and the external leakage to add."""
+        """Compute the model's parameters from a unit's values v and additional external leakage [m^3/(s Pa)]."""
         derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
         parameters = to_fixed_tuple(v, _N_PARAMETERS)
         parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + G_ext_A)
@@ -138,7 +138,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Derive the model's parameters from the unit's values and its inputs of external leakage."""
+        """Compute the model's parameters from the unit's values and its inputs of external leakage."""
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:

@@ -120,7 +120,10 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Raise InputError if a unit cannot run an experiment: a target, a fault of the machine, or a leak as a flow."""
+    """Raise InputError if a unit cannot run the experiment.
+
+    A unit can have neither a position target, nor a fault or drift of the machine, nor a leak stated as a flow.
+    """
     if experiment.target is not None:
         raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
     if experiment.effects():

@@ -195,7 +195,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t, 95 %
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Clear the sensor's memory `y`; return a failure if the pump has no displacement."""
+        """Clear the sensor's memory `y`; return 0, or a code of `FAILURES` if the pump has no displacement."""
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
@@ -324,7 +324,7 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 
 @large_law
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
-    """Append the conductance of the block in `m.model` to the history, unless it is imprecise and from a standstill.
+    """Append the conductance of the block in `m.model` to the history, except an imprecise one at standstill.
 
     `m`: memory; `size_error`: relative uncertainty of the machine's size; `n_rows`, `pressure` [Pa]: number of rows and
     mean abs(p_A - p_B) of the block; `is_learned`: update the other coefficients with the block.
@@ -367,7 +367,10 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Clear all sums and results in memory m, as those from a standstill cannot be compared with later ones."""
+    """Discard the fit and the estimates in memory m.
+
+    Those from a standstill cannot be compared with later ones.
+    """
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -447,7 +450,7 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of a column of the history over the n blocks up to the `newest`."""
+    """Compute the mean of a column of the history over the last n blocks, up to block `newest`."""
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n
@@ -456,9 +459,9 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 
 @large_law
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
-    """Compute the variance of the mean comparable conductance of the n blocks up to the `newest`.
+    """Compute the variance of the mean comparable conductance of the last n blocks, up to block `newest`.
 
-    The larger of the sample variance between the blocks and the mean of their variances, divided by n.
+    This is the larger of the sample variance between the blocks and the mean of their variances, divided by n.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):

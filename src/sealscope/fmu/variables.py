@@ -58,7 +58,7 @@ def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Make the variable of a rig's parameter; None if its law is absent from the rig."""
+    """Make the variable of a rig's parameter `name`; return None for a part that the rig does not have."""
     value, field = float(attrgetter(name)(rig)), dict(iter_fields(Rig))[name]
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
     is_absent = value == absent_of(field)

@@ -84,10 +84,11 @@ def piston_acceleration(
 
 @contracted
 def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
-    """Compute the force A_opp p [N] against +x of an opposing cylinder that is fed at p_opp [Pa] through an orifice.
+    """Compute the force A_opp p [N] of an opposing cylinder against +x.
 
-    p = p_opp + v |v| (A_opp/C_opp)^2 is the orifice's law solved for the pressure, no lower than vacuum. The oil of
-    that cylinder is taken as incompressible (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
+    The cylinder is fed at p_opp [Pa] through an orifice of coefficient C_opp [m^3/(s Pa^0.5)]; v [m/s]: piston's
+    velocity. p = p_opp + v |v| (A_opp/C_opp)^2 is the orifice's law solved for the pressure, no lower than vacuum. The
+    oil of that cylinder is taken as incompressible (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
     """
     drop_coefficient = A_opp / C_opp
     return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)

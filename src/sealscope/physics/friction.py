@@ -50,7 +50,7 @@ def karnopp_friction(
 
 @contracted
 def stuck_velocity(v: float, v_th: float) -> float:
-    """Compute the velocity [m/s] at which a piston with Karnopp's friction moves: 0 while it sticks, |v| < v_th."""
+    """Compute the velocity [m/s] of a piston with Karnopp's friction: v, or 0 while it sticks (|v| < v_th)."""
     return select(abs(v) < v_th, 0.0 * v, v)  # type: ignore[no-any-return]
 
 

@@ -48,7 +48,7 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose the flow coefficient of a one-way throttle by the sign of its pressure difference `dp`."""
+    """Choose the flow coefficient of a one-way throttle: `c_forward` if `dp` > 0 [Pa], else `c_reverse`."""
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
@@ -82,8 +82,8 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Compute the flow Q [m^3/s] of a one-way throttle in an implicit stage, from d + g Q(d) = total.
 
-    d [Pa]: pressure difference of the throttle at the stage's end; `total` [Pa]: the same if nothing flowed; `g` >= 0
-    [Pa s/m^3]: its fall per flow. The root is unique and has the sign of `total`.
+    d [Pa]: pressure difference of the throttle at the stage's end; `total` [Pa]: this difference if nothing flowed; `g`
+    >= 0 [Pa s/m^3]: fall of the difference per unit flow. The root is unique and has the sign of `total`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)
@@ -126,5 +126,9 @@ def filtered_flow(
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute the magnitude [m^3/s] of a filter's flow, if Q [m^3/s] divides between filter and bypass valve."""
+    """Compute the magnitude [m^3/s] of the flow through a filter with a bypass valve.
+
+    `Q` [m^3/s]: flow through both; `R` [Pa s/m^3]: the filter's resistance. The valve opens at the drop `p_bypass`
+    [Pa], with the conductance `G_bypass` [m^3/(s Pa)].
+    """
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

@@ -155,7 +155,10 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Build the numbers of a rig as the compiled laws take them."""
+    """Build the numbers of a rig for the compiled laws.
+
+    These are its parameters, the numbers derived from them, and the choice of laws.
+    """
     values = parameter_values(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
     choices["made_up"] = rig.makeup.check_valves != "absent"
@@ -190,14 +193,17 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the type of the record that `pack_numbers` returns; `lengths`: of the tuple of each law in `LAWS`."""
+    """Build the dtype of the record that `pack_numbers` returns.
+
+    `lengths`: for each law in `LAWS`, the length of its tuple in `RigNumbers` (0: the rig does not have this law).
+    """
     truths = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
     return np.dtype([*((name, "f8") for name in NUMBERS), *truths, *laws], align=True)  # type: ignore[list-item]
 
 
 def pack_numbers(p: RigNumbers) -> Any:
-    """Pack the numbers into a record: compiled functions pass its address instead of 100 values, and compile faster.
+    """Pack the numbers into one record, which compiled functions pass by its address instead of 100 values.
 
     Numbers with the tables of a load, which do not fit into a record, are returned unchanged.
     """
@@ -249,7 +255,10 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s]: set speed, of the command u [V] or of a supply, minus actual speed."""
+    """Compute the motor's speed error [rad/s], set speed minus actual speed.
+
+    The command `u` [V] sets the speed; in a valve-controlled rig the supply's speed `omega_P` does.
+    """
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -289,7 +298,10 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
 @contracted
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the resistances [Pa s/m^3] of the filters in lines A and B, clogged by the oil that has passed."""
+    """Compute the resistances [Pa s/m^3] of the filters in lines A and B.
+
+    They grow with the oil volume that has passed (`clogged_resistance`).
+    """
     if len(p.clogging) == 0:
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
@@ -300,10 +312,10 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 def implicit_flows(
     total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
 ) -> tuple[float, float]:
-    """Compute the flows Q_A, Q_B [m^3/s] through throttles and filters from d + g Q(d) = total on each side.
+    """Compute the line flows Q_A, Q_B [m^3/s] in an implicit stage from d + g Q(d) = total on either side.
 
-    `total` [Pa], `g` [Pa s/m^3], d: see `implicit_orifice_flow`. A filter in series with its throttle, p_1 - p_A =
-    d + R Q, adds R to g.
+    `total` [Pa], `g` [Pa s/m^3], d: see `implicit_orifice_flow`. A filter in series with the throttle of its line,
+    p_1 - p_A = d + R Q, adds R to g.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -435,9 +447,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the rates dp_A/dt .. dp_2/dt [Pa/s] that external leakage and make-up cause, and the make-up's flow.
+    """Compute the pressure rates dp_A/dt .. dp_2/dt [Pa/s] due to external leakage and make-up.
 
-    The flow [m^3/s] is that out of the accumulator, at its pressure.
+    Also returns the make-up's flow [m^3/s] out of the accumulator, at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -460,7 +472,10 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 @contracted
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
-    """Compute a servo valve's flows [m^3/s] from P to A, A to T, P to B, B to T; x_s > 0 opens P-A and B-T."""
+    """Compute a servo valve's flows [m^3/s] from P to A, A to T, P to B and B to T.
+
+    A spool position x_s > 0 opens the edges P-A and B-T, x_s < 0 the other two.
+    """
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
     return (

@@ -24,7 +24,10 @@ BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 @law
 def standstill_force(x: float, p: RigNumbers) -> float:
-    """Compute the force [N] against +x that the pressures carry at standstill at x [m]: load less end stop."""
+    """Compute the force [N] against +x that the chamber pressures carry at standstill at x [m].
+
+    It is the load, with an opposing cylinder's, less the force of an end stop.
+    """
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
 
@@ -50,10 +53,11 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Write the standstill of a pump-controlled rig at x [m] under `force` [N] against +x into a state `y` of zeros.
+    """Fill a state `y` of zeros with the standstill of a pump-controlled rig.
 
-    The motor holds the pump with the current i = T_load/C_m, eq. (4.5), for which the integral of the speed controller
-    is R_c i/K_i, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`, `BEYOND_DRIVE`.
+    `x` [m]: position; `force` [N]: against +x. The motor holds the pump with the current i = T_load/C_m, eq. (4.5), for
+    which the integral of the speed controller is R_c i/K_i, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`,
+    `BEYOND_DRIVE`.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -78,9 +82,10 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
 
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
-    """Compute p_1, p_A, p_B [Pa] at which the supply's pressure is constant, with a servo valve at null.
+    """Compute p_1, p_A, p_B [Pa] at standstill with a servo valve at null.
 
-    By bisection of dp_1/dt, which falls as p_1 rises. `force` [N] against +x; `x` [m]: position of the piston.
+    The supply's pressure is constant there: p_1 is the root of dp_1/dt, which falls as p_1 rises, by bisection.
+    `force` [N] against +x; `x` [m]: position of the piston.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return

@@ -48,11 +48,12 @@ _INSTRUMENT_SYMBOLS = {"noise", "hum", "offset", "gain_error", "scale_error", "c
 
 @dataclass(frozen=True)
 class Effect:
-    """The change of one number over time; several effects on it give (number + sum of addends) x product of factors.
+    """Change of one parameter of the machine or of an instrument over time.
 
-    `field`: a number of the compiled laws, or the dotted name of an instrument's parameter. `change(t)` at times t [s]:
-    addend if `additive`, else factor; `max_change`: its largest step from one block to the next; `breakpoints`: times
-    [s] at which it may jump or change its slope; `min_block`: shortest block [s].
+    `field`: name of a number in `RigNumbers`, or dotted name of an instrument's parameter; `change(t)`: addend (if
+    `additive`) or factor at times t [s]. Several effects on one parameter give (value + sum of addends) x product of
+    factors. `max_change`: largest change of it within a block of constant parameters; `breakpoints`: times [s] of
+    its jumps and changes of slope; `min_block` [s]: shortest block.
     """
 
     field: str
@@ -78,13 +79,18 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute each model parameter that an effect changes, by name, at times t [s]; `base`: all without effects."""
+    """Compute the model parameters that the effects change, by name, at times t (n,) [s].
+
+    `base`: the model's parameters without effects.
+    """
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
 def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
-    """Compute the bounds (n + 1,) of the blocks within which changing numbers are constant, as output indices.
+    """Divide a run into n blocks of constant parameters; return their bounds (n + 1,) as output indices.
+
+    `n_out`: number of outputs, at `rate` [Hz].
 
     A block is at most `LONGEST_BLOCK` long, and so short (but not below an effect's `min_block`) that no effect changes
     by more than its `max_change`. Breakpoints fall on bounds, to within one output interval at `rate` [Hz].
@@ -107,9 +113,10 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the parameter sets that limit the solver's step: `base`, and those just before and after valves switch.
+    """Collect the parameter sets for which the solver's step must be short enough.
 
-    Only fast effects (valves), with a `min_block` below `SHORTEST_BLOCK`, matter; all others change too little.
+    These are `base`, and the parameters just before and after each breakpoint of a fast effect, such as a valve that
+    switches (`min_block` below `SHORTEST_BLOCK`). All other effects change the parameters too little.
     """
     fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
@@ -148,7 +155,7 @@ class Schedule:
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
-        """Split the outputs first <= k < last at the bounds of blocks; yield (start, stop, numbers) of each part."""
+        """Yield the parts (start, stop, parameters) of the outputs first <= k < last, split at block bounds."""
         k = int(np.searchsorted(self.bounds, first, side="right")) - 1
         while first < last:
             stop = min(int(self.bounds[k + 1]), last)
@@ -187,7 +194,7 @@ class Readings:
 
 
 class Shape(Protocol):
-    """The change of a drifting parameter since the start over time, relative or in the parameter's unit."""
+    """Change of a drifting parameter since the start of the run, relative or in the parameter's SI unit."""
 
     def value_at(self, t: Array) -> Array:
         """Compute the change at times t [s] (any shape); 0 at t = 0."""
@@ -231,7 +238,7 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the path to a range (highest less lowest value within the duration) of `size`; keep a constant path."""
+        """Scale the path to a range `size` (highest less lowest value); return a constant path unchanged."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self
@@ -256,7 +263,10 @@ _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
 def is_absolute_drift(parameter: str) -> bool:
-    """Return True for a parameter that drifts in its own unit: an instrument's error or a load, which may be 0."""
+    """Return True for a parameter that drifts in its own unit, because its value may be 0.
+
+    These are the offset, gain and scale errors of instruments, and the load `F_l`.
+    """
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_ABSOLUTE_MAX_CHANGES)
 
 
@@ -317,7 +327,10 @@ class ParameterDrift:
 
 @cache
 def model_parameters_derived_from(parameter: str) -> tuple[tuple[str, float], ...]:
-    """Return the compiled model's parameters that scale with a rig parameter, as (name, exponent); () if none does."""
+    """Return (name, exponent) of each model parameter that is proportional to a power of a rig parameter.
+
+    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter depends on it.
+    """
     from sealscope.physics.rig import NUMBERS
 
     if parameter in PARAMETER_GROUPS:

@@ -19,10 +19,10 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the fewest solver outputs per recorded sample for which a controller samples at outputs only.
+    """Find the fewest solver outputs per recorded sample with an output at each controller sample.
 
-    At least `min_outputs`. `rate`, `controller_rate` [Hz]: of recording and controller. Raises InputError if no number
-    of outputs suits both.
+    `rate`, `controller_rate` [Hz]: sampling rates of recording and controller; `min_outputs`: least result. Raises
+    InputError if no number of outputs suits both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate

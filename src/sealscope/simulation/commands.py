@@ -53,7 +53,7 @@ class Sine:
 
 @dataclass(frozen=True)
 class MultiSine:
-    """u = sum of two or more sines, of which only the last may have an offset."""
+    """Sum of two or more sines; only the last one may have an offset."""
 
     parts: tuple[Sine, ...]
 
@@ -272,7 +272,10 @@ def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make the command that a recording has in its channel `u`, with its first sample at t = 0."""
+    """Make a command of a recording's channel `u`, with the first sample at t = 0.
+
+    `origin` names the recording in messages and texts.
+    """
     return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
 

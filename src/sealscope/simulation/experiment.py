@@ -270,9 +270,9 @@ class Experiment:
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Divide the openings of laminar leaks by the oil's relative viscosity, because warmer oil leaks more.
+        """Divide the openings of laminar leaks by the oil's relative viscosity: warmer oil leaks more.
 
-        The leaks' coefficients hold at the rig's viscosity.
+        The leaks' coefficients hold at the rig's viscosity. Without a fault of the oil the leaks are unchanged.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -294,7 +294,7 @@ class Experiment:
 
     @property
     def error_allowed(self) -> float:
-        """The rms error of a pressure [Pa] by which a step is chosen, as stated or the default."""
+        """Largest rms error [Pa] of a pressure for the choice of the solver's step, as stated or the default."""
         return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property
@@ -313,7 +313,10 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Convert the experiment to plain values, without leaks, faults and drifts, which a diagnosis must find."""
+        """Describe the experiment by plain values, without its leaks, faults and drifts.
+
+        A diagnosis must find those by itself.
+        """
         overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
             "rig": self.rig.name,
@@ -340,9 +343,10 @@ class Experiment:
 
 
 def identity_values(value: Any) -> Any:
-    """Convert a command, leak or other object to plain values that are equal only if all its numbers are equal.
+    """Convert a command, leak or other object to plain values that identify it.
 
-    Arrays become a hash of their bytes, dataclasses the list of their fields' values.
+    Objects with equal plain values are equal in all their numbers: an array becomes a hash of its bytes, a dataclass
+    the list of its fields' values, any other object its `repr`.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
@@ -354,7 +358,11 @@ def identity_values(value: Any) -> Any:
 def _parse_several(
     argument: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str
 ) -> tuple[_Kind, ...]:
-    """Parse an argument of one or several leaks or faults, as texts or as objects; raise InputError for others."""
+    """Parse an argument that states one or several leaks or faults.
+
+    The argument is a text, an object of `kind`, or an iterable of these; None gives an empty tuple. Raises InputError
+    for anything else; `name` names the argument in its message.
+    """
     items = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
     if not isinstance(items, Iterable):
         raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {argument!r}")

@@ -57,13 +57,16 @@ _PATTERNS = {
 
 
 def _parse_number(text: str | None) -> float:
-    """Parse a number of a fault's text, with or without a blank after its sign; 0 for None."""
+    """Convert the text of a number, whose sign may be followed by a blank; return 0 for None."""
     return float((text or "0").replace(" ", ""))
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """The effects and the text of a kind of fault: an entry of `faults.toml`, whose head explains its keys."""
+    """One kind of fault, an entry of `faults.toml`: the pattern of its text, and its effects.
+
+    The head of that file explains the keys.
+    """
 
     name: str
     kind: str
@@ -195,7 +198,10 @@ class Fault:
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the function from times [s] to the oil's viscosity over the rig's; None unless this is an oil fault."""
+        """Build the function of times [s] that gives the oil's dynamic viscosity relative to the rig's.
+
+        Returns None unless this is a fault of the oil's temperature.
+        """
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
@@ -204,7 +210,7 @@ class Fault:
         rig_nu = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
 
         def dynamic_viscosity_ratio(t: Array) -> Array:
-            """Compute the dynamic viscosity over the rig's: kinematic viscosity times density."""
+            """Compute the dynamic viscosity (kinematic viscosity times density) relative to the rig's."""
             T = self._oil_temperature(rig, t)
             nu_ratio = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / rig_nu
             return np.asarray(nu_ratio * thermal_density_ratio(T, oil.T_oil, oil.alpha))
@@ -231,7 +237,10 @@ class Fault:
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """The command `before` with amplitude and frequency changed by a duty fault, and a continuous phase."""
+    """A command whose amplitude and frequency a duty fault changes, with a continuous phase.
+
+    `before`: the original command; `change`: the duty fault.
+    """
 
     before: Command
     change: Fault
@@ -255,7 +264,10 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of a shut-off valve on its throttle's coefficients; InputError for a rig without lines."""
+    """Build the effects of a shut-off valve on the throttle in its line.
+
+    Raises InputError for a rig without lines.
+    """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
 
@@ -271,7 +283,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
         c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:
-            """Compute the change of the coefficient by the valve in series with the throttle."""
+            """Compute the change of the coefficient [m^3/(s Pa^0.5)] at times t [s] as the valve opens or closes."""
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
@@ -295,7 +307,7 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     assert viscosity is not None
 
     def density_power(power: float) -> Callable[[Array], Array]:
-        """Build the function of time for a power of the relative density."""
+        """Build the function of times [s] that gives the density relative to the rig's, raised to a power."""
         alpha = rig.fluid.alpha
         return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 

@@ -32,10 +32,11 @@ class Outputs(Protocol):
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Compute the taps (2 FILTER_REACH factor + 1,) of the anti-alias filter, a Kaiser-windowed sinc of unit gain.
+    """Compute the taps of the anti-alias filter, (2 FILTER_REACH factor + 1,).
 
-    `factor`: the signal's rate over the recording's; `delay`: lag of the filter, a fraction of the interval between
-    taps. Without it the filter has zero phase; with a factor of 1, too, it is a single tap of 1.
+    A Kaiser-windowed sinc of unit gain. `factor`: the signal's rate over the recording's; `delay`: lag of the filter, a
+    fraction of the interval between taps. A filter without delay has zero phase; for `factor` 1 and no delay it is a
+    single tap of 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -47,7 +48,7 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """Reduce the rate of `values` by `factor` to `n` samples, behind the anti-alias filter (`anti_alias_taps`).
+    """Filter `values` against aliasing (`anti_alias_taps`), and keep every `factor`-th one, `n` in all.
 
     `values` must extend FILTER_REACH samples of the lower rate beyond the last one; before the first they are constant.
     `delay` >= 0 in samples of `values`, whole or not: each sample is taken from that much earlier.
@@ -81,9 +82,10 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Sample `values` with a clock that is late by `lateness` (n,), -1 .. 1 intervals of `values`; None: no jitter.
+    """Sample `values` with a clock that jitters.
 
-    `sample(values)`: the samples (n,) of a clock without jitter. Values are interpolated by a parabola through three.
+    `sample(values)`: returns the samples (n,) of a clock without jitter; `lateness` (n,): delay of each sample, -1 .. 1
+    intervals of `values`; None: no jitter. Values are interpolated by a parabola through three of them.
     """
     center = sample(values)
     if lateness is None:
@@ -174,7 +176,7 @@ def record(
     readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
-        """Make the function (symbol, value in the rig) that returns a parameter of a channel's sensor over time."""
+        """Build the function that takes a sensor parameter's symbol and rig value, and returns it over time."""
         return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
     jitter_steps = None

@@ -76,10 +76,13 @@ class Trajectory:
 
 
 class RunInputs:
-    """The inputs of a run over time: the experiment's command, and leakage by `leaks` with known coefficients."""
+    """Inputs of a run over time: the voltage command, and the sums G and C over all leaks.
+
+    Under a position target the command is 0, because the controller sets the voltage (`Feedback`).
+    """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Prepare the inputs from the experiment's command, with `leaks` in place of the experiment's leaks."""
+        """Take the experiment's command, and `leaks` with known coefficients in place of its leaks."""
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the voltage is that of the controller (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
@@ -91,12 +94,12 @@ class RunInputs:
         return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
 
     def max_leakage(self, t: Array) -> tuple[float, float]:
-        """Compute the largest G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] of all leaks together at times t [s]."""
+        """Compute the maxima of total G [m^3/(s Pa)] and of total C [m^3/(s Pa^0.5)] over the times t [s]."""
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
     def _leakage(self, t: Array) -> tuple[Array, Array]:
-        """Compute the sums of G and of C of all leaks at times t [s]."""
+        """Compute the total G [m^3/(s Pa)] and total C [m^3/(s Pa^0.5)] of all leaks at times t [s]."""
         G, C = np.zeros(t.shape), np.zeros(t.shape)
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
@@ -106,9 +109,10 @@ class RunInputs:
         return G, C
 
     def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Check that the command u(t) [V] is within its limit during the run, and clip it after the end.
+        """Check that the command u(t) [V] stays within the limit during the run, and clip it after the end.
 
-        Raises InputError if it is not. Only the look-ahead of the anti-alias filter reads the command after the end.
+        Raises InputError for a command beyond the limit. After the end only the look-ahead of the anti-alias filter
+        reads the command.
         """
         if np.abs(u).max(initial=0.0) <= self._limit:
             return u
@@ -117,7 +121,10 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the solver outputs per recorded sample, so many that a controller's samples fall on outputs, too."""
+    """Compute the number of solver outputs per recorded sample.
+
+    The anti-alias filter needs a minimum (`oversampling_of`); every sample of a controller must fall on an output.
+    """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
     controller = experiment.active_controller
@@ -125,12 +132,15 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the outputs per sample at `rate` [Hz]: 4 for the anti-alias filter, but at most one per `step` [s]."""
+    """Compute the outputs per sample for the anti-alias filter: 4, or the steps in a sample if fewer.
+
+    `rate` [Hz]: sampling rate of the recording; `step` [s]: longest step of the solver.
+    """
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Compute the number of solver steps from one output to the next at `rate` [Hz], each at most `step` [s] long."""
+    """Compute the fewest solver steps of at most `step` [s] between two outputs at `rate` [Hz]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
@@ -173,12 +183,12 @@ def integrate_run(
 
 
 def _without_mean_leaks(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace leaks with a stated mean flow by leaks of coefficient 0."""
+    """Replace each leak with a stated mean flow by one of coefficient 0, where the search starts."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the coefficients of the experiment's leaks that give their stated mean flows."""
+    """Find the coefficients that give the leaks' stated mean flows; return the leaks with them."""
     if not any(leak.mean for leak in experiment.leaks):
         return _without_mean_leaks(experiment.leaks)
     return run_with_sized_leaks(experiment)[0]
@@ -189,7 +199,7 @@ def run_with_sized_leaks(
     progress: Callable[[str, float], None] | None = None,
     report_time: Callable[[float], None] | None = None,
 ) -> tuple[tuple[Leak, ...], Trajectory]:
-    """Find the coefficients of the experiment's leaks, and integrate its run with them; return both.
+    """Find the coefficients of the experiment's leaks; return the sized leaks and their run.
 
     `progress(task, fraction)` is called while leaks are sized, `report_time(t)` with the time reached [s] if there are
     none to size.
@@ -204,7 +214,10 @@ def run_with_sized_leaks(
     is_first_run = True
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate leaks with coefficients (n,); return mean flows [m^3/s] for a coefficient of 1, leaks and run."""
+        """Simulate leaks with coefficients (n,).
+
+        Returns each leak's mean flow per unit coefficient (n,), and (leaks, run).
+        """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
         sized_leaks = tuple(replace(leak, coefficient=float(coefficient)) for leak, coefficient in pairs)
@@ -341,7 +354,7 @@ class _Integration:
     reached: float = 0.0
 
     def refuse_unresolved(self, n_steps: int) -> None:
-        """Raise SimulationFailed if `n_steps` steps an output cannot resolve the rig."""
+        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig."""
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
                 refuse_unresolved(p, 1.0 / (self.rate * n_steps), self.method)
@@ -387,7 +400,7 @@ class _Integration:
                 self.progress(self.reached)
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Check the outputs `rows` of steps of h [s]; rows[0] is output `first` of the run.
+        """Check the outputs `rows` (n, 21), integrated with steps of h [s]; rows[0] is output `first` of the run.
 
         Raises SimulationFailed if one is not finite or, unless the run may be unresolved, if a pressure is below vacuum
         or the step is too long for an end stop that was hit.
@@ -422,7 +435,10 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 
 
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
-    """Raise SimulationFailed if `method`, rk4 or imex, cannot resolve the rig, leaks excepted, by steps of h [s]."""
+    """Raise SimulationFailed if steps of h [s] are too long for the rig, apart from its leaks.
+
+    `method`: rk4 or imex.
+    """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
     refuse_long(
@@ -437,7 +453,10 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 
 
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
-    """Choose the windows, as outputs (start, stop), in which a run of `n_out` outputs at `rate` [Hz] is checked."""
+    """Choose the time windows in which the solver's step is checked, each as output indices (start, stop).
+
+    `n_out`: number of outputs of the run; `rate` [Hz]: their rate.
+    """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
     for fraction in LATER_STARTS:
@@ -448,10 +467,10 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
 
 
 class StepErrorCheck:
-    """The comparison of a run at one step with the same run at half of it, window by window.
+    """Comparison of a run at one solver step with the same run at half that step, window by window.
 
-    `pressure_error` [Pa rms]: largest difference of a pressure so far; `detail_error`: largest relative difference of a
-    detail's RMS.
+    `pressure_error` [Pa]: largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`:
+    largest relative difference of a wavelet detail's RMS so far.
     """
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
@@ -490,7 +509,10 @@ class StepErrorCheck:
         return f"the RMS of a detail by {error:.3g} %, which must be <= {tolerance:.3g} %"
 
     def _add_detail_squares(self, coarse: Array, fine: Array) -> None:
-        """Add the squares of a window's details to the sums, except near its ends: the filters reach beyond them."""
+        """Add the squared wavelet details of a window to the sums.
+
+        The ends of the window, where the filters reach beyond it, are left out.
+        """
         import pywt
 
         from sealscope.signals.filters import reach

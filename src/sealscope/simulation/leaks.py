@@ -56,14 +56,17 @@ def growing_opening(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """The opening of a laminar leak divided by `viscosity(t)`, the oil's viscosity over the rig's at times t [s]."""
+    """Opening of a laminar leak in oil of changing viscosity: `opening` divided by the relative viscosity.
+
+    `viscosity(t)`: the oil's viscosity at times t [s] relative to the rig's.
+    """
 
     opening: Opening
     viscosity: Callable[[Array], Array]
     rise: ClassVar[None] = None
 
     def value_at(self, t: Array) -> Array:
-        """Compute the opening over the relative viscosity at times t [s]."""
+        """Compute the opening divided by the relative viscosity at times t [s]."""
         return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:

@@ -48,7 +48,7 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of a run, which a recording does not show: leaks, faults, drifts, and outputs without noise.
+    """The true leaks, faults, drifts and noise-free outputs of a run, which its recording does not contain.
 
     `outputs`: values at the samples `t` [s]. Of the leaks across the piston, `onset_s` is the time at which the first
     one opens, None if none does, and `mean_leak_lpm` the sum of their mean flows while open.
@@ -65,7 +65,10 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """The change of a quantity when the step is halved; `difference`, `tolerance` (None: not limited) in `unit`."""
+    """Change of one quantity when the solver's step is halved.
+
+    `difference` and `tolerance` are in `unit`; a `tolerance` of None sets no limit.
+    """
 
     name: str
     difference: float
@@ -80,7 +83,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class Proof:
-    """The comparison of an experiment at two steps [s], `step` and `halved`: the difference of every quantity."""
+    """Comparison of an experiment at a solver step and at half of it.
+
+    `step`, `halved` [s]: both steps; `differences`: the change of each quantity.
+    """
 
     method: str
     step: float
@@ -308,7 +314,10 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Compute a drift's range, and its change from start to end, over the times t [s]."""
+    """Describe a drift over the times t [s] by its range and its change from start to end.
+
+    Relative drifts are in per cent, absolute ones in the SI unit.
+    """
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:

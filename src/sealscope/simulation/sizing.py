@@ -33,17 +33,21 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Compute a leak's mean flow [m^3/s] at full opening: sum of |Q_L| over sum of the opening; 0 if never open."""
+    """Compute a leak's mean flow [m^3/s], referred to full opening; 0 if the leak never opens.
+
+    `flow` (n,): |Q_L| [m^3/s] at times t (n,) [s]. Its sum is divided by the sum of the opening.
+    """
     opening = leak.opening.value_at(t)
     opening_sum = float(opening.sum())
     return float(flow.sum()) / opening_sum if opening_sum > 0 else 0.0
 
 
 def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[float, float]) -> float:
-    """Compute the leakage coefficient to try next for a mean flow `mean` [m^3/s], by the secant in log-log scale.
+    """Compute the next leakage coefficient to try, by a secant on logarithmic scales.
 
-    `previous`, `latest`: (coefficient, mean flow) of the last two runs; if the coefficient is 0, the flow is that of a
-    coefficient of 1. The secant's slope is limited to 0.1 .. 1, a leak's range, and is 1 if the runs are too close.
+    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs; if the
+    coefficient is 0, the flow is that of a coefficient of 1. The secant's slope is limited to 0.1 .. 1, a leak's range,
+    and is 1 if the runs are too close.
     """
     (c_0, q_0), (c_1, q_1) = previous, latest
     if c_1 == 0.0:
@@ -60,12 +64,13 @@ def size_leaks(
     measure: Callable[[Array], tuple[Array, T]],
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Array, T]:
-    """Find the coefficients (n,) with which the leaks have their stated mean flows; return them and their measurement.
+    """Find the leakage coefficients (n,) that give the leaks' stated mean flows.
 
-    `coefficients`: first values, which are final for leaks without a stated mean; `measure(coefficients)` runs the
-    rig and returns the mean flows for a coefficient of 1 (n,), and any other result. A small leak's flow is
-    proportional to its coefficient, because friction sets the pressure difference; a large one's grows less, so that
-    coefficients follow a secant (`next_coefficient`). Raises SimulationFailed if the search does not converge.
+    `coefficients`: first values, which stay for leaks without a stated mean; `measure(coefficients)` runs the rig and
+    returns each mean flow per unit coefficient (n,), and any other result. Returns the coefficients and that other
+    result of their run. A small leak's flow is proportional to its coefficient, because friction sets the pressure
+    difference; a large leak's flow grows less, and its coefficient follows a secant (`next_coefficient`). Raises
+    SimulationFailed if the search does not converge.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

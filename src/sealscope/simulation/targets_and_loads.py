@@ -55,9 +55,10 @@ class Position:
 
 @dataclass(frozen=True)
 class Force:
-    """A load against +x in addition to the rig's own: F = signal(t) + f(x) + g(v) [N]; `words`: its text.
+    """An additional load on the piston against +x: F = signal(t) + f(x) + g(v) [N].
 
-    `over_x`, `over_v`: the piecewise linear f over position [m] and g over velocity [m/s] of the piston.
+    `words`: text of the load; `over_x`, `over_v`: the piecewise linear f over position [m] and g over velocity [m/s] of
+    the piston.
     """
 
     signal: Command
@@ -90,7 +91,10 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the state (14,) of a rig at t = 0, with the piston at standstill at x [m] under an additional load."""
+    """Compute the state (14,) at t = 0 with the piston at standstill at x [m].
+
+    `load`: additional load, None for none.
+    """
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
@@ -102,7 +106,10 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
 
 
 def breakpoints_through(s: Array, F: Array) -> Breakpoints:
-    """Convert points (s, F) with rising s to the breakpoints of a force that is constant beyond the outer points."""
+    """Convert points (s, F) to the breakpoints that `piecewise_linear_force` takes.
+
+    `s` (n,), rising: positions [m] or speeds [m/s]; `F` (n,) [N]. Beyond the outer points the force is constant.
+    """
     # the coefficient c_k of a breakpoint is the change of slope there
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
     return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
@@ -248,5 +255,5 @@ def parse_force(text: str) -> Force:
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Find the key of `units` that equals `unit` if blanks are ignored."""
+    """Find the key of `units` that equals `unit` apart from blanks."""
     return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

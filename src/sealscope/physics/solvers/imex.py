@@ -67,8 +67,9 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve an implicit stage: return its state, and the throttles' part `s` of the pressure rates [Pa/s].
 
-    `z`: the state without the stage's own implicit rates. r [Pa/m^3]: pressure rate of a volume per flow; g [Pa s/m^3]:
-    fall of a throttle's pressure difference over the stage per flow. Boiling oil keeps its pressure: its r is 0.
+    `z`: the state without the stage's own implicit rates. r [Pa/m^3]: pressure rate of a volume per unit flow; g
+    [Pa s/m^3]: fall of a throttle's pressure difference over the stage per unit flow. Boiling oil keeps its pressure:
+    its r is 0.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h

@@ -26,7 +26,10 @@ def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
 
 
 def _longest_mode_step(damping: float, stiffness: float) -> float:
-    """Compute the longest step [s] for the modes of s^2 + damping s + stiffness = 0; infinite if they do not decay."""
+    """Compute the longest step [s] for the modes of s^2 + damping s + stiffness = 0.
+
+    `damping` [1/s], `stiffness` [1/s^2]. Infinite if the modes neither oscillate nor decay.
+    """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:
         return OSCILLATION_LIMIT / math.sqrt(stiffness)
@@ -40,7 +43,7 @@ def _steepest_rise(breakpoints: np.ndarray) -> float:
 
 
 def stiffest_rate(p: RigNumbers) -> float:
-    """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 needs h lambda < 2.785.
+    """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 is stable for h lambda < 2.785.
 
     lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): a line volume and a chamber, at the end of the stroke where it is
     smallest, equalise through the throttle's laminar slope at dp = 0.

@@ -19,7 +19,7 @@ COUNT_X, COUNT_THETA, MIN_PRESSURE, MAX_VOLTAGE, LAST_VOLTAGE = range(5)
 
 
 class Loop(NamedTuple):
-    """A controller over a run: its inputs, its memory and its outputs.
+    """Inputs, memory and outputs of a controller over a run, as arrays for compiled code.
 
     `inputs` (samples, 5): time [s], target [m], target's speed [m/s], noise of p_A and p_B [Pa]; `volts` (samples +
     delay,): voltage [V] from each sample on; `compensated` (samples,): leakage flow [m^3/s] that the controller

@@ -43,7 +43,7 @@ def _compile(text: str, **scope: Any) -> Any:
 
 
 def _row_loader(count: int) -> Any:
-    """Compile the function (array, row) that loads `count` rows of lanes from row `row` on."""
+    """Compile a function of (array, row) that loads `count` rows of lanes, beginning with row `row`."""
     return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
 
 
@@ -60,9 +60,10 @@ def leak_opening(leak: Leak, t: float) -> float:
 
 
 def _build_inputs_law(count: int) -> Any:
-    """Compile the function (t, nodes, shape, k, drive, leak, p) that returns u, G, C, F at the `count` nodes of step k.
+    """Compile the function that computes the inputs u, G, C, F at the `count` nodes of step k.
 
-    `t` [s]: start of the step; the other arguments are those of `advance`.
+    Its arguments are (t, nodes, shape, k, drive, leak, p): `t` [s] is the start of the step, `drive` and `leak` are of
+    one group, the others those of `advance`.
     """
 
     def for_nodes(text: str) -> str:
@@ -87,7 +88,10 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Add the state `z` at an output at t [s] to the totals (`N_TOTALS`) of runs with the numbers `q`."""
+    """Update the totals (`N_TOTALS`) of runs with the state `z` at an output.
+
+    `t` [s]: time of the output; `q`: numbers of the runs' rigs.
+    """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
     p_A, p_B, p_1, p_2 = pressures_of(z, q)

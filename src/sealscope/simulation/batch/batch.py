@@ -35,7 +35,7 @@ _N_SAMPLE_RUNS, _SAMPLE_DURATION = 4, 2.0 * FIRST_WINDOW
 
 @dataclass(frozen=True, repr=False)
 class Batch:
-    """Result of `simulate_batch`: RMS of the details in segments, and the leaks of the runs.
+    """Result of `simulate_batch`: the RMS of wavelet details by run and segment, and the leaks of the runs.
 
     `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
     [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) limits of the segments [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while
@@ -205,10 +205,10 @@ def _run_set(
 
 
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
-    """Choose the step [s] of a set: the shortest that error control chooses for a few sample members.
+    """Choose the solver's step [s] of a set: the shortest that error control finds for a few sample runs.
 
-    Each of these runs for its first seconds only. The step is at most the longest that the parameters and leaks of all
-    members allow.
+    The sample runs are simulated for their first seconds only. `coefficients` (runs,): of the leaks; `error` [Pa]:
+    largest rms error of a pressure. The step is no longer than any run of the set allows (`longest_allowed_step`).
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -219,7 +219,10 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 
 
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
-    """Compute the longest step [s] for members with leaks `coefficients` (runs,), at least error control's shortest."""
+    """Compute the longest step [s] that resolves all runs of a set with leaks of `coefficients` (runs,).
+
+    The result is no shorter than the shortest step that error control tries.
+    """
     from sealscope.physics.solvers.limits import longest_step
 
     limits = []
@@ -235,7 +238,7 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
-        """Run the set; return the mean flows (runs,) [m^3/s] for a coefficient of 1, and None."""
+        """Run the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None."""
         flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
         run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)

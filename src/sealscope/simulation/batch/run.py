@@ -34,9 +34,10 @@ ABRUPT = 1e15
 
 @dataclass(frozen=True)
 class Member:
-    """One experiment of a set: its `row` in the batch, the model's parameters (`numbers`), their changes, its command.
+    """One experiment of a set.
 
-    The command is gain times the set's shape plus offset [V].
+    `row`: its index in the batch; `numbers`: the model's parameters, and `effects`: their changes within the run. The
+    command is `gain` times the set's command shape plus `offset` [V].
     """
 
     row: int
@@ -48,7 +49,7 @@ class Member:
 
     @property
     def leak(self) -> Leak:
-        """The leak of the run, of size 0 if it has none."""
+        """The leak of the run; a leak of coefficient 0 if the experiment has none."""
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", 0.0)
 
@@ -60,7 +61,7 @@ class Member:
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments with the same laws, shape of the command, load, and step or error."""
+    """Experiments that are integrated together: equal laws, command shape, load and solver settings."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -168,10 +169,11 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 
 
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
-    """Build the leaks' parameters (runs, LEAK_ROWS): acting G, C; start [s] and slope [1/s] of the opening; flow G, C.
+    """Build the leaks' parameters (runs, LEAK_ROWS) for the compiled laws (`physics.vector.runs`).
 
-    `coefficients` act in the run, `flow_coefficients` are those whose mean flow is computed. They differ while a leak
-    is sized: a run without a leak gives the flow of a unit leak under its pressures.
+    Columns: G and C that act in the run, start [s] and slope [1/s] of the opening, G and C whose mean flow is computed.
+    `coefficients` (runs,) give the first two, `flow_coefficients` (runs,) the last two. They differ while a leak is
+    sized: a run without a leak gives the flow that a unit leak would have under its pressures.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -187,10 +189,10 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 
 @dataclass(frozen=True)
 class Cells:
-    """The model's parameters over a run, constant within each cell, a span of outputs common to all runs.
+    """Model parameters of the runs of a set over time, constant within cells.
 
-    `bounds` (cells + 1,): outputs at which cells begin; `base` (runs, parameters); `changing`: indices of the
-    parameters that change, with `values` (runs, changing, cells).
+    A cell is a span of outputs, the same for all runs. `bounds` (cells + 1,): outputs at which cells begin; `base`
+    (runs, parameters); `changing`: indices of the parameters that change, with `values` (runs, changing, cells).
     """
 
     bounds: np.ndarray
@@ -207,7 +209,10 @@ class Cells:
 
 
 def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Build the cells of a set: the blocks of all effects of its members, for `n_out` outputs at `rate` [Hz]."""
+    """Build the cells of a set, short enough for the effects of all its members.
+
+    `n_out`: number of outputs of the run, at `rate` [Hz].
+    """
     from sealscope.physics.rig import NUMBERS
 
     numbers_by_id = {id(member.numbers): member.numbers for member in members}  # most members share their parameters
@@ -225,7 +230,10 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Replace the size of an experiment's leak, if it has one, by a coefficient."""
+    """Replace the size of an experiment's leak by a coefficient.
+
+    An experiment without a leak is returned unchanged.
+    """
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
@@ -344,7 +352,10 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Compute each lane's anti-alias filter; tap k multiplies the output k - `taps_before` after the sample's."""
+        """Compute the anti-alias filter of each lane.
+
+        Tap k multiplies the output k - `taps_before` steps from the sample.
+        """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
         taps_by_delay = {delay: anti_alias_taps(self.oversampling, delay % 1.0) for delay in np.unique(delays).tolist()}
@@ -480,9 +491,9 @@ class SetRun:
         return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
 
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
-        """Raise SimulationFailed if a run of the groups, now at output `stop`, is not valid.
+        """Raise SimulationFailed if a run of the groups diverged before output `stop`.
 
-        That is if it diverged, fell below vacuum, or hit an end stop that its step cannot resolve.
+        Unless the run may be unresolved, also if it fell below vacuum or hit an end stop that its step cannot resolve.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -523,7 +534,10 @@ class SetRun:
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute the mean |Q| [m^3/s] of leaks with `flow_coefficients` while open, (runs,); 0 if never open."""
+        """Compute the mean |Q_L| (runs,) [m^3/s] of leaks with `flow_coefficients`, referred to full opening.
+
+        0 for a leak that never opens.
+        """
         from sealscope.physics.vector.runs import FLOW, OPENING
 
         totals_by_run = unpack_lanes(self.totals, self.n_runs)

@@ -29,7 +29,10 @@ INSTRUMENT_ROWS = 18
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressure [Pa] as read back from the converter (`instruments.digitize`) of the instrument `row`."""
+    """Compute the pressure [Pa] as read back from the analog-digital converter (`instruments.digitize`).
+
+    The instrument's parameters are the rows of `sensor` from row `row` on (INSTRUMENT_ROWS).
+    """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
     volts_per_code = load(sensor, row + VOLTS_PER_CODE)
@@ -41,7 +44,7 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 
 @contracted
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
-    """Compute the mains hum [Pa] at a sample, sin(2 pi cycles) by sin 2a = 2 sin a cos a."""
+    """Compute the mains hum [Pa] at a sample, by sin 2a = 2 sin a cos a; `row`: see `convert_lanes`."""
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
     sine = half_turn_sine(cycles)
@@ -60,10 +63,10 @@ def _read_pressure(
     sample: int,
     samples_since: float,
 ) -> Any:
-    """Compute the reading [Pa] of a filtered `pressure` [Pa] by the instrument in row `row` of `sensor`.
+    """Compute the reading [Pa] of an instrument from the filtered `pressure` [Pa].
 
-    `channel_noise`, `common_noise`: standard normal; `drift` [Pa]; `samples_since`: samples since that for
-    which `sensor` was built.
+    `row`: see `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the
+    offset; `samples_since`: number of samples since the one for which `sensor` was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
@@ -77,9 +80,10 @@ def _read_pressure(
 
 @contracted
 def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, sums: np.ndarray, sums_row: int) -> None:
-    """Add the squared details of the n samples from sample `first` on to the sums of the segments between `bounds`.
+    """Add the squares of the details of n samples, and of d3 d4, to the sums of their segments.
 
-    `details`: (LEVELS, CHUNK, WIDTH); segment k has QUANTITIES rows of `sums` from `sums_row` + k QUANTITIES on.
+    `details` (LEVELS, CHUNK, WIDTH): of the samples from `first` on; `bounds` (segments + 1,): samples; segment k has
+    QUANTITIES rows of `sums` from `sums_row` + k QUANTITIES on.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES

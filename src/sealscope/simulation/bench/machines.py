@@ -66,7 +66,9 @@ class BenchMachine:
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Estimate the start position [m] that centres a command's strokes at mid-stroke; for a target, its first value.
+    """Estimate the start position [m] from which a command's strokes are centred at mid-stroke.
+
+    For a position target it is the target's first value. Both are limited to the stroke.
 
     The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is an unloaded one without inertia in
     its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve
@@ -112,7 +114,10 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 
 
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    """Draw a drift: a mixture of the oil temperature's path and a path of its own, scaled to a drawn size."""
+    """Draw the path of a drift: a mixture of the oil temperature's path and an independent one.
+
+    `drift`: range of the size, and weight of the oil temperature's path `oil`.
+    """
     path = _draw_path(random, drift.shapes, oil.duration)
     # weights whose squares sum to 1, so that the mixture varies as much as either path
     mixture = oil.times(drift.oil).plus(path.times((1.0 - drift.oil**2) ** 0.5)) if drift.oil else path
@@ -120,7 +125,10 @@ def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> 
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw a nuisance's values by parameter (factors if it scales), and its drifts; `oil`: path of the temperature."""
+    """Draw the values of a nuisance by parameter (factors on the rig's values if it scales), and its drifts.
+
+    `oil`: path of the oil temperature, which drifts may follow.
+    """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
     groups = [(name,) for name in nuisance.parameters] if nuisance.each else [nuisance.parameters]

@@ -65,8 +65,8 @@ class _NuisanceEntry(BaseModel):
 class DriftRange:
     """The distribution of a parameter's drift.
 
-    `size`: (low, high) of its range, relative or in SI if `absolute`; `shapes`: paths to choose from; `oil`: weight of
-    the oil temperature's path in it.
+    `size`: (low, high) limits of the drift's range, in SI units if `absolute`, else relative; `shapes`: paths to choose
+    from; `oil`: weight of the oil temperature's path in the drift, 0 .. 1.
     """
 
     size: tuple[float, float]
@@ -77,10 +77,10 @@ class DriftRange:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A difference between machines that is distributed uniformly between `low` and `high`.
+    """A difference between machines, distributed uniformly between `low` and `high`.
 
-    They are values in SI, or factors on the rig's values if it `scales`; `each`: one draw for each parameter, else one
-    for all; `why`: the reason for the range.
+    `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: one draw for each parameter instead of
+    one for all; `drift`: None for none; `why`: the reason for the range.
     """
 
     name: str
@@ -95,7 +95,11 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class NuisanceChoice:
-    """A difference between machines that is one of `values` (SI, or texts of a choice) for all `parameters`."""
+    """A difference between machines with a few possible values.
+
+    A machine has one of `values` for all `parameters`. `values`: SI numbers, or texts of a choice; `why`: the reason
+    for them.
+    """
 
     name: str
     parameters: tuple[str, ...]
