@@ -72,7 +72,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the hold as lines of text; `stated_pressure`: pressure difference [Pa] at which flows are stated."""
+        """Format the hold as lines of text, with flows at the pressure difference `stated_pressure` [Pa]."""
         flow = self.conductance * stated_pressure / LITRE_PER_MINUTE
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
@@ -107,7 +107,10 @@ def plan_hold(
 
 
 class _HoldDraws:
-    """Simulates holds of one `duration` [s] to find their smallest detectable leak; other arguments: `plan_hold`."""
+    """Simulations of holds of one `duration` [s], to find their smallest detectable leak.
+
+    Other arguments as for `plan_hold`.
+    """
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float

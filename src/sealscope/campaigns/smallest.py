@@ -220,9 +220,9 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 
 
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Compute the factor by which an unknown step of the pump raises the standard error of a leak's step at mid-record.
+    """Compute the ratio of the leak step's standard errors with an unknown and with no step of the pump.
 
-    Infinite if the balance has no term of the pump, or the two steps cannot be separated.
+    Both steps are at mid-record. Infinite if the balance has no term of the pump, or the two steps cannot be separated.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:

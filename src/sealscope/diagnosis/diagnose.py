@@ -47,12 +47,13 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """One recording, gaps bridged and without missing samples, judged by single detectors or by all.
+    """A recording to judge and its baseline, prepared for one detector or all of them.
 
-    `baseline`: leak-free recordings of the machine; `rig`: what detectors may assume of it; `distrust`: why the
-    pressures cannot be judged, so that no detector is run, or None; `refusal`: why no given baseline can be compared,
-    or None; `share`: fraction of the whole recording's samples in `recording`; `judged_until`: fraction of the whole
-    recording up to the last sample of `recording`.
+    Gaps in `recording` are bridged and no sample is missing. `baseline`: leak-free recordings of the machine; `rig`:
+    sizes that the detectors assume; `distrust`: reason why the pressures cannot be judged, in which case no detector
+    runs, or None; `refusal`: reason why none of the given baselines is comparable, or None; `share`: fraction of the
+    original samples that `recording` contains; `judged_until`: fraction of the original recording up to the last sample
+    of `recording`.
     """
 
     recording: Recording
@@ -67,7 +68,7 @@ class Examination:
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)
 
     def with_channels(self, channels: Iterable[str]) -> Examination:
-        """Return the examination of the same recordings by these channels alone; summarised ones are left out."""
+        """Return the examination with only these channels; baselines stored as summaries are dropped."""
         names = set(channels)
         recording, *baseline = (
             entry.only(name for name in entry.channels if name in names)
@@ -85,18 +86,21 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """Observations of duty, noise, hum and levels, which no detector of leaks makes."""
+        """Observed changes of duty, noise, hum and pressure levels, which may explain an alarm without a leak."""
         return observe_rivals(self.recording, self.baseline, self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Distribution of every observable over the healthy recordings."""
+        """Null distribution of each observable, from the healthy recordings."""
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide by one detector alone; for the change of RMS, other changes are not weighed as its explanations."""
+        """Decide by one detector alone.
+
+        The alarm of the RMS change is not weighed against other explanations.
+        """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
     def decide_by_all(self) -> Evidence:
@@ -115,9 +119,10 @@ class Examination:
         return combine(list(decisions.values()), self.refusal or next(iter(failures), None))
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
-        """Decide whether there is a leak by one detector's report.
+        """Decide whether there is a leak from one detector's report.
 
-        `reports`: others whose observables may explain its alarm; `weigh_rivals`: whether they compete with a leak.
+        `reports`: further observations that may explain its alarm; `weigh_rivals`: let these compete with a leak as
+        explanations.
         """
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, self.false_alarm_probability, weigh_rivals)

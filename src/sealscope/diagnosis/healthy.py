@@ -14,12 +14,12 @@ Summary = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class SummarisedRecording:
-    """A healthy recording without its samples: what each detector computed of them.
+    """A healthy recording reduced to the summaries of the detectors, without its samples.
 
     `file`: its name; `digest`: hash of its chamber pressures in hexadecimal digits, equal for copies; `units` by
     channel; `rate` [Hz]; `seconds`: duration; `start_s`: time of its first sample [s since 1970], None if unknown;
-    `summaries` by detector; `about`: pressure, oil temperature, noise and problems, for people to read; `statistics`:
-    finite numbers by name, the surprisals of its changes (`observation.healthy_surprisals`).
+    `summaries`: by name of the detector; `about`: pressure, oil temperature, noise and problems, for display;
+    `statistics`: surprisals of its changes by name, finite numbers (`observation.healthy_surprisals`).
     """
 
     file: str
@@ -38,7 +38,7 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect a detector's summaries of the healthy recordings that have one, as stored or computed now."""
+    """Collect a detector's summaries of healthy recordings, stored or computed now; skip those without one."""
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

@@ -25,11 +25,12 @@ from sealscope.recordings.recording import Recording, compute_once
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A recording as detectors see it.
+    """A recording corrected and checked for the detectors.
 
-    `part`: its samples on an even clock, from the first to the last with all chamber pressures and the command, as
-    `recordings.corrections` makes them; `findings` on all samples; `distrust`: why the chamber pressures cannot be
-    trusted, or None; `share`: fraction of the samples in the part; `judged_until`: fraction up to the part's last one.
+    `part`: its samples on an even clock, from the first to the last at which all chamber pressures and the command are
+    present (`recordings.corrections`); `findings`: defects found in all samples; `distrust`: reason why the chamber
+    pressures cannot be trusted, or None; `share`: fraction of the samples in the part; `judged_until`: fraction of the
+    recording up to the part's last sample.
     """
 
     part: Recording
@@ -60,12 +61,15 @@ class Inspection:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the chamber pressures: equal for copies of a recording."""
+        """Hash of the chamber pressures, equal for copies of a recording."""
         return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).hexdigest()
 
 
 def inspect_recording(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
-    """Inspect a recording, with the result cached; `channels`: those to check for findings, by default all."""
+    """Correct and check a recording, with the result cached.
+
+    `channels`: channels to check for findings, all if None.
+    """
     names = tuple(name for name in recording.channels if channels is None or name in channels)
     return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
 
@@ -90,8 +94,8 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
 class Baselines(NamedTuple):
     """Leak-free recordings that a recording can be compared with.
 
-    `parts`: their samples that can be analysed, or their summaries; `findings`: which were left out, and why;
-    `refusal`: why every given one was left out, None if one remains or none was given.
+    `parts`: samples of each that can be analysed, or its summary; `findings`: baselines left out, with the reasons;
+    `refusal`: most frequent reason if all given baselines were left out, None if one remains or none was given.
     """
 
     parts: tuple[Healthy, ...]
@@ -103,8 +107,8 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
     Left out are baselines that cannot be trusted, those that lack a chamber of the recording or have it in another
-    unit, the recording itself, and of several copies all but the one with the most channels. Differences of speed,
-    load and temperature are for the detectors to describe.
+    unit, and the recording itself. Of several copies only the one with the most channels is used. Differences of speed,
+    load and temperature are no reason, as they are left to the detectors.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # of the recordings that can be compared

@@ -46,10 +46,10 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Find the smallest tested size from which on all have a lower bound >= `detection`; infinite if there is none.
+    """Find the smallest tested size from which on every size has a lower bound >= `detection`.
 
-    For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The confidence applies to each
-    size alone. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    Infinite if there is none. For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The
+    confidence applies to each size separately. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -104,7 +104,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Return True if hits and misses overlap in one size at most; the likelihood then has no finite maximum."""
+    """Test whether hits and misses overlap in at most one size, which leaves the likelihood without a maximum."""
     hit_fraction = k / n
     n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))
     steps = np.diff(hit_fraction)

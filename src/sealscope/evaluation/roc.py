@@ -81,9 +81,10 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
-    """Compute for each score the fraction of the other kind's scores that it is ordered correctly with.
+    """Compute for each score the fraction of the other group's scores on its correct side.
 
-    Ties count half. Returns the fractions of the leak-free scores (n,) and of the leaky scores (m,).
+    Leaky scores should be the higher ones; ties count half. Returns the fractions of the leak-free scores (n,) and of
+    the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)

@@ -24,8 +24,8 @@ _LAST_STEP, _MAX_SECANTS = 1e-9, 12
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
     """Find a zero of a continuous function between `low` and `high` by Chandrupatla's method.
 
-    It is exact to four units of the last digit.
-    Raises ValueError if the function has the same sign at both ends, or is NaN there.
+    The result is accurate to four units in the last place. Raises ValueError if the function has the same sign at both
+    ends, or is NaN there.
     """
     a, b, f_a, f_b = high, low, function(high), function(low)  # a: the newest point; the root is between a and b
     if not f_a * f_b <= 0.0:
@@ -57,10 +57,11 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
 def find_near_root(
     function: Callable[[float], float], start: float, slope: float, low: float, high: float
 ) -> float | None:
-    """Find a zero of a smooth rising function of a scale of one near `start` by the secant method, else None.
+    """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
-    It takes a third of the evaluations of `find_root` where `start` is within a few per cent of the scale; None where
-    it does not converge, or leaves the range from `low` to `high`. `slope`: about that of the function at `start`.
+    The argument should have a scale of about one. If `start` is within a few per cent of the zero, this takes a third
+    of the evaluations of `find_root`. None also if the iteration leaves the range `low` to `high`, or meets a slope <=
+    0. `slope`: approximate slope of the function at `start`.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):

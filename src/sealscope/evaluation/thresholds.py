@@ -54,7 +54,10 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
 
 
 def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Compute the largest rank, counted from the largest score, that keeps the promise; 0 if none does."""
+    """Compute the largest rank, counted from the highest score, that keeps `promise`; 0 if none does.
+
+    `n`: number of leak-free scores; `promise`, `confidence`: as in `quantile_threshold`.
+    """
     from scipy.special import betainc
 
     if promise == "average":

@@ -162,7 +162,7 @@ def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute (details (levels, n), approximation (n,)) by Mallat's transform, with each coefficient held."""
+    """Compute (details (levels, n), approximation (n,)) by Mallat's transform, each coefficient repeated."""
     import pywt
 
     approximation, *deepest_first = pywt.wavedec(x, wavelet, mode=edge, level=levels)
@@ -180,7 +180,7 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute (details (levels, n), approximation (n,)) by the inverse transform of each level alone."""
+    """Compute (details (levels, n), approximation (n,)) by inverting the transform one level at a time."""
     import pywt
 
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)

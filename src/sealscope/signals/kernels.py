@@ -22,7 +22,8 @@ def filter_rows(
 ) -> None:
     """Filter eight signals: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
-    i < n, k < n_taps. Each row and tap has a number for each lane; eight outputs are computed at a time.
+    i < n, k < n_taps. The second axis of `rows`, `taps` and `out` holds the signals; eight outputs are computed at a
+    time.
     """
     i = 0
     while i + 8 <= n:
@@ -60,12 +61,12 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Compute the wavelet details (levels, CHUNK, WIDTH) of `n` new rows, the samples of a channel of WIDTH signals.
+    """Compute the wavelet details of `n` new rows of one channel, a group of WIDTH signals.
 
-    `low`, `high` (taps, WIDTH): low-pass and high-pass filter. In `buffers` the channel has a buffer of
-    `capacity` rows for each level, one after the other from row `start` on; the new rows are those from `first` on in
-    the first buffer. The high-pass of a level's buffer is its detail, the low-pass goes to the next buffer. Shallower
-    levels are delayed like the deepest, so that a row of `details` belongs to one sample.
+    `low`, `high` (taps, WIDTH): low-pass and high-pass filter. `buffers` holds for each level of the channel a buffer
+    of `capacity` rows, stacked from row `start` on; the new rows begin at row `first` of the first buffer. High-pass
+    filtering a level's buffer gives its detail, low-pass filtering fills the next buffer. Shallow levels are delayed
+    like the deepest, which aligns all levels of a row of `details` (levels, CHUNK, WIDTH) to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):

@@ -24,10 +24,10 @@ WINDOW_STEP = 500
 
 
 class WindowedRms(NamedTuple):
-    """RMS per window: `ends` (w,), the sample one past each window's last; `rms` (..., w), in the series' unit.
+    """RMS of sliding windows.
 
-    A window of `size` covers the samples ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate``
-    seconds.
+    `ends` (w,): number of the sample just after each window; `rms` (..., w), in the series' unit. A window of `size`
+    samples covers ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate`` seconds.
     """
 
     ends: IntArray
@@ -49,10 +49,11 @@ def rms(series: ArrayLike) -> Any:
 def windowed_rms(
     series: ArrayLike | Details, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, first: int = 0
 ) -> WindowedRms:
-    """Compute the RMS of each window of `size` samples, every `step` samples, over the last axis of (..., n).
+    """Compute the RMS of windows of `size` samples, every `step` samples, over the last axis of (..., n).
 
-    `first`: sample number of the first value, which is added to `ends`. Of `Details` all levels are used, without
-    samples that depend on padding, and `ends` are samples of the signal. A series shorter than `size` gives no window.
+    `first`: sample number of the first value, which is added to `ends`. For `Details`, all levels are used, samples
+    that depend on padding are left out, and `ends` are sample numbers of the signal. A series shorter than `size` gives
+    no window.
 
     Raises InputError for a series that is not finite, and for a size or a step below 1.
     """

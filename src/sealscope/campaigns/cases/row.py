@@ -27,7 +27,7 @@ Scores = Mapping[str, tuple[float | None, float | None]]
 
 @dataclass(frozen=True)
 class Statement:
-    """The part of a detector's evidence that a row stores; numbers that are not finite become None."""
+    """Part of a detector's evidence that a row stores, with None for numbers that are not finite."""
 
     verdict: Verdict
     score: float | None = None

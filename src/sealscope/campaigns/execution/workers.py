@@ -89,9 +89,10 @@ def iter_results_in_order(
 
 
 class _Pools(NamedTuple):
-    """Pools of workers. `start_pool` starts one; `submit` queues an item in it; a process that dies raises `death`.
+    """Pools of worker processes.
 
-    `max_items`: limit of items that run or are queued.
+    `start_pool`: function that starts a pool; `max_items`: largest number of items that run or are queued; `submit`:
+    function that queues an item in a pool; `death`: exception that a dead process raises.
     """
 
     start_pool: Callable[[], Executor]

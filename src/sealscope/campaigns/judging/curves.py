@@ -17,7 +17,8 @@ class DetectorPod:
     """One detector's probability of detection over the size of the leak.
 
     `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted,
-    with the reason in `why`; `proven`: smallest size whose detection probability is proven to be 90 %, without a curve.
+    with the reason in `why`; `proven`: smallest size from which on a detection probability of 90 % is proven by
+    counting alone.
     """
 
     detector: str

@@ -30,10 +30,10 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 
 @dataclass(frozen=True)
 class PlanDetector:
-    """One name of a plan's `detectors`, parsed.
+    """One entry of a plan's `detectors`, parsed.
 
-    `base`: name of a scorer or detector, `diagnose` or `watch`; `scorer`: None for a detector with its own verdict;
-    `view`: name of the set of channels it sees, "" if none is named.
+    `base`: name of a scorer or detector, `diagnose` or `watch`; `scorer`: the scorer, None for a detector that decides
+    by itself; `view`: name of the set of channels it uses, "" if none is named.
     """
 
     name: str

@@ -33,10 +33,10 @@ _BOTH = "d3d4 of both chambers as the thesis says"
 
 
 def split_bounds(n: int, rate: float, split: int) -> IntArray:
-    """Compute the usable samples, [begin, end) in rows (2, 2), of the parts before and after sample `split` of `n`.
+    """Compute the usable samples of the parts before and after sample `split` of `n`, (2, 2).
 
-    Details whose filters reach into the other part or beyond the recording are left out, and so is the start:
-    `START_SECONDS` at `rate` [Hz], at most `START_FRACTION` of the part. A part without samples ends before it begins.
+    Each row is [begin, end). Samples are left out whose details depend on the other part or on padding, and at the
+    start `START_SECONDS` at `rate` [Hz], at most `START_FRACTION` of the part. A part without samples has end < begin.
     """
     before, after = (int(samples) for samples in edge_samples()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
@@ -90,10 +90,10 @@ class SplitRms:
 
 @dataclass(frozen=True)
 class Scorer:
-    """A rule of the thesis.
+    """A decision rule of the thesis, as a score to compare with a threshold.
 
-    `parts`: quantity, chamber and direction (`fell`, ...) of each condition; the score is the smallest of theirs.
-    `threshold`: fixed threshold, None if leak-free records set it.
+    `parts`: conditions, each with quantity, chamber and direction (`fell`, ...); the score is the smallest score of the
+    conditions. `threshold`: fixed threshold, None if it is set from leak-free records.
     """
 
     name: str

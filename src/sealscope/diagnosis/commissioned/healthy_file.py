@@ -252,7 +252,7 @@ def _format_json(value: Any) -> bytes:
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Raise ArithmeticError if a method's summary could not be read again, for example with infinite numbers."""
+    """Raise ArithmeticError if a method's summary could not be read back, for example with infinite numbers."""
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
     except ValueError as error:
@@ -260,7 +260,7 @@ def check_summary(method: str, summary: Summary) -> None:
 
 
 def format_summary(recording: SummarisedRecording) -> Line:
-    """Format a recording's summaries as a line; raise InputError if it would not be read again."""
+    """Format a recording's summaries as a line; raise InputError if the line could not be read back."""
     fields = {name: value for name, value in vars(recording).items() if name != "file"}
     try:
         data = _format_json(fields)

@@ -162,8 +162,8 @@ class CommissionedMachine:
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
         """Return the machine with one more healthy recording.
 
-        Raises InputError if it is judged leaking, or overlaps a leak that a person confirmed, or is known already, or
-        cannot be trusted.
+        Raises InputError if the recording is judged leaking, overlaps in time with a confirmed leak, is a copy of a
+        known recording, or cannot be trusted.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
@@ -184,8 +184,8 @@ class CommissionedMachine:
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        A leak is open from its onset until a repair. A later judgement "invalid" of the same alarm revokes it, but not
-        one of a new alarm of the same name, whose onset is after the first judgement.
+        A leak is open from its onset until a repair. A later judgement "invalid" of the same alarm revokes it, unless
+        it concerns a new alarm of the same name, whose onset is after the first judgement.
         """
         for number, leak in enumerate(self.alarms, 1):
             is_revoked = any(

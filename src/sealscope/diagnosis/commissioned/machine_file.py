@@ -192,10 +192,11 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
-    """Write a machine's summaries, then the backup of its present text, then its new text, safe from interruption.
+    """Write the summaries, a backup of the present file, then the new file, safe against interruption.
 
-    Written are the summaries of the machine, those named by the present text or its backup, and other present ones as
-    long as the file stays below `_SPARE` bytes. Raises InputError if the new text could not be read again.
+    The summaries written are those of the machine and those that the present file or its backup names. Other present
+    ones are kept while the total size stays below `_SPARE` bytes. Raises InputError if the new text could not be read
+    back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
@@ -237,7 +238,11 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Describe each part of a machine's text that another process may change, by the hash of the part."""
+    """Map the hash of each part of a machine's file to a description of its change.
+
+    A part is anything that another process may change: the statements with the rig, a healthy recording, or a judged
+    alarm.
+    """
 
     def hash_value(value: Any) -> bytes:
         """Hash a plain value."""
@@ -251,10 +256,11 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Describe a change of a machine's file since it was read that writing would undo; None if there is none.
+    """Describe a change of a machine's file since loading that writing would undo; None if there is none.
 
-    The change is a part of the `present` file that is neither in `origin` nor `written`, or a `written` part of
-    `origin` that is no longer present. `present`, `written`: parts by hash (`_hash_parts`).
+    `origin`: parts when the file was loaded; `present`: parts of the file now; `written`: parts about to be written,
+    all by hash (`_hash_parts`). A change is a present part that is neither in `origin` nor in `written`, or a part in
+    both `origin` and `written` that is no longer present.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]

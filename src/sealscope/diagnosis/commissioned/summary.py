@@ -44,10 +44,11 @@ class TermEstimate(NamedTuple):
 
 
 class SmallestLeak(NamedTuple):
-    """The smallest leak that the next recording detects with the stated probability.
+    """The smallest leak that is detected in the next recording with the stated probability.
 
-    `lpm` [L/min], None if the machine's size is not stated, and `share`, a fraction of the pump's flow; `halved_by`:
-    multiple of healthy recordings and days that halves this leak, None if no multiple tried does.
+    `lpm`: flow [L/min], None if the machine's size is not stated; `share`: fraction of the pump's flow; `halved_by`:
+    factor by which the number of healthy recordings and days must grow to halve this leak, None if none of those tried
+    is enough.
     """
 
     lpm: float | None
@@ -100,7 +101,10 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, 16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Format table rows of the smallest leak and of the recordings, and days if they `are_dated`, that halve it."""
+        """Format the table rows on the smallest leak and on the recordings needed to halve it.
+
+        `are_dated`: also state the number of days.
+        """
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
             return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
@@ -221,8 +225,8 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that is detected in a recording of a later day under the usual duty.
 
-    A leak is detected with the probability `power` if it exceeds the threshold of Student's t by the normal quantile of
-    `power`. More healthy days lower the threshold and the error of their mean, but not the scatter between recordings.
+    The leak exceeds the threshold of Student's t test by the normal quantile of the detection probability `power`. More
+    healthy days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
@@ -257,7 +261,8 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise from second differences, at least that of rounding.
 
-    Second differences of white noise have 6 times its variance; 0.6745: median size of a standard normal number.
+    The variance of second differences of white noise is 6 times that of the noise; 0.6745 is the median absolute value
+    of a standard normal number. Returns 0 for fewer than three finite values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:

@@ -29,13 +29,13 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 @dataclass(frozen=True)
 class WatchedMachine:
-    """An actuator to be watched, from a rig's or a machine's file.
+    """An actuator to be monitored, from the file of a rig or a machine.
 
-    `rig`: machine's sizes; if only the areas are stated, with the displacement measured by the healthy recordings;
-    `channel_map`: channel to column of its logs; `rate` [Hz] of logs without a time column; `limit_lpm`: leak from
-    which it is to be repaired [L/min], None if that needs an area that is not stated; `machine` by whose healthy
-    recordings whole recordings are judged, None if it has none; `healthy`: leakage of pump and piston together in
-    these, None if they do not determine it.
+    `rig`: sizes of the machine; if only the areas are stated, its displacement is measured from the healthy recordings;
+    `channel_map`: channel -> column of its logs; `rate`: sampling rate [Hz] of logs without a time column; `limit_lpm`:
+    leak at which it must be repaired [L/min], None if that needs an unknown area; `machine`: healthy recordings against
+    which whole recordings are judged, None if there are none; `healthy`: leakage of pump and piston together in these,
+    None if it cannot be determined.
     """
 
     rig: Rig
@@ -66,7 +66,10 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Test whether two rigs differ only in the displacement, by up to 5 % as a new measurement of it may."""
+    """Test whether two rigs are equal except for a displacement that differs by at most 5 %.
+
+    A new measurement of the displacement may differ by that much.
+    """
     values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
         tree.get("pump", {}).pop("q_b", None)
@@ -74,7 +77,7 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Set a rig's displacement to that measured by the healthy recordings, if the areas alone are stated."""
+    """Replace a rig's displacement by the median measured in healthy recordings, if only its areas are stated."""
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
@@ -100,7 +103,7 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 
 
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
-    """Fit the leakage conductance [m^3/(s Pa)] to a recording's sums; None if these are not of a single balance."""
+    """Fit the leakage conductance [m^3/(s Pa)] to a recording's sums; None unless they are of a single balance."""
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:
         return None

@@ -23,13 +23,14 @@ PLUG_IN = "plug-in"
 
 
 class Detector(Protocol):
-    """A detector: follows numbers over a recording and tests them for a change; it states no verdict.
+    """A detector, which follows quantities over a recording and tests them for changes, without a verdict.
 
     Its recordings are uniformly sampled, and their chamber pressures and command have no missing sample (missing ones
     are bridged, and marked in `Recording.bridged`); any other channel may be absent or contain NaN.
 
-    A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None; such
-    a detector is also given stored summaries (`healthy.SummarisedRecording`), and reads both by `healthy_summaries`.
+    A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None. A
+    detector with this method also receives stored summaries (`healthy.SummarisedRecording`) as baselines, and reads
+    both kinds with `healthy_summaries`.
     """
 
     name: str
@@ -64,18 +65,18 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make an observable of a user's own detector from its chance; a piston leak is assumed to change it.
+    """Make an observable for a user-defined detector from its p-value; a piston leak is assumed to change it.
 
     Parameters
     ----------
     name : str
-        What changed, in plain words.
+        Name of the change, in plain words.
     chance : float
-        Probability that a healthy recording changes as much; of several tests the rarest one's, times their number.
+        Probability that a healthy recording changes as much; for several tests the smallest one, times their number.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
-        When it changed, with its 95 % interval [s]: (value, low, high).
+        Time of the change with its 95 % interval [s]: (value, low, high).
     """
     score = -2.0 * float(np.log(max(chance, np.finfo(float).tiny)))
     interval = None if onset is None else Interval(*onset)

@@ -49,16 +49,20 @@ def limit_threads() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _thread_pools(n_modules: int) -> Any:
-    """Find the loaded libraries of linear algebra, anew only if modules were imported since: it takes milliseconds."""
+    """Find the loaded linear-algebra libraries.
+
+    The search takes milliseconds and is repeated only if `n_modules`, the number of imported modules, has changed.
+    """
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
 
 
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
-    """Test a recording for rivals of a leak: changes of duty, noise, hum and pressures, also over healthy recordings.
+    """Test a recording for changes that may be mistaken for a leak: of duty, noise, hum and pressure levels.
 
-    `distrust`: reason why the pressures cannot be judged, or None.
+    The changes are tested within the recording and against the healthy ones. `distrust`: reason why the pressures
+    cannot be judged, or None.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -137,7 +141,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _max_surprisals(report: Observed) -> dict[str, float]:
     """Collect the largest surprisal of each observable that changes within the recording, by `null.null_key`.
 
-    The step of the leak is included, by the chance of its own test.
+    The test for a step of the leak is included.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:
@@ -150,11 +154,11 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
-    """Collect the null distribution of every observable: its surprisals, -log(chance), in the healthy recordings.
+    """Collect the null distribution of every observable, the surprisals -log(chance) of healthy recordings.
 
-    Comparisons between recordings have one distribution for each kind of data: the largest surprisal of each healthy
-    recording against all others. With `shut` the balance's surprisals are those under the hypothesis that the pump is
-    cut off at rest.
+    Comparisons between recordings have one distribution for each kind of data, made of the largest surprisal of each
+    healthy recording against all others. `shut`: use the balance's surprisals under the hypothesis that the pump is cut
+    off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

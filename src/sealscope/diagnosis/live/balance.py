@@ -56,12 +56,13 @@ N_WAKING: int = _PRIORS.wakes
 
 
 class BlockConductance(NamedTuple):
-    """State of the machine in one block.
+    """Leakage conductance and duty of the machine in one block.
 
-    `begin`, `end` of its samples [s]; `g`, `sd`: conductance of pump and piston and its standard error [m^3/(s Pa)],
-    comparable between blocks, as later estimates of the other coefficients do not shift it; `total`: conductance by the
-    latest estimates of the other coefficients, whose errors and that of the machine's size add the standard error
-    `offset`; `pressure`: mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean abs of the flow that moves the piston [m^3/s].
+    `begin`, `end`: times of its samples [s]; `g`, `sd`: conductance of pump and piston and its standard error [m^3/(s
+    Pa)]. Values of `g` are comparable between blocks, as later estimates of the other coefficients do not shift them.
+    `total`: conductance by the latest estimates of the other coefficients; `offset`: standard error common to all
+    blocks, due to these coefficients and the machine's size; `pressure`: mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean
+    absolute flow that moves the piston [m^3/s].
     """
 
     begin: float
@@ -80,14 +81,15 @@ class BlockConductance(NamedTuple):
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of mean pressure difference [Pa] and mean flow [m^3/s], at least the smallest float."""
+        """Logarithms of the mean pressure difference [Pa] and the mean flow [m^3/s], finite also for zero values."""
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
 class NotJudged(NamedTuple):
-    """Reason why the block up to the clock `end` [s] has no estimate.
+    """Reason why the block up to the time `end` [s] has no estimate.
 
-    `status` of the block; `counter` to raise, "" for none; `restarts`: later blocks do not compare with earlier ones.
+    `status`: reason as text; `counter`: counter to increase by one, "" for none; `restarts`: True if later blocks
+    cannot be compared with earlier ones.
     """
 
     end: float
@@ -97,7 +99,7 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Make a reason whose status also names the counter to raise."""
+        """Make a reason that increases the counter named after its status."""
         return cls(end, status, f"blocks: {status}", restarts)
 
 
@@ -246,7 +248,7 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the mean square of a block's left side, relative to that of earlier blocks."""
+        """Compute the mean square of a block's left side, relative to that of earlier blocks (`relative_motion`)."""
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:

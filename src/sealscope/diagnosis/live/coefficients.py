@@ -36,11 +36,11 @@ ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of n nuisances, the sums from which they are computed, and arrays to work in.
+    """Nuisance coefficients of a balance, the sums they are computed from, and work arrays.
 
-    `sums` (n + 2, n + 2); `values` (n,); `leak_products` (n,), products of the leak's column with the nuisances;
-    `numbers` (6,), by `ROWS` to `MISFIT`. To work in: `block` (n + 2, n + 2), sums of one block; `matrix` (n, n + 3),
-    normal equations.
+    For n nuisances: `sums` (n + 2, n + 2): weighted products of nuisances, leak and left side; `values` (n,):
+    coefficients; `leak_products` (n,): products of the leak's column with the nuisances; `numbers` (6,): entries `ROWS`
+    to `MISFIT`. Work arrays: `block` (n + 2, n + 2): sums of one block; `matrix` (n, n + 3): normal equations.
     """
 
     sums: Any
@@ -66,9 +66,10 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
 
 @large_law
 def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
-    """Add `model.block`, of so many `rows`, to the sums with a `weight`, and reduce the weight of earlier blocks.
+    """Add the sums in `model.block` to those of earlier blocks, which are given less weight.
 
-    Between blocks the leak makes a random step, of the variance of a block's estimate, or unlimited if `has_stepped`.
+    `rows`: number of rows in the block; `weight`: weight of the block, 0 to 1. Between blocks the leak takes a random
+    step with the variance of a block's estimate, or of any size if `has_stepped`.
     """
     sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
     leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
@@ -139,10 +140,10 @@ def fit_coefficients(model: Any) -> None:
 
 @large_law
 def _learn_block(model: Any, rows: float, g: float) -> float:
-    """Add `model.block`, with the leak's estimate `g`, to the sums and the usual noise; return the block's weight.
+    """Add `model.block` to the sums and update the usual noise; return the block's weight.
 
-    A residual variance over `JUMP`^2 times the usual one reduces the weight; a step of the leak by over `JUMP` standard
-    deviations frees the leak.
+    `g`: leak estimated in the block. The weight is reduced if the residual variance is over `JUMP`^2 times the usual
+    one. A step of the leak by over `JUMP` standard deviations is not constrained by earlier blocks.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -163,9 +164,10 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in `model.block`; with `is_learned`, add the block to the earlier ones.
 
-    Return (w, w g, w s, w^2 V): the estimate g with its precision w, the shift s to subtract, so that better estimates
-    of the nuisances do not move the series, and the variance V due to the nuisances. `energy`: sum of squares of the
-    leak's column, N_k of the module; `usual_slope`: regression of a nuisance's column on it in the last blocks.
+    Returns (w, w g, w s, w^2 V): estimate g, its precision w, the shift s to subtract from g, which keeps the series
+    continuous when the nuisance estimates improve, and the variance V due to the nuisances. In the body `energy` is the
+    sum of squares of the leak's column, N_k of the module; `usual_slope` is the regression of a nuisance's column on it
+    over the last blocks.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
@@ -195,6 +197,9 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 
 @law
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
-    """Compute the mean `square` of a block's left side over that of earlier blocks; inf if those did not move."""
+    """Divide the mean `square` of a block's left side by that of earlier blocks.
+
+    Returns inf if only this block moved, and 1 if none moved.
+    """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -30,9 +30,10 @@ GROUP: int = LIVE.watch.group
 class BlockEstimate:
     """Estimate of one block.
 
-    `number`: blocks so far, including this one; `t`: its end [s]; `status`: "learning", "watched", "alarm", or why it
-    is not judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston together, `leak_lpm`:
-    its rise over the healthy machine [L/min], each with a 95 % interval that allows for warmer oil, or None if unknown.
+    `number`: count of blocks, including this one; `t`: end of the block [s]; `status`: "learning", "watched", "alarm",
+    or the reason why it is not judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston
+    together [L/min]; `leak_lpm`: its rise over the healthy machine [L/min]. Each has a 95 % interval that allows for
+    warmer oil, and is None if unknown.
     """
 
     number: int
@@ -45,18 +46,18 @@ class BlockEstimate:
 
     @property
     def judged(self) -> bool:
-        """True if the block was compared with the machine before it."""
+        """True if the block has an estimate that is tested, also while the baseline is learned."""
         return self.status in ("learning", "watched", "alarm")
 
 
 @dataclass(frozen=True)
 class WatchedLeak:
-    """A leak that a test has shown, until `dismiss` or `relearn` is called.
+    """A leak that a test has detected, present until `dismiss` or `relearn` is called.
 
-    `raised_s`: clock of the alarm; `onset_s`: begin of the leak [s], `leak_lpm`: its size at the alarm [L/min], both
-    with 95 % intervals; `conductance_before`: conductance before the onset, `rise`: its rise, with the standard
-    deviation `rise_sd` [m^3/(s Pa)], under the mean `pressure` difference [Pa]; `test`: "step" or "level"; `cause`:
-    path of the oil; `reason`: one line; `score`, `threshold`: of the test (`rise.LiveRise`).
+    `raised_s`: time of the alarm [s]; `onset_s`: start of the leak [s], `leak_lpm`: its size at the alarm [L/min], both
+    with 95 % intervals; `conductance_before`: conductance before the onset, `rise`: increase of it, `rise_sd`: standard
+    deviation of the increase [m^3/(s Pa)]; `pressure`: mean pressure difference [Pa]; `test`: "step" or "level";
+    `cause`: path of the leaking oil; `reason`: one line of text; `score`, `threshold`: of the test (`rise.LiveRise`).
     """
 
     raised_s: float
@@ -87,7 +88,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Rate of such scores in a healthy machine, as a fraction of the stated false-alarm rate, from 1e-9 to 1."""
+        """Chance of the score in a healthy machine, as a fraction of the test's allowed chance, 1e-9 to 1."""
         exponent = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(exponent, math.log(1e-9))))
 
@@ -110,11 +111,11 @@ class HealthyLevel:
 
 @dataclass(frozen=True)
 class WatchBaseline(HealthyLevel):
-    """A healthy machine, as it was while the baseline was learned.
+    """Leakage and duty of the healthy machine while the baseline was learned.
 
-    `version`: 1 for the first, one more after each repair; `hours` of operation; `lpm`: `level` as a flow at the mean
-    pressure difference [L/min], None if it cannot be stated; `duty_low`, `duty_high`: minima and maxima of the
-    logarithms of mean pressure difference [Pa] and mean flow of the pump [m^3/s].
+    `version`: 1 for the first baseline, increased by one after each repair; `hours`: learning time in operating hours;
+    `lpm`: `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated; `duty_low`,
+    `duty_high`: minima and maxima of the logarithms of mean pressure difference [Pa] and mean flow of the pump [m^3/s].
     """
 
     version: int
@@ -127,11 +128,12 @@ class WatchBaseline(HealthyLevel):
 def find_level_rise(
     healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
 ) -> LiveRise | None:
-    """Estimate the rise of a mean conductance `g` over a healthy level, or return None if it is not significant.
+    """Estimate the rise of a mean conductance over a healthy level; None if it is not significant.
 
-    Both tests must be significant at the false-alarm `probability`: of g against the minimum of the healthy means with
-    the warmest oil, and against their average by their scatter (Student's t, B. L. Welch's degrees of freedom).
-    `deviation`: standard error of g; `onset`: stated for the rise.
+    `g`, `deviation`: conductance and its standard error [m^3/(s Pa)]; `onset`: onset to state for the rise. Two tests
+    must both be significant at the false-alarm `probability`. The first compares g with the lowest healthy mean,
+    increased for the warmest oil. The second compares g with the average of the healthy means by their scatter
+    (Student's t, Welch's degrees of freedom). None also for fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -153,9 +155,9 @@ def find_level_rise(
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
-    """Return the conductance before a leak, with the range that the oil's temperature may give it by the clock `t` [s].
+    """Return the conductance before a leak, with its possible range at time `t` [s] due to oil temperature.
 
-    The range grows from the onset on, for `shift` hours, to that of the coldest and the warmest oil.
+    The range widens from the onset on. After `shift` hours it spans from the coldest to the warmest oil.
     """
     oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
@@ -171,7 +173,10 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether a duty is from `low` to `high` with a margin, larger for low pressures, as a leak lowers them."""
+    """Test whether a duty is between `low` and `high`, extended by a margin.
+
+    The margin towards low pressures is larger, as a leak lowers the pressure difference.
+    """
     margin = LIVE.watch.margin
     min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)
     return all(lower <= value <= upper + margin for value, lower, upper in zip(duty, min_duty, high, strict=True))
@@ -181,9 +186,10 @@ def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
 class BaselineLearning:
     """Running sums from which the baseline is computed.
 
-    Of all `blocks`: sums of the conductance (`total`) and of the `flow` of a unit conductance, range of the duty. Of
-    `count` means of `GROUP` blocks: `mean`, sum of `squares` about it, `low`, `high`. `group`: conductances that await
-    their mean.
+    Over all `blocks` blocks: `total`, sum of the conductances; `flow`, sum of the flows of a unit conductance;
+    `duty_low`, `duty_high`, range of the duty. Over the `count` complete groups of `GROUP` blocks: `mean` of the group
+    means, sum `squares` of their squared deviations, and their extremes `low`, `high`. `group`: conductances of the
+    incomplete group.
     """
 
     blocks: int = 0

@@ -28,8 +28,8 @@ ALARMING = (*LEAK_EVENTS, *(event.name for event in load_events() if event.cause
 class RiseExplanation(NamedTuple):
     """Explanation of a rise of the leakage.
 
-    `is_leak`: a leak explains it; `is_outside`: a leak to the outside, almost surely; `other_events`: those that
-    explain it instead, in words, "" if there are none.
+    `is_leak`: True if a leak explains the rise; `is_outside`: True if the leak is almost surely to the outside;
+    `other_events`: events that explain the rise instead, in words, "" if there are none.
     """
 
     is_leak: bool
@@ -44,8 +44,8 @@ UNKNOWN = RiseExplanation(is_leak=False)
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
     """Explain a rise of the leakage by the observables of the blocks around it.
 
-    `data`: kind of data that the leakage is estimated from; its changes outside the interval `onset` [s] are
-    ignored. `is_settled`: enough blocks have followed to distinguish a leak to the outside from a sensor fault.
+    `data`: kind of data that the leakage is estimated from; changes in these data outside the interval `onset` [s] are
+    ignored. `is_settled`: True if enough blocks have followed to distinguish a leak to the outside from a sensor fault.
     """
     names = ALARMING if is_settled else LEAK_EVENTS
     events = [event for event in load_events() if event.name in names]

@@ -46,7 +46,11 @@ def format_ways(ways: Sequence[Sequence[str]]) -> str:
 
 
 def are_successive(steps: Any, rate: float) -> Any:
-    """Test whether samples `steps` [s] apart follow each other at a `rate` [Hz]; nearer ones are copies."""
+    """Test whether samples follow each other without a gap.
+
+    `steps`: time between neighbours [s]; `rate`: sampling rate [Hz]. False for a gap and for a copy of the sample
+    before.
+    """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
 
@@ -68,10 +72,10 @@ class SampleRun(NamedTuple):
 class SampleJoiner:
     """Divide the samples of an actuator into runs without a gap.
 
-    `ways`: sets of channels that suffice (`ways_to_watch`); `names`: the set in use, replaced if a position is recorded
-    later, unless `is_final`. Samples up to `late_s` older than the `newest` one [s] are late or repeated, and dropped;
-    older ones show that the clock was set back. `changed`: the `rate` differs from that of the last run. `counters`:
-    numbers of dropped samples and of interruptions, by reason.
+    `ways`: sets of channels that suffice (`ways_to_watch`); `names`: set in use, replaced by a better one if a position
+    is recorded later, unless `is_final`. Samples up to `late_s` [s] older than the `newest` one are late or repeated,
+    and dropped; older ones show that the clock was set back. `changed`: True if the `rate` differs from that of the
+    last run. `counters`: numbers of dropped samples and of interruptions, by reason.
     """
 
     ways: tuple[tuple[str, ...], ...]
@@ -115,7 +119,7 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels to watch by: the best recorded set at first or once a position appears, else `names`."""
+        """Choose the channels to use: the best recorded set, at first or once a position appears, else `names`."""
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names

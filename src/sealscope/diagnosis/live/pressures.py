@@ -53,12 +53,13 @@ _MAX_SD: float = PRESSURE.response["G"][1]
 
 
 class PressureEstimator:
-    """Estimate the leakage conductance block by block from the pressure response, as `LiveBalance` does by volumes.
+    """Estimate the leakage conductance block by block from the response of the pressures to the command.
 
-    `rig`: prior of the machine; `litres`: whether it states the sizes that L/min need. Only changes of the conductance
-    are stated (`states_level`), with a relative error `size_error`. An orifice of the same apparent conductance passes
-    `orifice_factor` times the flow of a laminar leak, which widens the upper end of an interval;
-    `min_internal_fraction`: fraction of an apparent leak that is internal, at least.
+    The counterpart of `LiveBalance` without a position. `rig`: prior of the machine; `litres`: True if it states the
+    sizes that L/min need. Only changes of the conductance are stated (`states_level`), with a relative error
+    `size_error`. An orifice of the same apparent conductance passes `orifice_factor` times the flow of a laminar leak,
+    which widens the upper end of an interval; `min_internal_fraction`: smallest fraction of an apparent leak that is
+    internal.
     """
 
     method, data, states_level = "pressures", RESPONSE, False
@@ -107,7 +108,10 @@ class PressureEstimator:
         self._samples = samples.copy()
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
-        """Set stuck pressure readings in the first `n_block` samples to nan; return False if later ones must decide."""
+        """Set stuck pressure readings in the first `n_block` samples to nan.
+
+        Returns False, and changes nothing, if only later samples can tell whether a reading is stuck.
+        """
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         if min(hold.pending for hold in holds) < n_block:
             return False
@@ -141,7 +145,7 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
-        """Report a block that the model does not describe; after `lost` successive ones restart the fit."""
+        """Report a block that does not fit the model; after `lost` such blocks in succession restart the fit."""
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
             follower.interrupt(math.inf)
@@ -151,9 +155,9 @@ class PressureEstimator:
         return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
-        """Prepare the fit for a block after a gap [s]; return it, and whether earlier blocks are not comparable.
+        """Prepare the fit for a block after a `gap` [s]; return it, with True if earlier blocks are not comparable.
 
-        At another sampling rate the parameters are the start of a new fit.
+        After a change of the sampling rate the present parameters are the start of a new fit.
         """
         has_other_rate = follower.machine.rate != rate
         if has_other_rate:

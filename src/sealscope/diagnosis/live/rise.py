@@ -20,8 +20,8 @@ _UNDATED = Interval(math.nan, math.nan, math.nan)
 class LiveRise(NamedTuple):
     """A rise of the conductance in a stream, with its test (`observable.DatedTest`).
 
-    `score`: of a step twice the logarithm of an e-value, of a level a normal quantile; `interval`: onset [s]; `size`,
-    `deviation`: the rise and its standard deviation [m^3/(s Pa)].
+    `test`: "step" or "level"; `score`: for a step twice the logarithm of an e-value, for a level a normal quantile;
+    `interval`: onset with its 95 % interval [s]; `size`, `deviation`: the rise and its standard deviation [m^3/(s Pa)].
     """
 
     test: str
@@ -32,14 +32,14 @@ class LiveRise(NamedTuple):
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of the largest probability that a healthy machine scores as high (of a step J. Ville's bound)."""
+        """Logarithm of the largest probability that a healthy machine scores this high (for a step, Ville's bound)."""
         from scipy.special import log_ndtr
 
         return -0.5 * max(self.score, 0.0) if self.test == STEP else float(log_ndtr(-self.score))
 
     @property
     def chance(self) -> float:
-        """Largest probability that a healthy machine scores as high."""
+        """Largest probability that a healthy machine scores this high."""
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
@@ -53,7 +53,7 @@ class LiveRise(NamedTuple):
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity: the smallest step that a stream would show depends on its random walk, and is not known."""
+        """Return infinity, as the smallest detectable step depends on the stream's random walk and is not known."""
         return math.inf
 
 

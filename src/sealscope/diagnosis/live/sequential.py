@@ -77,7 +77,7 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all onsets and blocks before now; keep what is learned of noise and walk."""
+        """Drop all onsets and blocks so far; keep the learned noise and walk."""
         self._end = -np.inf
         self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
 
@@ -165,14 +165,14 @@ class StepDetector:
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratios log R (v, q, j), by the prior on the step's size, walk and onset."""
+        """Compute the log likelihood ratios log R (v, q, j) for each step size v, walk q and onset j."""
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
         explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
         return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, 0] * np.log1p(-explained)))
 
     def _log_terms(self) -> Array:
-        """Compute the logarithms (v, q, j) of the terms of M, by size, walk and onset."""
+        """Compute the logarithms of the terms of M, (v, q, j), for each step size v, walk q and onset j."""
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
@@ -199,7 +199,7 @@ class StepDetector:
         return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Compute the quantile of the rise at a `probability`, given that the rise is > 0; inf without onsets."""
+        """Compute the quantile of a positive rise at `probability`, an upper bound [unit of g]; inf without onsets."""
         if not len(self._onsets):
             return np.inf
         a, b, T = self._sums[_A : _T + 1]
@@ -212,7 +212,7 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Ratio of the innovations' variance to the stated one, learned with a walk of a tenth of that variance."""
+        """Variance of the innovations over the stated one, for the walk with a tenth of a block's variance."""
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
@@ -228,9 +228,10 @@ class StepDetector:
 
 
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
-    """Select the onsets to store: all of the last `RECENT` blocks, and of older blocks a grid that coarsens with age.
+    """Select the onsets to keep: all of the last `RECENT` blocks, and fewer of older blocks.
 
-    The grid contains only onsets at the start of a block. `block`: number of the present block; `onsets` (j, 4).
+    Older onsets are kept on a grid that coarsens with age, up to `HORIZON` blocks, and only if at the start of a block.
+    `block`: number of the present block; `onsets` (j, 4).
     """
     _, onset_block, onset, block_start = onsets.T
     age = block - onset_block

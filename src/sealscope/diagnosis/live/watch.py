@@ -314,7 +314,7 @@ class Watch:
         return self._add_flows(estimate, estimator, blocks)
 
     def _has_known_duty(self, block: BlockConductance) -> bool:
-        """Test whether a block's duty is one of the baseline's; every duty is, while there is no baseline."""
+        """Test whether a block's duty is within the range of the baseline; True while there is no baseline."""
         baseline = self.baseline
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
@@ -342,10 +342,10 @@ class Watch:
             self._learning = BaselineLearning()
 
     def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
-        """Test for a step of the conductance after a block, and set the leak alarm if a leak explains the step.
+        """Test for a step of the conductance after a block, and raise the leak alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Return True if a step was found
-        that only further blocks can explain.
+        For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Returns True if a step was
+        found whose explanation needs further blocks.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -462,7 +462,7 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows of the last block's estimate by means over more blocks, and thus over cycles of the duty.
+        """Average the flows of the last block's estimate over more blocks, to cover whole cycles of the duty.
 
         The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
         """

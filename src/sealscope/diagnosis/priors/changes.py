@@ -47,7 +47,7 @@ class OctavePriors(PriorTable):
 
 
 class FilteredPriors(PriorTable):
-    """Size of a change that a filter makes (logarithm)."""
+    """Size of the spectral tilt that a filter causes: median and spread of its logarithm."""
 
     size: float
     spread: float

@@ -4,7 +4,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class SmallestLeakPriors(PriorTable):
-    """The smallest leak that is detected in the next recording."""
+    """Requirements on the smallest detectable leak: detection probability, and multiples of healthy days tried."""
 
     power: float
     repeats: tuple[int, ...]

@@ -4,7 +4,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class NullPriors(PriorTable):
-    """Laws of statistics on healthy recordings."""
+    """Prior on the error of a detector's null distribution for healthy recordings."""
 
     fails: float
     inflation: float
@@ -12,13 +12,13 @@ class NullPriors(PriorTable):
 
 
 class QuestionPriors(PriorTable):
-    """Shares of the false-alarm probability."""
+    """Fraction of the false-alarm probability for each test of a diagnosis."""
 
     within: float
 
 
 class ExplanationPriors(PriorTable):
-    """Probabilities from which an explanation is named."""
+    """Probabilities above which an explanation is named or a leak stated."""
 
     heading: float
     leak: float
@@ -28,7 +28,7 @@ class ExplanationPriors(PriorTable):
 
 
 class WorthPriors(PriorTable):
-    """Bounds worth stating."""
+    """Limits beyond which an upper bound of a leak, or an unjudged rest of a recording, is too large to state."""
 
     share: float
     unjudged: float

@@ -54,7 +54,7 @@ class ScatterPriors(PriorTable):
 
 
 class ConditionPriors(PriorTable):
-    """Conditions beyond those of the healthy recordings: `oil` [K]; the others are numbers."""
+    """Difference of the operating conditions from those of the healthy recordings; `oil` [K]."""
 
     ratio: float
     oil: float
@@ -86,7 +86,7 @@ class SizePriors(PriorTable):
 
 
 class RepeatPriors(PriorTable):
-    """Repetition of the flow that motion takes from day to day (relative standard deviations)."""
+    """Relative standard deviations of the flow needed for the same motion from day to day."""
 
     error: float
     scatter: float
@@ -94,7 +94,7 @@ class RepeatPriors(PriorTable):
 
 
 class GrowthPriors(PriorTable):
-    """Growth of a leak after its onset within a recording."""
+    """Growth of a leak after its onset within a recording: fraction that stay constant, and largest growth."""
 
     steady: float
     most: float
@@ -108,7 +108,7 @@ class StepSize(PriorTable):
 
 
 class SensePriors(PriorTable):
-    """Probability that a symptom of the sign of the flow into A has another cause."""
+    """Probabilities of other causes for the symptoms of a wrong sign of the flow into side A."""
 
     work: float
     leak: float

@@ -44,7 +44,10 @@ class ConductancePriors(PriorTable):
 
 
 class FrictionLaw(PriorTable):
-    """A law of friction: `give` [m/N] before it slides; it creeps below the speed `creep` [m/s] (None: the rig's)."""
+    """A law of friction: compliance `give` [m/N] before sliding, and largest creep speed [m/s].
+
+    `creep` is None to use the value of the rig.
+    """
 
     give: tuple[float, float, float]
     creep: float | None = None

@@ -4,7 +4,11 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class WalkPriors(PriorTable):
-    """Walk of the levels: scales of half-Cauchy laws, gained in `time` [s]: `machine`, `noise`, `duty` [1 in 90 s]."""
+    """Random walk of the log RMS levels over time.
+
+    `machine`, `noise`, `duty`: half-Cauchy scales of the deviation gained in `time` [s]; `tried`: number of rates
+    tried; `least`: smallest fraction of a level that is due to the machine.
+    """
 
     machine: float
     noise: float
@@ -15,7 +19,7 @@ class WalkPriors(PriorTable):
 
 
 class DutyExponents(PriorTable):
-    """Exponents by which a detail's RMS goes with the duty (standard deviation)."""
+    """Prior standard deviations of the exponents in the power law of a detail's RMS over the duty."""
 
     command: float
     rate: float
@@ -24,7 +28,7 @@ class DutyExponents(PriorTable):
 
 
 class LevelScatter(PriorTable):
-    """Scatter of the levels from recording to recording (logarithms): `pause` [s]; the others are numbers."""
+    """Scatter of the log RMS from recording to recording; `pause` [s], the other fields have no unit."""
 
     scatter: float
     session: float
@@ -35,7 +39,7 @@ class LevelScatter(PriorTable):
 
 
 class RmsBlockPriors(PriorTable):
-    """Blocks of a recording: `seconds`, `settling` [s]; the others are numbers."""
+    """Blocks of a recording; `seconds`, `settling` [s], the other fields have no unit."""
 
     seconds: float
     samples: int
@@ -47,7 +51,7 @@ class RmsBlockPriors(PriorTable):
 
 
 class RingingRates(PriorTable):
-    """Sampling rates that show the ringing: `ringing`, `slowest` [Hz]."""
+    """Lowest sampling rates [Hz] at which the machine's and a hydraulic line's ringing are recorded."""
 
     ringing: float
     slowest: float

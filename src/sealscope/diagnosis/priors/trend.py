@@ -4,7 +4,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class LevelDeviation(PriorTable):
-    """Standard deviation of a level from recording to recording: `times` [d]."""
+    """Scatter of a level from recording to recording: its size, and the times [d] for which a part of it lasts."""
 
     volume_balance: float
     ringing: float
@@ -15,7 +15,7 @@ class LevelDeviation(PriorTable):
 
 
 class LevelError(PriorTable):
-    """Error of the level and of the scale that one recording states."""
+    """Errors stated for a single recording, of its ringing level (logarithm) and of its scale (relative)."""
 
     ringing: float
     scale: float

@@ -4,13 +4,13 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class RepairPriors(PriorTable):
-    """Limit from which a machine is repaired: `creep` [mm/min]."""
+    """Default repair limit, as the creep speed of the piston with its lines shut [mm/min]."""
 
     creep: float
 
 
 class FalseAlarmPriors(PriorTable):
-    """Probability of `leak` on a leak-free recording."""
+    """Default, smallest and largest probability of the verdict `leak` on a leak-free recording."""
 
     probability: float
     rarest: float

@@ -33,11 +33,11 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 class RmsBlocks:
     """Log RMS of every quantity (`QUANTITIES`) in the n blocks without missing samples.
 
-    `edges` (n + 1,): begin of each block and end of the last one [s]; `log_rms` (n, 5 per chamber); `duty` (n, 4): log
-    RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp) / RMS(dp). Differences
-    between the phases of a cycle are removed from both. `phases`: blocks a cycle; `cycle` of the command [s], or None;
-    `frozen`: text on the first block in which a reading does not move, so that its log RMS means nothing, or None;
-    `n_left_out`: number of blocks with missing samples.
+    `edges` (n + 1,): start of each block and end of the last one [s]; `log_rms` (n, 5 per chamber); `duty` (n, 4): log
+    RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp) / RMS(dp). In both, the
+    mean differences between the phases of a duty cycle are removed. `phases`: number of blocks per cycle; `cycle`:
+    period of the command [s], or None; `frozen`: description of the first block in which a pressure reading is stuck,
+    which makes its log RMS meaningless, or None; `n_left_out`: number of blocks with missing samples.
     """
 
     edges: Array
@@ -65,7 +65,7 @@ class RmsBlocks:
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return the blocks without the machine's start: 10 s or three cycles, but at most an eighth of the blocks."""
+        """Return the blocks after the machine's start, which lasts 10 s or three cycles, at most an eighth of them."""
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
         first = min(n_blocks // 8, int(np.ceil(start_s / self.seconds))) if n_blocks else 0
@@ -78,13 +78,16 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chambers whose readings are not mostly clipped, or all chambers if there is none such."""
+    """Return the chambers whose readings are not mostly clipped; if all are clipped, return all chambers."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
 
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
-    """Compute the log RMS (5 per judged chamber,) and the duty (4,) of a recording without the transform's edges."""
+    """Compute the log RMS (5 per judged chamber,) and the duty (4,) of a whole recording.
+
+    Samples affected by padding of the wavelet transform are left out.
+    """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
     log_rms, duty = _measure_blocks(recording, transformed, np.array([inside.start, inside.stop]))
@@ -109,7 +112,10 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
-    """Cut a uniformly sampled recording without missing samples into blocks, edges of the transform dropped."""
+    """Cut a recording into blocks, without the samples affected by padding of the wavelet transform.
+
+    The recording must be uniformly sampled and without missing samples.
+    """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
     cycle = find_cycle(recording)
@@ -132,9 +138,11 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
 
 
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
-    """Choose the sample bounds of the blocks between the transform's edges, and the number of blocks in a cycle.
+    """Choose the sample bounds of the blocks, and the number of blocks per cycle.
 
-    A block is a whole fraction, or a multiple, of the cycle [s]; of several cycles if there would be too many blocks.
+    `inside`: samples unaffected by padding; `rate` [Hz]; `cycle`: period of the command [s], or None. A block is an
+    integer fraction or an integer multiple of the cycle. If this gives too many blocks, each block spans several whole
+    cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)
@@ -153,7 +161,11 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
 def _find_frozen(
     recording: Recording, chambers: Sequence[str], log_rms: Array, is_complete: NDArray[np.bool_], times: Array
 ) -> str | None:
-    """Describe the first block in which a detail d1 to d4 is a rounding error or no number; `times`: bounds [s]."""
+    """Describe the first block in which a pressure is stuck; None if there is none.
+
+    A pressure is stuck if a detail d1 to d4 is only rounding error or not finite. `is_complete` (n,): blocks without
+    missing samples; `times` (n + 1,): bounds of the blocks [s].
+    """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4
     is_frozen = is_complete[:, None] & ~np.all(np.isfinite(levels) & (levels > floor), axis=2)

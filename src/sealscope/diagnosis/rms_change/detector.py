@@ -44,7 +44,7 @@ class RmsChange:
     reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
-        """Nothing is assumed of the machine."""
+        """Create the detector; `rig` is ignored, as nothing is assumed of the machine."""
 
     def usable(self, recording: Recording) -> str | None:
         """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
@@ -87,8 +87,8 @@ class RmsChange:
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test every quantity of every chamber for a step within the blocks of one recording.
 
-    All judged quantities that changed share one onset, by the sum of their log likelihoods. `rate`: of the samples
-    [Hz]; `unused`: recorded columns that no channel is made of.
+    All changed quantities share one onset, found from the sum of their log likelihoods. `rate`: sampling rate [Hz];
+    `unused`: recorded columns that belong to no channel.
     """
     changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -146,8 +146,7 @@ def compare_summaries(
 ) -> tuple[tuple[Observable, ...], float]:
     """Test every quantity of every chamber for a rise or fall against leak-free recordings.
 
-    Returns the observables, and the 95 % upper bound of the size of an undetected change, the smallest of all judged
-    quantities.
+    Returns the observables and the smallest 95 % upper bound of an undetected change over all judged quantities.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
@@ -165,7 +164,7 @@ def compare_summaries(
 
 
 def _is_judged(column: str) -> bool:
-    """Test whether a column, such as "d3 of p_A", is of a judged quantity."""
+    """Test whether the quantity in a column name, such as "d3 of p_A", is among the judged ones."""
     return column.split(maxsplit=1)[0] in JUDGED
 
 
@@ -174,7 +173,8 @@ def _make_observable(
 ) -> Observable:
     """Make the observable of a column's change.
 
-    `chance` is that of a single test; there are two, for a rise and a fall, of each judged quantity of each chamber.
+    `chance`: p-value of a single test. It is corrected for the number of tests: a rise and a fall of each judged
+    quantity in each chamber.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

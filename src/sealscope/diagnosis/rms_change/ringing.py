@@ -23,10 +23,11 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute log RMS (n, 5 per chamber) relative to noise and a constant signal, and the signal's energy fraction.
+    """Compute the noise-free change of the log RMS, and the fraction of energy that is not noise.
 
-    The noise of each block is the energy E_1 of d1; the signal S_j of a detail is its mean energy in the `healthy` log
-    RMS (k, 5 per chamber) beyond that of d1. The results are y and w of the module's equations.
+    `log_rms` (n, 5 per chamber): levels of n blocks or recordings; `healthy` (k, 5 per chamber): levels from which the
+    mean signal energy S_j of each detail is estimated, as the energy beyond that of d1. The energy E_1 of d1 is the
+    noise of the same row. Returns y and w of the module's equations, both in the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -44,7 +45,10 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 
 
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Compute the information on the change g of each quantity, duty eliminated, and the mean weight w of each."""
+    """Compute the information on the change g of each quantity over the blocks, with the duty eliminated.
+
+    Returns one `Information` for each column of `blocks.log_rms`, and the mean weight w of each column.
+    """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance
     features = DUTY[:-1]  # without the direction: the levels of phases are already removed
@@ -68,12 +72,14 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def estimate_rises(
     log_rms: Array, duty: Array, healthy: Array, healthy_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Estimate the rise g of each quantity over n leak-free recordings, duty removed; return these and w.
+    """Estimate the rise g of each quantity over n leak-free recordings, corrected for the duty.
 
-    `log_rms` (5 per chamber,), `duty` (4,) of the judged recording; `healthy` (n, 5 per chamber), `healthy_duty` (n, 4)
-    of the leak-free ones; `times` (n + 1,) of these and of the judged one [s], None if unknown. The quantities of
-    healthy recordings are normal about a mean, with an effect of the duty and an Ornstein-Uhlenbeck process of the time
-    between them: a random walk of unknown rate, limited to the differences between sessions, which a pause separates.
+    `log_rms` (5 per chamber,), `duty` (4,): judged recording; `healthy` (n, 5 per chamber), `healthy_duty` (n, 4):
+    leak-free recordings; `times` (n + 1,): start of the leak-free recordings, then of the judged one [s], None if
+    unknown. Returns the rises and the weights w, (5 per chamber,).
+
+    Model of the healthy values: a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over time. The
+    rate of this process is unknown; its variance is that between sessions, which are separated by a pause.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponents = np.array([vars(RMS_PRIORS.duty)[name] for name in DUTY])

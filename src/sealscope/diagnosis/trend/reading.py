@@ -47,16 +47,16 @@ BASES: tuple[Basis, ...] = get_args(Basis)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """Level of leakage of one recording.
+    """Leakage level of one recording.
 
-    `start` of its first sample [s since 1970], None if unknown, and `duration` [s]; `basis`, None if no level can be
-    stated, and `problem`: why; `level`: conductance of pump and piston together [m^3/(s Pa)], or a relative index, with
-    its standard `error`; `states_flow`: whether L/min can be stated; `area` of the piston [m^2] that converts a speed
-    of creep to the level's unit, or None; `pressure`: mean |p_A - p_B| [Pa]; `pump`: mean flow of the pump, and
-    `size_error`, the relative standard error of the machine's size; `sums` of the balance's `terms` and `ringing`, to
-    compare with other recordings, None if the channels do not allow them; `temperature` of the oil [deg C], None if the
-    file does not state it; `scale`: ratio of displacement to area, over the assumed ratio; `machine`: what was assumed;
-    `digest`: equal for copies.
+    `start`: time of its first sample [s since 1970], None if unknown; `duration` [s]; `basis`: method of the level,
+    None if no level can be stated, with the reason in `problem`; `level`: conductance of pump and piston together
+    [m^3/(s Pa)], or a relative index, with its standard error `error`; `states_flow`: True if the level can be stated
+    in L/min; `area`: piston area [m^2] that converts a creep speed to the level's unit, or None; `pressure`: mean |p_A
+    - p_B| [Pa]; `pump`: mean flow of the pump; `size_error`: relative standard error of the machine's size; `sums` of
+    the balance's `terms`, and `ringing`: data to compare with other recordings, None if the channels do not allow them;
+    `temperature` of the oil [deg C], None if the file does not state it; `scale`: measured ratio of displacement to
+    area over the assumed one; `machine`: assumptions about the machine; `digest`: hash, equal for copies.
     """
 
     file: str
@@ -83,9 +83,9 @@ class LeakReading:
 def estimate_reading(
     recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = ""
 ) -> LeakReading:
-    """Estimate the level of leakage of a recording.
+    """Estimate the leakage level of a recording.
 
-    `rig`: what may be assumed of the machine; None: as for `diagnose`, L/min only where the machine is known.
+    `rig`: assumed sizes of the machine; if None, as for `diagnose`, L/min are stated only for a known machine.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -108,7 +108,10 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the fields of the most specific level that a recording without a defect allows, or its `problem`."""
+    """Estimate the most specific level that a defect-free recording allows.
+
+    Returns the fields of `LeakReading` that the level determines, or only its `problem` if no level can be estimated.
+    """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     no_balance, no_response = unusable_reason(balance, part), unusable_reason(response, part)
     fields: dict[str, Any] = {"ringing": details.learn(part) if unusable_reason(details, part) is None else None}
@@ -224,7 +227,10 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
-    """Return why each reading is left out: no level, a copy, or a rarer basis than others; "" if it is not."""
+    """List the reason why each reading is left out, "" for those that are used.
+
+    Reasons are a missing level, a copy of another recording, and a basis rarer than the most frequent one.
+    """
     file_of_digest: dict[str, str] = {}
     notes = []
     for reading in readings:
@@ -241,7 +247,10 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 
 
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """List findings on the clock, on groups, and on readings left out, one for reasons that differ in numbers only."""
+    """List the findings on the clock, on groups of recordings, and on readings left out.
+
+    Readings whose reasons differ only in numbers share one finding.
+    """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
     for point in points:
@@ -269,9 +278,10 @@ def _relative_change(scale: float | None, other: float | None) -> float:
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
-    """Find signs of a clock set back: recordings that overlap, or times that fall in the order of numbered names.
+    """Find signs that the clock was set back.
 
-    Recordings of one date without a time of day have the same start, and do not count as overlapping.
+    These are recordings that overlap, and times that fall while the numbers in the file names rise. Recordings dated
+    without a time of day share one start and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

@@ -147,7 +147,7 @@ class Trend:
 
     @property
     def alarm(self) -> TrendPoint | None:
-        """The recording after which the test alarmed since the last repair, or None."""
+        """First recording at which the test raised an alarm since the last repair; None without an alarm."""
         number = self.episodes[-1].alarm if self.episodes else None
         return None if number is None else self.points[self.rows[number]]
 
@@ -375,7 +375,7 @@ def _count_healthy(trend: Trend) -> int:
 
 
 class _ConvertedLevels(NamedTuple):
-    """Levels in the trend's unit, and the number of these units per unit of a reading's level."""
+    """Levels in the trend's unit, with the factor that converts a level of a reading to that unit."""
 
     levels: Levels
     trend_units_per_level: float
@@ -384,8 +384,8 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the compared levels to the trend's unit and to the oil temperature of the first recording.
 
-    The unit is L/min at the trend's pressure, or % of the usual level, the mean of the healthy recordings. Levels are
-    conductances [m^3/(s Pa)]; those of the ringing are logarithms, whose differences from the usual one become %.
+    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are conductances
+    [m^3/(s Pa)], or for the ringing logarithms; a difference of logarithms from the healthy mean is converted to %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (

@@ -31,9 +31,9 @@ MIN_RECORDINGS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrendLeak:
-    """The rise of the leakage over recordings, a `LeakMeasure` whose flows are in the unit of the levels.
+    """The rise of the leakage from recording to recording, as a `LeakMeasure` with flows in the levels' unit.
 
-    It has no test within a recording, so that the step and its flow are none, and no history but the trend itself.
+    There is no test for a step within a recording, and no history other than the trend itself.
     """
 
     provider: str
@@ -55,12 +55,12 @@ class TrendLeak:
 
     @property
     def step_flow(self) -> Flow:
-        """Flow of a step within a recording: unknown."""
+        """Unknown flow, as no step within a recording is tested."""
         return Flow(0.0, np.inf)
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The rise, of which no step within a recording explains a part; None without a rise."""
+        """The whole rise, as no step within a recording accounts for a part of it; None without a rise."""
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
@@ -83,11 +83,11 @@ def decide_trend(
     interval: float,
     years: float,
 ) -> Evidence:
-    """Decide whether leakage has risen since the last repair, by the compared recordings since then, in time order.
+    """Decide from the recordings since the last repair whether the leakage has risen.
 
-    `trend_units_per_level`: factor from levels of readings to the trend's unit; `pressure`: difference for which L/min
-    are stated [Pa], None if the levels are relative; `interval`: typical time between two recordings [days]; `years`:
-    machine-years to a false alarm.
+    `points`: comparable recordings in time order; `trend_units_per_level`: factor from levels of readings to the
+    trend's unit; `pressure`: pressure difference at which L/min are stated [Pa], None if the levels are relative;
+    `interval`: typical time between two recordings [days]; `years`: mean time between false alarms [machine-years].
     """
     wear = episode.wear
     # interval over the mean time to a false alarm of this score
@@ -107,9 +107,10 @@ def decide_trend(
 def _measure_leak(
     points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
 ) -> TrendLeak:
-    """Measure the rise since the last repair; arguments as for `decide_trend`, with the `chance` of the rise.
+    """Measure the rise since the last repair.
 
-    Leak laws between laminar and orifice flow are mixed: the flow goes with the pressure to one of `EXPONENTS`.
+    `chance`: probability of such a rise in a healthy machine; other arguments as for `decide_trend`. As the leak may be
+    laminar or an orifice, the flow is taken as proportional to the pressure to one of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -135,7 +136,10 @@ def _measure_leak(
 
 
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
-    """Return the rise as a normal law with the standard deviation that gives it the chance; None if it is not rare."""
+    """Convert the rise to a normal distribution whose probability of a value below zero is `chance`.
+
+    None if the chance is 0.5 or more, or the upper bound of the rise is not positive.
+    """
     from scipy.special import ndtri
 
     score = -float(ndtri(chance))
@@ -146,13 +150,13 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """State the total flow [L/min], with the error of the machine's size added to its interval."""
+    """Make the total leakage [L/min], with the size's relative error `size_deviation` added to its interval."""
     below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
     return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
 
 
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
-    """Report the fall of the ringing, which bounds no leak."""
+    """Report the fall of the ringing as a detector's observation, which gives no upper bound of a leak."""
     size = -wear.leak.value / 100.0  # change of the logarithm, from %
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
     ringing = None
@@ -162,7 +166,10 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split the recordings comparable with the last one into those before and since the onset, or the last day."""
+    """Split the recordings comparable with the last one into those before the onset and those since.
+
+    Without an onset the split is at the last recording.
+    """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
     before = [point for point in comparable if point.day < onset]
@@ -170,7 +177,10 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 
 
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
-    """Compare the balance's other terms since the onset with before, where the same single balance describes both."""
+    """Compare the other balance terms since the onset with those before, as rival explanations of the rise.
+
+    Recordings are compared only where the same single balance describes both.
+    """
     names = [roles.names for roles in points[-1].terms]
     sums_before, sums_since = (
         [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]

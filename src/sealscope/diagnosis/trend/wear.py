@@ -62,10 +62,11 @@ class ScatterPrior(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels (n,) of n recordings in the order of their times, and the `prior` on their scatter.
+    """Levels (n,) of n recordings in time order, and the `prior` on their scatter.
 
-    `t` [days]; `value`; `error`: standard error that each states of itself; `group` (n,): number of the group that
-    shares a mean; `covariate` (n,) with the standard deviation `slope_sd` of its coefficient, 0 for none.
+    `t`: time [days]; `value`: the levels; `error`: standard error that each recording states for its level; `group`
+    (n,): number of the group, whose recordings share a mean; `covariate` (n,): an explanatory variable, whose
+    coefficient has the prior standard deviation `slope_sd`, 0 for none.
     """
 
     t: Array
@@ -92,7 +93,7 @@ class Levels:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation between recordings: from the median step of neighbours, shrunk towards the prior."""
+        """Standard deviation between recordings, from the median step between neighbours shrunk towards the prior."""
         prior = self.prior
         # the step of two neighbours has twice the variance of one
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
@@ -102,7 +103,7 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average neighbours of a group, so that about `max_count` levels remain, which limits the time of the test."""
+        """Average neighbours within a group to reduce the levels to about `max_count`, which limits computing time."""
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
@@ -117,10 +118,11 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute the excess of each value (n,) to ignore as an outlier: while the value is the last one, and afterwards.
+    """Compute the part of each value that is ignored as an outlier, (n,), in two variants.
 
-    It is the distance from the median of the three values before, less `outlier` standard deviations, or 0 if the value
-    before or after lies as far out on the same side.
+    The first variant treats the value as the latest one. The second also uses the next value, and is 0 for the last
+    value. The excess is the signed distance from the median of the three values before, less `outlier` standard
+    deviations. It is 0 if the value before, or in the second variant the value after, lies as far out on the same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -188,9 +190,9 @@ class _Changes(NamedTuple):
 class _Node(NamedTuple):
     """Likelihoods at one pair (tau, r) of the grid.
 
-    `log_null` (n,): logarithm of prior times likelihood without a change, after each recording; `a`, `b` (n, m): of the
-    likelihood ratio of m profiles; `mean`, `variance` of the last group's level without a change; `mean_slope` (m,):
-    decrease of that mean per unit of a change.
+    `log_null` (n,): logarithm of prior times likelihood without a change, after each recording; `a`, `b` (n, m): terms
+    of the likelihood ratio of m profiles; `mean`, `variance`: level of the last group without a change; `mean_slope`
+    (m,): decrease of that mean per unit of a change.
     """
 
     tau: float
@@ -259,7 +261,7 @@ def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
 
 
 class ChangeScores(NamedTuple):
-    """Logarithm of R after each recording (n,), and the `begin` (n,) of the change that is most probable then."""
+    """Logarithm of R after each recording (n,), with the most probable `begin` (n,) of a change."""
 
     log_R: Array
     begin: IntArray
@@ -273,7 +275,8 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the sequential test's R for a rise (a step or a growth), or with `falls` for a fall (a step).
 
-    The first `n_healthy` recordings are without a change; `may_grow`: the level may have grown evenly before.
+    The first `n_healthy` recordings are assumed unchanged; `may_grow`: allow an even growth from the first recording on
+    as part of the null hypothesis.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
@@ -310,7 +313,10 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw from the posterior; `signed`: the amplitude has a flat prior and either sign, else a half-normal one."""
+        """Draw from the posterior.
+
+        `signed`: give the amplitude a flat prior and either sign, instead of a half-normal prior.
+        """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
         a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
@@ -334,13 +340,14 @@ class _Draws(NamedTuple):
 
 
 class Wear(NamedTuple):
-    """Level, change and time to the limit after the last of some recordings.
+    """Level, change and time to the limit after the last of a series of recordings.
 
-    `total`: level without the last recording's scatter; `leak`: its rise since the change, below `bound` with a
-    probability of 95 %; `growth` per month; `step`: its size, None if a growth is more probable or nothing changed;
-    `onset`: time of the change [days], None if nothing changed; `healthy`: mean before the change, and range of 95 % of
-    the recordings then; `scatter`: standard deviation between recordings; `limit`: mean before the change plus the
-    allowed rise, None if no rise is stated; `reach`: days from the last recording to the limit, infinite if never.
+    Quantities are in the unit of the levels. `total`: present level without the last recording's own scatter; `leak`:
+    its rise since the change; `bound`: 95 % upper bound of that rise; `growth`: rise per month; `step`: size of a step,
+    None if a growth is more probable or nothing changed; `onset`: time of the change [days], None if nothing changed;
+    `healthy`: mean before the change, with the range of 95 % of the recordings then; `scatter`: standard deviation
+    between recordings; `limit`: mean before the change plus the allowed rise, None if no rise is stated; `reach`: days
+    from the last recording to the limit, infinite if never reached.
     """
 
     total: Interval
@@ -356,7 +363,7 @@ class Wear(NamedTuple):
 
 
 def _interval_of_draws(draws: Array) -> Interval:
-    """Compute median and 95 % interval of draws, of which some may be infinite."""
+    """Compute the median and 95 % interval of draws, some of which may be infinite."""
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
     return Interval(float(median), float(low), float(high))
 
@@ -365,9 +372,9 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     """Estimate level, growth and time to the limit after the last recording.
 
     `allowed_rise`: rise of the level above the healthy one at which a repair is due, None if there is no limit;
-    `change_begin`: first recording after the change, as the test dates it. If it is None, an even growth over all
-    recordings is estimated, of either sign and with a wide prior. Recordings that span less than a day have no growth
-    per month.
+    `change_begin`: index of the first recording after the change, found by the test. If it is None, an even growth of
+    either sign over all recordings is estimated, with a wide prior. No growth per month is estimated from recordings
+    that span less than a day.
     """
     is_changed, is_long = change_begin is not None, levels.t[-1] - levels.t[0] >= 1.0
     # without a change the growth may begin with the first recording
@@ -413,7 +420,7 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean of unchanged recordings with the range of 95 % of them, and their standard deviation."""
+    """Estimate the mean of unchanged recordings, the range of 95 % of them, and their standard deviation."""
     draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
     error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(draws.tau.size)
@@ -422,10 +429,11 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 
 
 class Episode(NamedTuple):
-    """Recordings between two repairs: rows `begin` to `end` (exclusive) of the judged ones.
+    """Recordings between two repairs, rows `begin` to `end` (exclusive) of the judged ones.
 
-    `alarm`: the row after which the test alarmed, or None; `log_days`: logarithm of the largest mean time to a false
-    alarm [days] at which it would have alarmed; `wear`: at the end; `fell`: it began with a fall of the level.
+    `alarm`: row at which the test raised an alarm, or None; `log_days`: logarithm of the largest mean time to a false
+    alarm [days] for which the test would still raise one; `wear`: estimate at the last row; `fell`: True if the episode
+    began with a fall of the level.
     """
 
     begin: int
@@ -441,9 +449,9 @@ def find_episodes(
 ) -> list[Episode]:
     """Divide the recordings at repairs, and test and estimate the wear of each part.
 
-    `years`: mean time to a false alarm, at least; `n_healthy`: how many of the first recordings are of a healthy
-    machine; `allowed_rise`: at which a repair is due. A repair is a fall of the level that the same test finds. After
-    it a new level is estimated; the scatter before it becomes the prior.
+    `years`: minimum mean time between false alarms; `n_healthy`: number of first recordings that are known to be
+    healthy; `allowed_rise`: rise of the level at which a repair is due, or None. A repair is a fall of the level
+    detected by the same test. After it the level is estimated anew; the scatter before it becomes the prior.
     """
     days, begin, episodes = years * DAYS_PER_YEAR, 0, list[Episode]()
     while begin < len(levels):

@@ -126,9 +126,10 @@ class Diagnosis(Evidence):
 
     @property
     def repair_lpm(self) -> float | None:
-        """Repair limit for the plot of `course` [L/min]; None if it cannot be stated as a flow.
+        """Repair limit to draw in the plot of `course` [L/min]; None if it cannot be stated as a flow.
 
-        If the course is the total leakage, its median before the onset, without a leak from the start, is added.
+        If the course is the total leakage, the limit is raised by the median of the course before the onset, less any
+        leak that was open from the start.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None or not course.whole:
@@ -171,7 +172,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause named by the verdict, a leak's for `leak`, else another event's; None if it names none."""
+        """Cause that the verdict names, of the leak or of another event; None if it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -198,7 +199,11 @@ class Diagnosis(Evidence):
 
     @property
     def is_baseline(self) -> bool:
-        """True if the recording may serve as a baseline, its total leakage being usual among the healthy recordings."""
+        """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
+
+        Usual means that at least 1 in 20 healthy recordings scores as high. False also if an undetected leak could make
+        up the whole total leakage.
+        """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
             return False
@@ -347,7 +352,7 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(test: Evidence) -> bool:
-    """Test whether 19 of 20 healthy recordings score lower than this test's evidence, or its chance is not stated."""
+    """Test whether at least 1 in 20 healthy recordings scores as high, or the chance is not stated."""
     return test.chance is None or test.chance >= 0.05
 
 

@@ -39,10 +39,11 @@ VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure resp
 
 @dataclass(frozen=True, eq=False)
 class LeakCourse:
-    """Leak over a recording.
+    """Leak flow over the time of a recording.
 
-    Estimates `lpm` (k,) [L/min] at the instants `t` (k,) [s], each with its 95 % interval `low`, `high` (k,). `whole`:
-    True for the total flow past pump and piston, if no leak began; False for its rise since the onset of a leak.
+    Estimates `lpm` (k,) [L/min] at the times `t` (k,) [s], each with its 95 % interval `low`, `high` (k,). `whole`:
+    True for the total flow past pump and piston, stated if no leak began; False for the rise of that flow since the
+    onset of a leak.
     """
 
     t: Array
@@ -54,13 +55,13 @@ class LeakCourse:
 
 @dataclass(frozen=True)
 class TotalLeakage:
-    """Flow past pump and piston together over a whole recording, with any leak from before its start.
+    """Mean flow past pump and piston together in a recording, including any leak from before its start.
 
-    `lpm`: mean flow, and its 95 % interval [L/min], None if the machine's size is not known; `pressure`: mean size of
-    the pressure difference at which it flows [Pa]; `findable_lpm`: smallest step of that flow that would have been
-    found [L/min], None if a step was found; `healthy_lpm`: largest flow of a healthy machine at that pressure [L/min],
-    None if the rig does not state it; `pump_share`, `findable_share`: the flow, and the smallest step, over the pump's
-    mean flow.
+    `lpm`: the flow with its 95 % interval [L/min], None if the machine's size is not known; `pressure`: mean absolute
+    pressure difference that drives it [Pa]; `findable_lpm`: smallest step of the flow that would have been detected
+    [L/min], None if a step was detected; `healthy_lpm`: largest flow of a healthy machine at that pressure [L/min],
+    None if the rig does not state it; `pump_share`, `findable_share`: `lpm` and `findable_lpm` as fractions of the
+    pump's mean flow.
     """
 
     lpm: float | None
@@ -80,11 +81,11 @@ class TotalLeakage:
 
 @dataclass(frozen=True)
 class RelativeLeak:
-    """A leak relative to other measurements of the recording, known without area and displacement.
+    """Leak relative to other measured quantities, available even if area and displacement are unknown.
 
-    `pump_share`: leak over the pump's mean flow, None if the pump's motion is not recorded; `creep`: leak over the
-    piston's area, the speed at which it would creep with its lines shut [m/s], None if the position has no unit; each
-    with its 95 % interval.
+    `pump_share`: leak as a fraction of the pump's mean flow, None if the pump's motion is not recorded; `creep`: leak
+    divided by the piston's area, the speed at which the piston would creep with its lines shut [m/s], None if the
+    position has no unit; each with its 95 % interval.
     """
 
     pump_share: float | None = None
@@ -169,12 +170,12 @@ class Evidence:
 
     @property
     def abstains(self) -> bool:
-        """True if the next detector has to judge: `cannot tell`, and no change was detected."""
+        """True if the verdict is `cannot tell` without a detected change, which leaves it to the next detector."""
         return self.verdict == CANNOT_TELL and self.cause is None and not self.alarmed
 
     @property
     def summary(self) -> str:
-        """The verdict in words, with the cause of a change that is no leak past piston or pump."""
+        """The verdict in words, with its cause if the change is no leak past piston or pump."""
         if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
         if self.verdict == CANNOT_TELL:
@@ -183,7 +184,7 @@ class Evidence:
 
     @property
     def stated_chance(self) -> float | None:
-        """`chance`, at least `RAREST`, as smaller values are not known."""
+        """The `chance` for display, not below `RAREST`, as smaller probabilities cannot be trusted."""
         return None if self.chance is None else max(RAREST, self.chance)
 
     @property

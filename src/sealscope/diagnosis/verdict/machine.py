@@ -23,11 +23,11 @@ _DEFAULT, _REASON = "thesis", "no rig was stated"
 class AssumedMachine:
     """Assumptions of a diagnosis about the machine.
 
-    `rig`: its name; `stated_by` the call (`--rig` or a Rig), the recording's provenance, or nobody;
-    `area` of the piston, the mean of both sides [m^2], and `displacement` of the pump [m^3/rev]; `area_stated`,
-    `displacement_stated`: whether they are stated, by the rig or on their own; `flow_meter`: whether a meter, `q_pump`,
-    measures the flows, which then need neither; `areas` of sides A and B [m^2]; `bypass`: whether a flow meter in a
-    bypass of the cylinder was recorded.
+    `rig`: name of the rig; `stated_by`: source of the rig: "call" (`--rig` or a Rig), "recording" (its provenance) or
+    "nobody"; `area`: mean piston area of both sides [m^2]; `displacement` of the pump [m^3/rev]; `area_stated`,
+    `displacement_stated`: True if known from the rig or stated separately; `flow_meter`: True if a meter, `q_pump`,
+    measures the flow, in which case neither size is needed; `areas`: areas of sides A and B [m^2]; `bypass`: True if a
+    flow meter in a bypass of the cylinder was recorded.
     """
 
     rig: str
@@ -60,10 +60,10 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Return the rig that detectors assume, and what it states of the machine.
+    """Return the rig that detectors assume, with a summary of which of its sizes are stated.
 
-    Without a `rig` it is the thesis's. That is stated if the recording's provenance names a rig of the same areas and
-    displacement, else all its values are assumptions (`Rig.states`).
+    Without `rig` the thesis's rig is used. It counts as stated if the recording's provenance names a rig of the same
+    areas and displacement; otherwise all its values are assumptions (`Rig.states`).
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
@@ -86,21 +86,24 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Test whether a whole rig was stated, as opposed to the default rig with at most areas or displacement stated."""
+    """Test whether a whole rig was stated; False for the default rig, even with stated areas or displacement."""
     # nobody states the mass alone: it is assumed for want of a rig, or it is the rig's
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Test whether the flow to the cylinder is a meter's, in m^3/s, and not computed from the pump's angle or speed."""
+    """Test whether a flow meter in m^3/s measures the pump flow.
+
+    False if the flow is computed from the pump's angle or speed.
+    """
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)]; 0 if stated for another pump.
+    """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)], or 0 if unknown.
 
-    A value that a rig's file assumes for its own pump counts; that of the default rig does not if only the displacement
-    is stated.
+    A value that a rig file assumes for its own pump is used. The value of the default rig is not used for a pump of
+    which only the displacement is stated.
     """
     is_same_place = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_same_place

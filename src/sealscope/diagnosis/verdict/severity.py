@@ -23,10 +23,10 @@ _Figure = tuple[float, float, float] | None
 
 @dataclass(frozen=True)
 class RepairLimit:
-    """Leak from which a machine is to be repaired.
+    """Leak at which a machine must be repaired.
 
-    `value`: flow [m^3/s], or speed at which the piston creeps with its lines shut [m/s], by `kind`; `stated` by the
-    caller, else the creep of `priors.toml`, which applies to a piston of any area.
+    `value`: by `kind` a flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s]; `stated`: True
+    if the caller gave the limit, False for the default creep of `priors.toml`, which applies to any piston area.
     """
 
     value: float
@@ -55,7 +55,7 @@ class RepairLimit:
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def flow_lpm(self, area: float | None) -> float | None:
-        """Convert the limit to L/min; a speed needs the piston's area [m^2], None if that is not stated."""
+        """Convert the limit to L/min; None for a speed limit if the piston's `area` [m^2] is None."""
         if self.kind == "flow":
             return self.value / LITRE_PER_MINUTE
         return None if area is None else self.value * area / LITRE_PER_MINUTE
@@ -85,8 +85,9 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Level by the leak's interval: `repair` if all above the limit, `monitor` if below half of it, else `plan`.
+        """Urgency of the repair, by the 95 % interval of the leak relative to the limit.
 
+        `repair` if the whole interval is above the limit, `monitor` if all of it is below half the limit, else `plan`.
         None if the leak is not known in the limit's unit.
         """
         if self.of_limit is None:

@@ -54,10 +54,10 @@ def _tables() -> Mapping[str, Mapping[str, Any]]:
 def state_of(
     condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
 ) -> MachineState:
-    """Return the state of a machine under a condition of `states.toml`; KeyError for an unknown condition.
+    """Return the machine state for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    `cause` of the change sets the action, and the state unless the machine leaks past piston or pump; `since_s`: begin
-    of the state [s]; `action`: in place of the table's.
+    `cause`: cause of the change; it determines the action, and also the state unless it is a leak past piston or pump.
+    `since_s`: time at which the state began [s]; `action`: replaces the action of the table.
     """
     tables = _tables()
     condition_row, cause_row = tables["conditions"][condition], tables["causes"].get(cause or "", {})
