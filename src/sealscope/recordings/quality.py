@@ -358,6 +358,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     return rails
 
 
+@lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
     """Return the smallest n >= `count` with no prime factor above 5, a length for which an FFT is fast.
 
