@@ -368,6 +368,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     return rails
 
 
+@lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
     """Return the smallest FFT-friendly length n >= `count`, with no prime factor above 5.
 

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 
 from sealscope.diagnosis.inference.observable import Observable
@@ -38,16 +38,16 @@ class Event:
 
     def affects(self, observable: Observable) -> bool:
         """Test whether the event changes an observable."""
-        return _matches(observable, self.affected)
+        return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
         """Test whether the event may change an observable as a side effect."""
-        return _matches(observable, self.disturbed)
+        return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
 
-def _matches(observable: Observable, patterns: Sequence[str]) -> bool:
-    """Test whether the observable's "data: name" matches one of the patterns."""
-    key = f"{observable.data}: {observable.name}"
+@lru_cache(maxsize=4096)
+def _matches(key: str, patterns: tuple[str, ...]) -> bool:
+    """Test whether an observable's "data: name" matches one of the patterns."""
     return any(fnmatchcase(key, pattern) for pattern in patterns)
 
 

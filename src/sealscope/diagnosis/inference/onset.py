@@ -400,11 +400,12 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Whitening of K blocks of a coefficient, for any readings; `transform` to `walk_log_priors` as in `_Whitened`.
+    """Matrices that whiten K blocks of a coefficient; they do not depend on the readings (`whiten`).
 
-    `root` (r,) and `vectors` (K, r): square roots of the eigenvalues of the precision that have information, and their
-    eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 reading for a prior on
-    the slope, else 0; `basis` (n, n): eigenvectors of the walk's covariance.
+    `transform` to `walk_log_priors`: as in `_Whitened`. `root` (r,) and `vectors` (K, r): square roots of the
+    eigenvalues of the precision that have information, and their eigenvectors; `complement` (n, r + s): directions
+    orthogonal to level and slope, with s = 1 reading for a prior on the slope, else 0; `basis` (n, n): eigenvectors of
+    the walk's covariance.
     """
 
     root: Array
