@@ -51,7 +51,11 @@ _MIN_OIL_KELVIN, _MAX_OIL_KELVIN = 173.15, 573.15
 
 
 class AlarmEvent(NamedTuple):
-    """A change of an alarm: the alarm after it, the event that `AlarmJudge.update` returns, and its time [s]."""
+    """A change of an alarm.
+
+    `alarm`: the alarm after the change; `kind`: the event that `AlarmJudge.update` returns; `t`: time of the change
+    [s].
+    """
 
     alarm: Alarm
     kind: str
@@ -84,10 +88,11 @@ class _Actuator:
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[AlarmEvent]]:
-        """Judge new samples; return the estimate of each block of them, and the changes of the alarm.
+        """Judge new samples; return an estimate for each of their blocks, and the changes of the alarm.
 
-        `follows`: False if the samples do not continue those before; `verdict`: on the samples as a whole recording. If
-        it decides, it updates the alarm instead of the blocks. From one state, the same samples give the same result.
+        `follows`: False if the samples do not continue those before; `verdict`: on the samples as a whole recording. A
+        verdict that decides updates the alarm; otherwise the blocks do. The result depends only on the state of the
+        actuator and the samples.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
@@ -129,7 +134,10 @@ class _Actuator:
                 self.oil_celsius = float(kelvin.mean()) - 273.15
 
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
-        """Keep the last `_ALARM_SAMPLES_S` of samples of an open alarm; discard those before a gap or new format."""
+        """Keep the last `_ALARM_SAMPLES_S` seconds of samples while an alarm is open.
+
+        Samples before a gap, or with other channels, units or rate, are discarded.
+        """
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
         if self.judge.alarm is None or not follows or not same_format:
@@ -145,7 +153,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore watch, last estimate, oil temperature and verdict from a checkpoint, but not the judge of alarms."""
+        """Restore watch, last estimate, oil temperature and verdict from a checkpoint, but not the AlarmJudge."""
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -153,7 +161,10 @@ class _Actuator:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
 
     def _machine_state(self) -> MachineState:
-        """Determine the NE 107 state from the active alarm, else the verdict, else the last block and the baseline."""
+        """Determine the NE 107 state of the machine.
+
+        An active alarm decides first, then the verdict on the last recording, then the last block and the baseline.
+        """
         alarm, baseline, ended_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
             return state_of(alarm.condition, alarm.cause, since_s=alarm.onset_s, action=alarm.next_check)
@@ -168,7 +179,7 @@ class _Actuator:
         return state_of("watched", since_s=max(baseline.known_s, ended_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Return the summary for page, metrics and messages as plain values."""
+        """Build the summary for page, metrics and messages from plain values."""
         baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
@@ -204,7 +215,7 @@ def _parse_settings(stored: str) -> WatchSettings | None:
 
 
 def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
-    """Test whether two watches learn with the same settings and rig, except for a remeasured pump displacement."""
+    """Return True if two watches learn with the same settings and rig; the pump's displacement may differ."""
     (rig, *conditions), (stored_rig, *stored_conditions) = fresh.learned_with, stored.learned_with
     return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
 
@@ -246,9 +257,10 @@ class WatchedActuators:
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint and pending samples; return True if a new checkpoint must be saved.
+        """Restore an actuator from its checkpoint; return True if a new checkpoint must be saved.
 
-        Its watch starts anew if the state has another version, or was learned with another rig or learning time.
+        The samples since the checkpoint are judged again. The watch starts anew if the state has another version, or
+        was learned with another rig or learning time.
         """
         settings, fresh, state, name = actuator.settings, actuator.watch, stored.state, actuator.settings.name
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
@@ -279,7 +291,7 @@ class WatchedActuators:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Messages and blocks that were dropped since the start, by reason."""
+        """Numbers of messages and blocks dropped since the start, by reason."""
         with self._counting:
             return dict(self._counters)
 
@@ -296,7 +308,7 @@ class WatchedActuators:
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known_blocks))
 
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge and store those blocks of known actuators that are not stored yet.
+        """Judge the blocks that are not stored yet, and store them.
 
         Repeated blocks are rare: the database is asked for them only after it has refused one.
         """
@@ -363,7 +375,10 @@ class WatchedActuators:
             self._add_summary(actuator, rows)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add an actuator's state to the rows, and the numbers up to which old blocks and estimates are deleted."""
+        """Add an actuator's state to the rows, and limits below which old rows are deleted.
+
+        The limits are running numbers, one of blocks and one of estimates.
+        """
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
         self._add_summary(actuator, rows)
@@ -424,13 +439,13 @@ class WatchedActuators:
 
     @property
     def false_alarms_per_1000_h(self) -> float:
-        """Upper limit of the false alarms of all actuators together, if all are healthy and run [per 1000 h]."""
+        """Upper limit of the false alarms of all actuators together [per 1000 h], if all run and are healthy."""
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the last stored summary of each actuator of the settings.
+        """Return the last stored summary of each actuator in the settings.
 
-        Its state is "no data" if no block has come for `no_data_s` and no leak is announced.
+        The state of the machine is "no data" if no block has come for `no_data_s` and no leak is announced.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

@@ -65,17 +65,17 @@ class Alarm:
 
     @property
     def is_over(self) -> bool:
-        """Test whether the alarm is closed or invalid."""
+        """True if the alarm is closed or invalid."""
         return self.state in ("invalid", "closed")
 
     @property
     def active(self) -> bool:
-        """Test whether the cause of the alarm lasts."""
+        """True if the cause of the alarm has not ended, and the alarm is neither closed nor invalid."""
         return self.returned_s is None and not self.is_over
 
     @property
     def shelved(self) -> bool:
-        """Test whether the alarm was shelved at its last change; a shelved alarm is not announced."""
+        """True if the alarm was shelved at its last change; a shelved alarm is not announced."""
         return self.shelved_until_s > self.updated_s
 
     @property
@@ -85,7 +85,7 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Status bits of the actuator: 1 active warning, 2 active error, 4 new alarm."""
+        """Status bits of the actuator (1 active warning, 2 active error, 4 new alarm)."""
         level = 0 if not self.active else ERROR_BIT if self.level == "error" else WARNING_BIT
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
@@ -116,11 +116,12 @@ class AlarmJudge:
     def update(
         self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with a block; return (alarm, event), None if no alarm is active or the block is not judged.
+        """Update the alarm with a block; return (alarm, event), or None if there is no alarm to update.
 
-        The event is "raised", "error", "warning", "returned" or "". `baseline`: version of the healthy baseline;
-        `leak`: the leak that the watch knows. It is None during an alarm if the detector was restarted; the alarm then
-        stays, for the leak may last. A leak without L/min is a warning. A leak that comes back before anybody has
+        None means that the block is not judged, or that no alarm was active and none is raised. The event is "raised",
+        "error", "warning", "returned" or "". `leak`: the leak that the watch knows, None if there is none; `baseline`:
+        version of the healthy baseline. After a restart of the detector the leak is None during an alarm; the alarm
+        then stays, for the leak may last. A leak without L/min is a warning. A leak that comes back before anybody has
         acknowledged its alarm raises the same alarm again.
         """
         if not estimate.judged:
@@ -173,7 +174,10 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise an alarm with the fields `findings`, or again the open one whose cause had ended; return the alarm."""
+        """Raise an alarm with the fields `findings`, and return it.
+
+        An open alarm whose cause had ended is raised again under its id.
+        """
         self.raised += self.alarm is None
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
         id = f"{self.actuator}-{self.raised}"
@@ -185,8 +189,9 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return (alarm, event) as `update` does.
 
+        `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy baseline.
         A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the recording
-        before, of verdict `earlier`, leaks as well. `no leak`, or a leak below the warning threshold, ends it.
+        before leaks as well. `no leak`, or a leak below the warning threshold, ends the alarm.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -222,7 +227,10 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Store the alarm as the open one, unless it is over, and the time at which its cause ended; return it."""
+        """Store the alarm as the open one unless it is over, and return it.
+
+        If it is not active, its last change is stored as the time at which it ended.
+        """
         if not alarm.active:
             self.over_s = alarm.updated_s
         self.alarm = None if alarm.is_over else alarm
@@ -257,16 +265,16 @@ class AlarmJudge:
         return self._set_alarm(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return the fields as plain values for `restore`."""
+        """Return the attributes as plain values, from which `restore` makes an AlarmJudge."""
         return save_attributes(self, vars(self))
 
 
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sort the actuators, each with its open alarm, by severity of state, then new alarms first, then by evidence.
+    """Sort actuators by severity of their state, then new alarms first, then strongest evidence first.
 
-    Evidence is the rate at which healthy actuators raise such an alarm, lowest first, so that all actuators share one
-    budget of false alarms. Ties go to the larger lower end of the leak's interval, then the larger leak, then the name.
-    `alarms`: the open ones.
+    Each row is a summary with its open alarm. Evidence is the rate at which healthy actuators raise such an alarm,
+    lowest first, so that all actuators share one budget of false alarms. Ties go to the larger lower end of the leak's
+    interval, then the larger leak, then the name. `alarms`: the open ones.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:

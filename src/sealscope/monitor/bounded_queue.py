@@ -10,7 +10,7 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Numbers of blocks and of bytes waiting to be stored, and of times that a source waited for a full queue."""
+    """Number of blocks waiting to be stored, their bytes, and how often a source waited for a full queue."""
 
     n_blocks: int = 0
     n_bytes: int = 0
@@ -18,9 +18,9 @@ class QueueLoad(NamedTuple):
 
 
 class BoundedQueue(Generic[_Item]):
-    """A queue between threads of at most `max_items` items and `max_bytes` bytes, by the sizes that `put` is given.
+    """A queue between threads, limited to `max_items` items and `max_bytes` bytes.
 
-    An empty queue accepts an item of any size.
+    The size of an item is the one stated to `put`. An empty queue accepts an item of any size.
     """
 
     def __init__(self, max_items: int, max_bytes: int) -> None:
@@ -41,7 +41,7 @@ class BoundedQueue(Generic[_Item]):
         """
 
         def has_room() -> bool:
-            """Test whether the item may be appended now."""
+            """Return True if the item may be appended now."""
             fits = len(self._items) < self._max_items and self._bytes + size <= self._max_bytes
             return always or not self._items or fits
 

@@ -27,10 +27,11 @@ def check_mqtt() -> None:
 
 
 class MqttLink:
-    """A connection to a broker by MQTT 5, through paho's `client`; its user must acknowledge the received messages.
+    """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `will`: returns topic and payload of the last will, which the broker publishes when the connection is lost; called
-    before each connection. `close` publishes the same. `retain`: whether the broker retains the will.
+    `client`: the client of paho. `will`: returns topic and payload of the last will, which the broker publishes when
+    the connection is lost; called before each connection. `close` publishes the same. `retain`: True if the broker
+    retains the will.
     """
 
     def __init__(
@@ -77,7 +78,10 @@ class MqttLink:
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message with paho's `options`; return True if it was sent, with `qos` 1 acknowledged, in time."""
+        """Publish a message; return True if it was sent in time.
+
+        `options`: those of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
+        """
         message = self.client.publish(topic, payload, **options)
         try:
             message.wait_for_publish(_PUBLISH_TIMEOUT_S)

@@ -95,7 +95,7 @@ class Service:
             raise
 
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
-        """Queue a block or a refused message for storage, counting the latter; wait while the queue is full."""
+        """Queue a block or a refused message for storage, and count refusals; wait while the queue is full."""
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
             self._refused += 1
@@ -240,5 +240,8 @@ class Service:
 
 
 def _is_logged(number: int) -> bool:
-    """Test whether occurrence `number` of a problem, from 1, is logged: the first ones, then powers of two."""
+    """Return True if a repeated problem is logged: its first occurrences, then powers of two.
+
+    `number`: number of the occurrence, from 1.
+    """
     return number <= _FIRST_LINES or number.bit_count() == 1

@@ -42,8 +42,8 @@ class WatchSettings(_Part):
     """Settings of a watched actuator.
 
     `debounce_blocks`: successive blocks beyond a threshold after which the alarm changes; `return_share`: fraction of a
-    threshold below which the leak counts as ended; `no_data_s`, `not_comparable_s`: time without a block, and without a
-    judged one, after which the state of the actuator says so.
+    threshold below which the leak counts as ended; `no_data_s`: time without a block after which the state of the
+    actuator is "no data" [s]; `not_comparable_s`: time without a judged block after which it is "not comparable" [s].
     """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"

@@ -112,7 +112,10 @@ def payload_class() -> Any:
 
 
 def encode_payload(payload: SparkplugPayload) -> bytes:
-    """Encode a payload; the data type of each metric must be a constant of this module, or an array of doubles (31)."""
+    """Encode a payload as bytes.
+
+    The data type of each metric must be a constant of this module, or 31 for an array of doubles.
+    """
     message = payload_class()(timestamp=payload.timestamp, seq=payload.seq)  # protobuf omits fields that are None
     for metric in payload.metrics:
         fields: dict[str, Any] = {name: getattr(metric, name) for name in ("name", "alias", "timestamp", "datatype")}

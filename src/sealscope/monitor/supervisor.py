@@ -135,12 +135,15 @@ class Supervisor:
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return for each part whether it is reached, its number of outages, and their total length [s]."""
+        """Return (is reached, number of outages, their total length [s]) of each part, by name."""
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
     def start(self, name: str, work: _Work, *, restart: bool = True, on_end: _Work = lambda: None) -> threading.Thread:
-        """Start a thread that runs `work`, with `restart` again after each error, and finally calls `on_end`."""
+        """Start a thread that runs `work`, and calls `on_end` at its end.
+
+        `restart`: run `work` again after each error, until `stopping` is set.
+        """
         part = self.part(name)
 
         def work_with_timer() -> None:
@@ -161,7 +164,7 @@ class Supervisor:
         return _start_thread(attempts, name)
 
     def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
-        """Start a thread that runs `step` every `every_s` [s], and `last` once `stopping` is set."""
+        """Start a thread that runs `step` at intervals of `every_s` seconds, and `last` once `stopping` is set."""
         part = self.part(name)
 
         def attempts() -> None:
@@ -174,9 +177,10 @@ class Supervisor:
 
 
 class LimitedLines(logging.Filter):
-    """Limit the log lines per minute from one place in the code, and state how many were left out.
+    """A log filter that limits the lines per minute from one place in the code.
 
-    Each message becomes one printable line, as the names in it come from outside.
+    The number of lines left out is logged later. Each message becomes one printable line, as the names in it come from
+    outside.
     """
 
     def __init__(self) -> None:
@@ -184,7 +188,7 @@ class LimitedLines(logging.Filter):
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Test whether a record is within the limit of its place in the code, and make it one printable line."""
+        """Return True if a record is within the limit of its place in the code; make it one printable line."""
         place = (record.name, record.pathname, record.lineno)
         now, max_lines = time.monotonic(), _PACKAGE_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
         minute_start, n_records = self._places.get(place, (now, 0))

@@ -89,43 +89,47 @@ class RecordingVerdict:
 
     @property
     def leaks(self) -> bool:
-        """Test whether the verdict is a leak."""
+        """True if the verdict is a leak."""
         return bool(self.verdict == LEAK)
 
     @property
     def clears(self) -> bool:
-        """Test whether the verdict is "no leak"."""
+        """True if the verdict is "no leak"."""
         return bool(self.verdict == NO_LEAK)
 
     @property
     def decides(self) -> bool:
-        """Test whether the verdict or a person's mark states the condition of the machine; else its blocks do."""
+        """True if the verdict or a person's mark states the condition of the machine, False if its blocks do."""
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Test whether a leak-free recording scores as high no more often than the allowed rate of false alarms.
+        """Return True if the verdict is within the allowed rate of false alarms.
 
-        The limit of `chance` is the rate times the length of the recording, but at least `rarest` of `priors.toml`, the
-        smallest chance that can be known. True if `chance` is None.
+        `chance`, the probability that a leak-free recording reaches this score, must not exceed a limit. The limit of
+        `chance` is the rate times the length of the recording, but at least `rarest` of `priors.toml`, the smallest
+        chance that can be known. True if `chance` is None.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """The number of healthy recordings in 1000 h that score as high by chance, None if the chance is not known."""
+        """Expected number of equally high scores in 1000 h of healthy recordings, None if not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
-        """Return the neutral verdict that replaces this one after a person's mark, until the next recording."""
+        """Make the neutral verdict that replaces this one from a person's mark until the next recording."""
         state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
         texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
         texts |= {"size": "", "cause": "", "mark": mark}
         return RecordingVerdict(self.file, CANNOT_TELL, state=state, start_s=start_s, end_s=end_s, **texts)
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Replace the leak of a block by the recording's; before its onset, or without a leak, by the bound alone."""
+        """Replace the leak of a block by that of the recording.
+
+        Before the onset, and without a leak, the block gets no leak, and as interval 0 to the recording's bound.
+        """
         lpm, interval = self.leak_lpm, self.leak_interval_lpm
         if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):
             lpm, interval = None, None if self.bound_lpm is None else (0.0, self.bound_lpm)
@@ -140,7 +144,7 @@ def _parse_interval(ends: Any) -> Interval | None:
 def judge_recording(
     machine: CommissionedMachine, recording: Recording, file: str, shift: float, *, limit_lpm: float | None = None
 ) -> RecordingVerdict:
-    """Judge a recording as `sealscope diagnose --machine` does.
+    """Judge a recording by the healthy ones of its machine, like `sealscope diagnose --machine`.
 
     `shift`: added to the recording's times to give the monitor's clock [s]; `limit_lpm`: leak that calls for a repair
     [L/min], None for the limit in the machine's file.

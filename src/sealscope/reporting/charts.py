@@ -62,7 +62,7 @@ class Chart(NamedTuple):
     """One chart.
 
     `base`: time axis of its lines (all samples, centres of the RMS windows, or times of the leak over the recording);
-    `band`: whether the second and third line are the interval of the first; `limits`: ends of the axis, None to show
+    `band`: True if the second and third line are the interval of the first; `limits`: ends of the axis, None to show
     all values; `level`: repair limit, None if there is none.
     """
 
@@ -120,7 +120,10 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Return the display unit of a detail and the scale by which to divide its values; both are squared for d3d4."""
+    """Return the display unit of a detail, and the scale by which to divide its values.
+
+    Both are squared for d3d4. `unit`: unit of the channel.
+    """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
@@ -182,7 +185,10 @@ _MAX_LIMIT_RATIO = 4.0
 
 
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
-    """Build the chart of the leak over the recording, with its interval and the repair limit; [] if it is not known."""
+    """Build the chart of the leak over the recording, with its interval and the repair limit.
+
+    The list is empty if the course of the leak is not known. `height`: height of the chart.
+    """
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
         return []
@@ -309,7 +315,7 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset and its interval [s], with the interval clipped to the recording; None if not known."""
+    """Return the onset [s], and its interval [s] clipped to `span`; None for each that is not known."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None
@@ -322,7 +328,10 @@ def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float 
 def render_still(
     chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
 ) -> Picture:
-    """Draw the still picture of a chart, 860 wide and `chart.height` high, from values of its `lines` at times `t`."""
+    """Draw the still picture of a chart, 860 wide and `chart.height` high.
+
+    `t`: times [s] of the values of its `lines`; `span`: ends of the time axis [s]; `moments`: marked moments.
+    """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)
     finite = all_values[np.isfinite(all_values)]

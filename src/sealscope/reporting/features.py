@@ -50,9 +50,10 @@ class DetailChange(NamedTuple):
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """Compute the details of one chamber over its usable parts; return them with a note on samples that are left out.
+    """Compute the wavelet details of one chamber; return them with a note on omitted samples.
 
-    If the data cannot be transformed, the details are None and the note is the reason.
+    Only the usable parts of the recording are transformed. If the data cannot be transformed, the details are None and
+    the note is the reason.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
@@ -96,7 +97,10 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
 
 class Parts(NamedTuple):
-    """Two parts of a recording to compare, t < `end` and t >= `start` [s], their `heads`, and the reason (`text`)."""
+    """Two parts of a recording to compare.
+
+    The first part is t < `end` [s], the second t >= `start` [s]; `heads`: their headings; `text`: reason of the choice.
+    """
 
     end: float
     start: float

@@ -72,7 +72,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the cause of the change; None if there is none, or if it is a leak that the verdict does not state."""
+    """Return the cause of the change, None without one; a leak is a cause only if the verdict is "leak"."""
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
@@ -102,7 +102,10 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Format the leak flow [L/min] or why it is not stated; without a leak its upper bound, None if not known."""
+    """Format the leak flow [L/min], or the reason why none is stated.
+
+    For other verdicts than "leak" the text is the upper bound of a leak, None if it is not known.
+    """
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
         if diagnosis.bound_lpm is not None:
@@ -160,7 +163,7 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the leak relative to the repair limit, or else to the pump's flow; None if neither is known."""
+    """Format the leak as a fraction of the repair limit, or else of the pump's flow; None if neither is known."""
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
         return None
@@ -180,7 +183,10 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, relative to the pump's flow, and as a speed of creep; None if none is known."""
+    """Format the leak in mL/min, as a fraction of the pump's flow and as a speed of creep, if known.
+
+    None if none of the three is known.
+    """
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -194,9 +200,9 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, and the smallest detectable step; None if it is not known.
+    """Format the total leakage past pump and piston, and the smallest detectable step; None if not known.
 
-    `basis`: whether to add the machine data on which L/min are based.
+    `basis`: True to add the machine data on which L/min are based.
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -216,7 +222,10 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage that is not known in L/min: as a fraction of the pump's flow, with the smallest step."""
+    """Format a total leakage as a fraction of the pump's flow, with the smallest detectable step.
+
+    `pressure`: text of the pressure at which the leakage is stated.
+    """
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -228,7 +237,10 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
 
 
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
-    """Format the usual leakage past pump and piston in a few words; None if unknown, or if the verdict is "leak"."""
+    """Format the total leakage past pump and piston in a few words.
+
+    None if it is not known, or if the verdict is "leak".
+    """
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
         return None
@@ -251,7 +263,7 @@ def _format_percent(fraction: float | None) -> str:
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the odds that a healthy recording looks like this one, the score and its threshold, and false alarms."""
+    """Format the evidence: odds of a healthy recording like this one, score, threshold, false alarms."""
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, found_cause = _odds(diagnosis), cause(diagnosis)
@@ -268,12 +280,15 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 
 def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the odds that a healthy recording looks like this one, or the false-alarm probability without them."""
+    """Format the odds of a healthy recording like this one; if unknown, the false-alarm probability."""
     return _odds(diagnosis) or false_alarms(diagnosis)
 
 
 def _odds(diagnosis: Diagnosis) -> str | None:
-    """Format the odds that a healthy recording looks like this one, or after `no leak`, shows as much change."""
+    """Format the odds that a healthy recording looks like this one; None if they are not known.
+
+    After `no leak` without an alarm the odds are those of an equally large change.
+    """
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
         return odds
@@ -334,7 +349,7 @@ def raw_counts(diagnosis: Diagnosis) -> str | None:
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on recorded columns that look usable but have no channel, with --map options; None if none."""
+    """Format a note on unused columns that could be channels, with --map options; None if there are none."""
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -417,7 +432,7 @@ _FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as a line of a table: file, date, verdict and L/min; a second line states what to do.
+    """Format a diagnosis as a line of a table: file, date, verdict and L/min; a second line states the next step.
 
     `start_s`: start of the recording [s since 1970].
     """

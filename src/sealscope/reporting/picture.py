@@ -58,7 +58,7 @@ class Picture:
 
     @property
     def view_box(self) -> str:
-        """The SVG viewBox: frame and margins."""
+        """The SVG viewBox, which includes frame and margins."""
         left, top, right, bottom = self.margins
         return f"{-left:g} {-top:g} {left + self.width + right:g} {top + self.height + bottom:g}"
 

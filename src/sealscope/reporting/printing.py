@@ -68,9 +68,10 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 
 
 def _inline_styles(page: str) -> str:
-    """Prepare a page for WeasyPrint, which neither applies the style sheet to drawings nor supports variables in them.
+    """Prepare a page for WeasyPrint by copying the style sheet into each drawing.
 
-    Variables are replaced by their values for print, and the sheet is copied into each drawing.
+    WeasyPrint neither applies the sheet to drawings nor supports variables in them. Variables are replaced by their
+    values for print.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -105,7 +106,7 @@ def _write_by_browser(
 ) -> None:
     """Run a browser that writes the page to `target`; raise InputError unless the file is complete.
 
-    `kind`: what the file is, for the message.
+    `kind`: name of the file's kind, for the message.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"

@@ -31,8 +31,8 @@ class Circuit(NamedTuple):
     """The drawn parts of a machine.
 
     `cylinder`: name of its kind; `rods`: sides with a rod, "A", "B" or "AB"; `rod`: height of the rod in the drawing,
-    for a single rod sqrt(1 - A_small / A_large) of the bore; `throttles`, `make_up`, `bypass`: whether the lines have
-    them; `valve`: whether a servo valve drives the cylinder; `values`: label -> value with unit, "" if not known.
+    for a single rod sqrt(1 - A_small / A_large) of the bore; `throttles`, `make_up`, `bypass`: True if the lines have
+    them; `valve`: True if a servo valve drives the cylinder; `values`: label -> value with unit, "" if not known.
     """
 
     cylinder: str
@@ -71,7 +71,10 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 
 
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
-    """Return (kind, sides with a rod, height of the rod in the drawing) of a cylinder with the areas of A and B."""
+    """Return (kind, sides with a rod, height of the drawn rod) of a cylinder.
+
+    `areas`: piston areas of the sides A and B, in any common unit.
+    """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:
         return "double-rod cylinder", "AB", _ROD
@@ -80,7 +83,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format an SI value with four digits in a `unit` that is `scale` SI units."""
+    """Format an SI value in `unit` with four digits; `scale`: size of the unit in SI."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 

@@ -21,8 +21,8 @@ class DrawnTimes:
 
     `t`: (m,) [s], never decreasing; `starts`, `stops`: (k,) first and last (exclusive) sample of each bucket; `width`:
     samples in a full bucket, 1 if all samples are drawn; `fine`: samples that are all drawn at any `width`; `breaks`:
-    points at which the line is broken by a gap in time; `by_sample`: whether the time stamps are out of order, so that
-    `t` is the number of the sample over the rate.
+    points at which the line is broken by a gap in time; `by_sample`: True if the time stamps are out of order; `t` is
+    then the number of the sample over the rate.
     """
 
     t: Array
@@ -54,7 +54,10 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Return (time stamps [s], False), or if these do not increase, (sample numbers over the rate [s], True)."""
+    """Return an increasing time axis [s], and True if it replaces time stamps that do not increase.
+
+    The replacement is the number of the sample over the rate.
+    """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
 
@@ -62,11 +65,12 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
 def choose_drawn_times(
     t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0
 ) -> DrawnTimes:
-    """Choose which of n samples a chart draws: two per bucket, about `points` in all, and each sample near `near` [s].
+    """Choose the samples that a chart draws: two per bucket, about `points` in all.
 
-    `t`: time stamps (n,) [s]; `rate`: nominal rate [Hz]; `near_samples`: number of samples that are all drawn. Buckets
-    have equal numbers of samples, so that a drawn peak is at most one bucket away from its true time. A gap in time
-    starts a new bucket, and an additional point there interrupts the line; only the longest gaps if there are many.
+    All samples near `near` [s] are drawn in addition, none if that is None. `t`: time stamps (n,) [s]; `rate`: nominal
+    rate [Hz]; `near_samples`: number of samples that are all drawn. Buckets have equal numbers of samples, so that a
+    drawn peak is at most one bucket away from its true time. A gap in time starts a new bucket, and an additional point
+    there interrupts the line; only the longest gaps if there are many.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -89,9 +93,10 @@ def choose_drawn_times(
 
 
 def encode_values(values: Array) -> dict[str, Any]:
-    """Encode values as base64 of 16-bit integers, on a grid of 65 534 steps from minimum to maximum; NaN is -32768.
+    """Encode values as base64 of 16-bit integers; NaN is -32768.
 
-    They are decoded as `low + (q + 32767) * step`; minimum and maximum are exact to rounding.
+    The integers q are a grid of 65 534 steps from minimum to maximum, decoded as `low + (q + 32767) * step`; minimum
+    and maximum are exact to rounding.
     """
     is_finite = np.isfinite(values)
     low, high = (float(values[is_finite].min()), float(values[is_finite].max())) if is_finite.any() else (0.0, 0.0)

@@ -44,11 +44,12 @@ def noise_free_mean_squares(
     x_0: float = 0.0,
     values: Mapping[str, float | str] | None = None,
 ) -> Array:
-    """Simulate a condition and compute the noise-free mean squares of d1..d4 [psi^2] and d3d4 [psi^4], (chambers, 5).
+    """Simulate a condition and compute the mean squares of its wavelet details, without noise.
 
-    The pressures are sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`.
-    `leak`: leak as text, sized on the rig; `values`: parameters that override those of the condition; `x_0` [m]: start
-    of the piston. Raises the errors of the simulation.
+    Returns those of d1..d4 [psi^2] and d3d4 [psi^4] as (chambers, 5). The pressures are sampled at the rig's rate
+    behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as text, sized on the rig;
+    `values`: parameters that override those of the condition; `x_0` [m]: start of the piston. Raises the errors of the
+    simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -181,7 +182,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well each hypothesis predicts the sheet: leak-free RMS, mean change with the leak, and its sign.
+    """Compare each hypothesis with the sheet: leak-free RMS, mean change with the leak, and its sign.
 
     A sign is right if the change with the leak has the sign of the sheet's change in the same test.
     """

@@ -66,11 +66,18 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add the samples and verdict of block `number` since the checkpoint, which a restart judges again."""
+        """Add the samples and verdict of a block, which a restart judges again.
+
+        `number`: number of the block since the checkpoint, from 1; `follows`: False if the samples do not continue
+        those before.
+        """
         self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state, and unless `kind` is empty an event at `t` [s] with a person's comment."""
+        """Add an alarm in its present state, and an event of `kind` at `t` [s]; no event if `kind` is empty.
+
+        `by_whom`, `text`: the person who caused the event and their comment, "" if there is none.
+        """
         actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
         if kind:
@@ -92,7 +99,7 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """Samples of a block, whether they continue those before, and the verdict, None if they are not a recording."""
+    """Samples of a block; `follows`: True if they continue those before; `verdict`: None if they are no recording."""
 
     samples: Recording
     follows: bool
@@ -108,7 +115,10 @@ class StoredCheckpoint(NamedTuple):
 
 
 class MonitorStore:
-    """The database of a monitor, `database` a file of SQLite or a URL; raises InputError where it cannot be opened."""
+    """The database of a monitor.
+
+    `database`: a file of SQLite, or a URL. Raises InputError if it cannot be opened.
+    """
 
     def __init__(self, database: str) -> None:
         self.tables = tables
@@ -152,7 +162,7 @@ class MonitorStore:
 
     @contextmanager
     def _begin_relaxed_transaction(self) -> Iterator[sa.Connection]:
-        """Open a transaction that survives the end of this process, but perhaps not a loss of power: it is faster."""
+        """Open a faster transaction, which survives the end of this process but perhaps not a loss of power."""
         is_file = self.engine.dialect.name == "sqlite"
         with self._writing_lock, self.engine.connect() as connection:
             if is_file:
@@ -192,7 +202,7 @@ class MonitorStore:
             }
 
     def is_known(self, actuator: str, identity: str) -> bool:
-        """Test whether a block is stored."""
+        """Return True if a block is stored."""
         return bool(self.select_stored([(actuator, identity)]))
 
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
@@ -257,7 +267,7 @@ class MonitorStore:
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Note the start of decoding a message; return the number of earlier starts without an end.
+        """Note that a reader starts to decode a message; return the number of earlier starts without an end.
 
         A message whose decoding ends the process can thus be refused after a restart.
         """
@@ -321,7 +331,7 @@ class MonitorStore:
         return [_event_from_row(row) for row in self._rows(query)]
 
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
-        """Return the estimates of an actuator, averaged over successive ones to at most about `max_rows` rows.
+        """Average successive estimates of an actuator, to return at most about `max_rows` rows in order of time.
 
         `seconds`: length of the history before the newest estimate [s], None for all of it.
         """
@@ -343,7 +353,7 @@ class MonitorStore:
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Return the number of the last event that the output `name` has delivered."""
+        """Return the number of the last event that the output `name` has delivered, 0 if there is none."""
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:

@@ -22,7 +22,7 @@ _DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
 
 def _is_announced(event: dict[str, Any]) -> bool:
-    """Test whether an event is announced; for a shelved alarm only the marks of persons are."""
+    """Return True if an event is announced; of a shelved alarm only the marks of persons are announced."""
     return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
@@ -41,7 +41,10 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an announced event as a line, unbuffered: a buffer would keep the lines that a full disk refuses."""
+        """Write an event as a line, if it is announced.
+
+        The line is not buffered, as a buffer would keep the lines that a full disk refuses.
+        """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:

@@ -53,7 +53,7 @@ def format_metrics(
     families: dict[str, Any] = {}
 
     def add(name: str, text: str, value: float | None, **labels: str) -> None:
-        """Add a value with its labels to the metric `name` of help `text`, unless it is None."""
+        """Add a value with its labels to the metric `name`; skip None. `text`: help text of the metric."""
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))

@@ -101,7 +101,10 @@ class SparkplugNode:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
-        """Return topic and payload of the next connection's last will; its bdSeq follows that of the last birth."""
+        """Return topic and payload of the last will for the next connection.
+
+        Its bdSeq follows that of the last birth.
+        """
         self._birth_number = (self._last_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
@@ -128,7 +131,7 @@ class SparkplugNode:
             self._birth_due.set()
 
     def _send_event(self, event: dict[str, Any]) -> bool:
-        """Send an event and its alarm as data of the actuator's device; return whether they were sent."""
+        """Send an event and its alarm as data of the actuator's device; return True if they were sent."""
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
         if alarm["actuator"] not in self._sent_values:  # the actuator is no longer in the settings
             return True
@@ -157,7 +160,7 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message with the next sequence number; return whether it was sent."""
+        """Send a message with the next sequence number; return True if it was sent."""
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_level(actuator))
         payload = spb.SparkplugPayload(_milliseconds(None), tuple(metrics), self._seq)
@@ -173,12 +176,15 @@ def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _milliseconds(t: float | None) -> int:
-    """Convert a time of samples [s] to [ms since 1970]; return the present if it is None or counts from elsewhere."""
+    """Convert a time of samples [s] to [ms since 1970].
+
+    The present time replaces None, and a time that is not counted from 1970.
+    """
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 
 def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Look up the values of a table's metrics in nested `values`, None for missing ones."""
+    """Look up each metric of a table in the nested `values`, None if it is missing."""
     result: dict[str, Any] = {}
     for name, row in _load_table(table).items():
         value: Any = values

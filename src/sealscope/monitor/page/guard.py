@@ -24,10 +24,12 @@ BACKLOG = 64
 
 
 class Admission:
-    """The token of a page, and the failed attempts by address; `now` returns a monotonic clock [s].
+    """The access check of a page, which delays an address after wrong tokens.
 
-    After five wrong tokens the next one of an address, right or wrong, is checked only after a pause: 1 s, doubled by
-    each further wrong one, up to a minute. An IPv6 network (/64) counts as one address.
+    `token`: the valid token; `now`: returns the time of a monotonic clock [s].
+
+    After five wrong tokens the next one of an address, right or wrong, is checked only after a pause of 1 s. Each
+    further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
@@ -38,7 +40,7 @@ class Admission:
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Return the time until the next token of an address is checked [s]."""
+        """Compute the time until the next token of an address is checked [s], 0 if there is no pause."""
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
             return 0.0
@@ -46,7 +48,10 @@ class Admission:
         return max(0.0, last + min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S) - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Test a token, or with `session` a browser's cookie, and count a wrong one against its address."""
+        """Return True if a token is right, else count the failure against its address.
+
+        `session`: True if `token` is a browser's cookie instead.
+        """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
             self._failures.pop(network, None)
@@ -80,10 +85,10 @@ def connection_limit() -> int:
 
 
 def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asyncio.Protocol]:
-    """Derive from uvicorn's HTTP protocol a class that limits the connections, and their silence to `silent_s` [s].
+    """Build a subclass of uvicorn's HTTP protocol that limits number and silence of the connections.
 
-    Above the limit the connection that has been silent for longest is closed, or the new one if all others are being
-    answered.
+    A connection is closed after `silent_s` seconds without activity. Above the limit the connection that has been
+    silent for longest is closed, or the new one if all others are being answered.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
@@ -104,7 +109,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
             self.loop.call_later(_CHECK_INTERVAL_S, self.check_silence)
 
         def is_sending_answer(self) -> bool:
-            """Test whether the answer to a request is still being sent."""
+            """Return True if the answer to a request is still being sent."""
             return self.cycle is not None and not self.cycle.response_complete
 
         def check_silence(self) -> None:

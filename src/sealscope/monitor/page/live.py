@@ -46,7 +46,7 @@ class _Window:
     version: int = 0
 
     def add(self, samples: Recording) -> None:
-        """Append samples; after a gap, at another rate or with other channels the window starts anew."""
+        """Append samples; start the window anew after a gap, or at another rate or with other channels."""
         max_samples = min(MAX_SAMPLES, max(MIN_SAMPLES, round(SPAN_S * samples.rate)))
         t = samples.t[-max_samples:]
         names = [name for name in CHANNELS if name in samples]
@@ -80,7 +80,7 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of an actuator while the context lasts; yield False if too many others are viewed."""
+        """Keep the samples of an actuator while the context lasts; yield False if too many are viewed already."""
         with self._lock:
             is_first = name not in self._windows
             is_admitted = not is_first or len(self._windows) < MAX_ACTUATORS
@@ -120,16 +120,16 @@ class LiveSamples:
         return frozenset(self._windows)
 
     def version(self, name: str) -> int:
-        """Return a number that changes with the samples of a viewed actuator, 0 if there are none."""
+        """Return a number that increases whenever a viewed actuator gets new samples, 0 if there are none."""
         window = self._windows.get(name)
         return 0 if window is None else window.version
 
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
-        """Compute the curves of a viewed actuator as plain values, None for a missing one; times end at 0 [s].
+        """Compute the curves of a viewed actuator as plain values, None for a missing value.
 
-        `pressures` [bar]; `details`: wavelet details d1 to d4 of one `pressure` [kPa], by `detail_form` as their RMS in
-        windows of `WINDOW_SIZE` samples ("rms") or as samples ("details"); `motion`: position [mm], pressures [bar],
-        speeds of piston [mm/s] and pump [rpm].
+        Times count back from the last sample, which is at 0 s. `pressures` [bar]; `details`: wavelet details d1 to d4
+        of one `pressure` [kPa], by `detail_form` as their RMS in windows of `WINDOW_SIZE` samples ("rms") or as samples
+        ("details"); `motion`: position [mm], pressures [bar], speeds of piston [mm/s] and pump [rpm].
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -157,7 +157,10 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce series over `t` to minimum and maximum of about `_BINS` bins, in order of time, if they are longer."""
+    """Reduce long series over `t` to minimum and maximum in each of about `_BINS` bins, in order of time.
+
+    Series of at most two samples per bin are returned as they are, by name, with the times as `t`.
+    """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
         return {"t": _round_to_json(t, 4), **{name: _round_to_json(values) for name, values in series.items()}}
@@ -173,7 +176,11 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 
 
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
-    """Compute the wavelet details of a pressure, or their RMS, from the samples after the last missing one."""
+    """Compute the wavelet details of a pressure [Pa], or their RMS, in [kPa], for `LiveSamples.curves`.
+
+    Only the samples after the last missing one are used; there are no curves if these are too few. `signal`: None if
+    the pressure is not recorded; `pressure`: its name.
+    """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
     samples = samples[missing_indices[-1] + 1 if missing_indices.size else 0 :]
@@ -222,10 +229,10 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 
 @cache
 def describe_rig(rig: str) -> dict[str, Any]:
-    """Describe the parts of a rig that the page draws as plain values.
+    """Describe in plain values the parts of a rig that the page draws.
 
     `rods`: the sides that the rod leaves; `stroke` [mm]; `area` [L/min per mm/s] and `displacement` [L/rev] give flows;
-    `valve`: whether a servo valve drives the cylinder.
+    `valve`: True if a servo valve drives the cylinder.
     """
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit

@@ -131,7 +131,7 @@ class _Connection:
         self._arrived.put((self._connection, None), 0, always=True)
 
     def _offline_message(self) -> tuple[str, str]:
-        """Return the last will of a Sparkplug primary host, with the time of the connection about to be made."""
+        """Build the last will of a Sparkplug primary host, dated at the start of the coming connection."""
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
 
@@ -173,7 +173,8 @@ class _Connection:
     def _submit_arrived(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        Once the queue is empty, a connection whose messages were refused is closed, so that they are sent again.
+        A connection whose messages found a full queue is closed once the queue is empty; the broker then sends them
+        again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._arrived.pop(1, 0.5)
@@ -209,16 +210,19 @@ class _Connection:
             acknowledge() if block is None else self._service.submit(replace(block, done=acknowledge))
 
     def _decode(self, topic: str, payload: bytes) -> SourceBlock | None:
-        """Decode a message to its block, None for a Sparkplug message without samples; refuse an invalid one."""
+        """Decode a message to its block; return None for a Sparkplug message without samples.
+
+        Raises RefusedMessage if the message is invalid.
+        """
         if self._host is not None and topic.startswith(f"{NAMESPACE}/"):
             return self._host.receive(topic, payload)
         return decode_message(payload, self._names.get(topic), self._units_of)
 
     @contextmanager
     def _note_decoding(self, message: Any) -> Iterator[None]:
-        """Note in the database that the decoding of a large or repeated message is under way, until it ends.
+        """Note in the database that a large or repeated message is being decoded, until the context ends.
 
-        Raises RefusedMessage if it has begun twice without an end, as the process died both times.
+        Raises RefusedMessage if the decoding has begun twice without an end, as the process died both times.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
@@ -253,6 +257,6 @@ class _Connection:
                     self._published_states[name] = state
 
     def _publish(self, actuator: str, kind: str, message: str) -> bool:
-        """Publish a retained message of an actuator, an "alarm" or "state"; return whether it was acknowledged."""
+        """Publish a retained message of an actuator, an "alarm" or "state"; return True if acknowledged."""
         topic = f"{self._settings.alarms_topic}/{topic_level(actuator)}/{kind}"
         return self._link.publish(topic, message, qos=1, retain=True)

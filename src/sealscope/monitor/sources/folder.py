@@ -51,7 +51,7 @@ _GAP_S = 1.0
 
 
 class _FoundFile(NamedTuple):
-    """A file of a folder: modification time [s since 1970], path, and an identity that changes with its contents."""
+    """A file of a folder: time of its last change [s since 1970], path, and identity of its contents."""
 
     modified_s: float
     path: Path
@@ -120,11 +120,14 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Return the time since the last change of a file [s], or since it was first seen if that is longer."""
+        """Compute the time since a file changed or was first seen [s], whichever is longer."""
         return max(time.time() - file.modified_s, time.monotonic() - self._first_seen[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Test whether a file has settled, is not stored yet, and may be tried now; mark a stored one as submitted."""
+        """Return True if a file has settled, is not stored, and may be tried now.
+
+        A file that is stored already is marked as submitted.
+        """
         if file.identity in self._unreadable and self._may_be_incomplete(file):
             return False
         if self._unchanged_s(file) < self.settle_s:
@@ -135,7 +138,7 @@ class WatchedFolder:
         return True
 
     def _may_be_incomplete(self, file: _FoundFile) -> bool:
-        """Test whether an unreadable file has changed so recently that it may still be written."""
+        """Return True if an unreadable file changed recently and may still be written."""
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
     def _start_time(self, file: _FoundFile) -> float:
@@ -161,7 +164,7 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Return the reason to refuse a recording, "" if none: it must not be older than those watched before."""
+        """Return the reason to refuse a recording that is older than those watched before, "" for no refusal."""
         if samples is None:
             return ""
         path, now = file.path, time.time()
@@ -199,7 +202,10 @@ class WatchedFolder:
     def _judge(
         self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
     ) -> RecordingVerdict | None:
-        """Judge a whole recording; log an error and return None, so that only its blocks are watched."""
+        """Judge a whole recording; after an error log it and return None, and only the blocks are watched.
+
+        `shift`: added to the recording's times to give the monitor's clock [s].
+        """
         try:
             return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
         except Exception as error:
@@ -208,7 +214,7 @@ class WatchedFolder:
             return None
 
     def _read_machine(self) -> CommissionedMachine | None:
-        """Read the machine's file again, as marks and engineers change it; None if `rig` is not such a file."""
+        """Read the machine's file again, as it may have changed; return None if `rig` is not such a file."""
         try:
             return load_watched(self._rig).machine
         except (SealscopeError, OSError) as error:
@@ -276,5 +282,8 @@ def _printable(name: str) -> str:
 
 
 def _is_date_of(start: float, newest: float) -> bool:
-    """Test whether `start` is 0:00 of the day that contains `newest` [s since 1970], as of a date without a time."""
+    """Return True if `start` is midnight of the day that contains `newest`, both in [s since 1970].
+
+    A recording that is dated without a time of day starts at midnight.
+    """
     return start % DAY == 0.0 and start <= newest < start + DAY

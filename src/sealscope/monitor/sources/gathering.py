@@ -36,11 +36,14 @@ class _Channel:
     newest: int | None = None
 
     def last_value(self) -> float | None:
-        """Return the newest value, None if there is none."""
+        """Return the value of the latest index, None if there is none."""
         return self.values[max(self.values)] if self.values else self.previous
 
     def pop_values(self, first: int, stop: int) -> Array:
-        """Remove and return the samples from index `first` up to `stop`; a missing one repeats the value before it."""
+        """Remove and return the samples from index `first` up to `stop` (exclusive), (stop - first,).
+
+        A missing sample repeats the value before it.
+        """
         known_indices = sorted(k for k in self.values if k < stop)
         n_known_before = np.searchsorted(known_indices, np.arange(first, stop), side="right")  # up to each sample
         previous = math.nan if self.previous is None else self.previous
@@ -50,7 +53,7 @@ class _Channel:
 
 
 class ValueGatherer:
-    """The values of one actuator at a rate [Hz], gathered into blocks of `block_s` [s].
+    """The values of one actuator, gathered from single channels into blocks of `block_s` seconds at `rate` [Hz].
 
     `count`: called with the reason for each dropped value; `now`: returns a monotonic clock [s].
     """
@@ -91,7 +94,7 @@ class ValueGatherer:
         return self._pop_blocks()
 
     def _continue_after_pause(self) -> None:
-        """Restart the time axis after a pause, with the last value of each channel as its `previous` one."""
+        """Restart the time axis after a pause; the last value of each channel is kept as its `previous` one."""
         old_channels = self._channels
         self.discard_values()
         for name, old_channel in old_channels.items():

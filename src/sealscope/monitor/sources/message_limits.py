@@ -60,7 +60,7 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check the limits of a JSON message; return its number of colons, in texts and outside.
+    """Check the limits of a JSON message; return the number of its colons, including those within texts.
 
     Raises MessageLimit if it has too many quotation marks or brackets.
     """
@@ -73,9 +73,10 @@ def check_json(payload: bytes) -> int:
 
 
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
-    """Check that no mapping of a JSON message, decoded to `values`, repeats a key; raise MessageLimit otherwise.
+    """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    Each pair has a colon outside texts; a repeated key leaves fewer pairs in `values` than colons in the `payload`.
+    `values`: the decoded message; `n_colons`: number of colons that `check_json` counted. Each pair has a colon outside
+    texts; a repeated key leaves fewer pairs in `values` than colons in the `payload`.
     """
     if _count_shallow_pairs(values) != n_colons:  # quick test: unequal also if a text contains a colon
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -83,20 +84,23 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that all `n_pairs` of a message were decoded; fewer mean a repeated key, which raises MessageLimit."""
+    """Check that no key of a message is repeated; raise MessageLimit otherwise.
+
+    `values`: the decoded message; `n_pairs`: pairs before decoding, of which a repeated key loses some.
+    """
     if _count_shallow_pairs(values) != n_pairs and (n_decoded := _count_pairs(values)) != n_pairs:
         raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} again")
 
 
 def _count_shallow_pairs(values: Any) -> int:
-    """Count the pairs of a mapping and of the mappings that are its values, without going through lists."""
+    """Count the pairs of a mapping and of the mappings nested directly in it; lists are not searched."""
     if not isinstance(values, dict):
         return 0
     return len(values) + sum(len(value) for value in values.values() if isinstance(value, dict))
 
 
 def _count_pairs(values: Any) -> int:
-    """Count the pairs of all mappings, however deep."""
+    """Count the pairs of all mappings at any depth."""
     if isinstance(values, dict):
         return len(values) + sum(map(_count_pairs, values.values()))
     return sum(map(_count_pairs, values)) if isinstance(values, list) else 0
@@ -115,10 +119,10 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Return the argument of a CBOR item and the position of the byte after it, -1 if the data end before.
+    """Read the argument of a CBOR item; return it and the position after it, -1 if the data end before.
 
-    `position`: first byte after the item's initial byte, whose low 5 bits are `info`: the argument itself below 24,
-    else the number of bytes that contain it: 1, 2, 4 or 8 for 24 to 27.
+    `position`: first byte after the item's initial byte; `info`: low 5 bits of the initial byte. Below 24 `info` is the
+    argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
     """
     if info < 24:
         return info, position
@@ -133,7 +137,7 @@ def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
 
 @law
 def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int) -> tuple[int, int, int]:
-    """Skip the pieces of a text or byte string of unknown length, all of which must have its major type `major`.
+    """Skip a CBOR text or byte string of unknown length; all its pieces must have its major type `major`.
 
     `start`, `position`: first byte of the item, and of its first piece; `n_texts`: pieces of text or bytes so far.
     Returns the broken rule's code (0: none), the position of the fault or else after the end, and the new `n_texts`.

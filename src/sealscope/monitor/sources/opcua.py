@@ -127,7 +127,7 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit blocks in a thread of its own, as the service may block while the connection must go on."""
+        """Submit the queued blocks until the session ends, in a separate thread, as the service may block."""
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(1, _LOOK_S):
                 self._service.submit(block)

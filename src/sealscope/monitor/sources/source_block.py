@@ -111,7 +111,7 @@ REASONS = (
 
 @contextmanager
 def raising_refused_message() -> Iterator[None]:
-    """Convert any other error of decoding to a RefusedMessage, so that no message ends its decoder."""
+    """Convert any other error within the context to a RefusedMessage; no message can then end its decoder."""
     try:
         yield
     except (RefusedMessage, MissingExtra):
@@ -201,7 +201,7 @@ def compute_digest(payload: bytes) -> str:
 
 
 def _parse_identity(value: Any) -> str:
-    """Convert the `id` of a message to text, "" if it is None; refuse an id that a database cannot store."""
+    """Convert the `id` of a message to text, "" for None; refuse an id that a database cannot store."""
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
@@ -215,7 +215,7 @@ def _parse_identity(value: Any) -> str:
 
 
 def _abbreviate(value: Any) -> str:
-    """Format a text or number in at most 40 characters, anything else, which may be deeply nested, as its type."""
+    """Format a text or number in at most 40 characters, and any other value as the name of its type."""
     try:
         return str(value)[:40] if isinstance(value, (str, int, float, type(None))) else type(value).__name__
     except ValueError:  # CBOR integers may exceed Python's limit of digits

@@ -77,7 +77,7 @@ class _Birth:
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
         """Add name, type and unit of the birth to a metric; return None if it is no channel.
 
-        `is_complete`: whether no message since the birth is missing; else aliases are refused.
+        `is_complete`: True if no message since the birth is missing; otherwise aliases are refused.
         """
         if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -106,7 +106,7 @@ class _EdgeState:
     """The session of an edge node.
 
     `births`: births of actuators by device, "" for the node itself; `birth_sequence`: bdSeq of the last birth; `seq`:
-    last sequence number, None before a birth; `is_complete`: whether no number since the birth is missing.
+    last sequence number, None before a birth; `is_complete`: True if no number since the birth is missing.
     """
 
     births: dict[str, _Birth] = field(default_factory=dict)
@@ -232,7 +232,7 @@ class SparkplugHost:
         """Build a recording in SI from the samples of a message's metrics, None if there are no samples.
 
         `sent_ms`: time of sending [ms since 1970], for metrics without a time. A single value of a slow channel is no
-        sample, but repeated in all recordings until the next value.
+        sample: all recordings repeat it until the next value.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -267,10 +267,10 @@ class SparkplugHost:
         return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
-        """Compute the times [s] of `size` samples from `t` on; if they nearly follow the block before, they join it.
+        """Compute the times [s] of `size` samples from `t` [s] on, joined to the block before if that is near.
 
-        The start is the end of the block before, shifted by at most `_MAX_SHIFT` samples towards the interval that the
-        rounding of `t` to milliseconds allows.
+        A joined start is the end of the block before, shifted by at most `_MAX_SHIFT` samples towards the interval that
+        the rounding of `t` to milliseconds allows.
         """
         start, expected = t, self._next_starts.get(actuator, math.nan)
         if abs(expected - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
@@ -283,7 +283,7 @@ class SparkplugHost:
 def _simultaneous_samples(
     group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
 ) -> dict[str, Array]:
-    """Return channel -> samples (n,) of the metrics of one timestamp: of its arrays, or of single values (n = 1).
+    """Return channel -> samples (n,) of the metrics that share one timestamp; single values give n = 1.
 
     `group`: channel -> metric; `channel_of`: name of a metric -> channel. A channel without a single value repeats its
     last one.

@@ -43,13 +43,19 @@ def _format_area(area: Area) -> str:
 
 
 def column_sizes(judgement: Judgement) -> list[float]:
-    """List the leak sizes of the table's columns; [nan], all sizes pooled, if there are too many sizes or none."""
+    """List the leak sizes for the columns of the main table, in the unit of the plan.
+
+    If there are too many sizes or none, the list is [nan], a column of all sizes together.
+    """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
 
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
-    """Build heads and rows of the main table: the plan's detectors, then those that always and never fire."""
+    """Build heads and rows of the main table, a row for each detector.
+
+    The detectors of the plan come first, then those that always and never fire.
+    """
     judgement = result.judgement
     sizes = column_sizes(judgement)
     rows = judgement.overall if math.isnan(sizes[0]) else judgement.table
@@ -78,7 +84,7 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format a90 and a90/95, as `> SIZE` if they are beyond the tested sizes."""
+    """Format the leak sizes a90 and a90/95, as `> SIZE` beyond the tested sizes, and a dash if not known."""
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)

@@ -74,9 +74,9 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Draw the leak of each recording over time, by picture size; None if no recording states an estimate or bound.
+    """Draw the leak of each recording over time; return a picture for each size in `SIZES`.
 
-    Recordings are drawn by number, from 1, if a date is missing.
+    None if no recording states an estimate or a bound. Recordings are drawn by number, from 1, if a date is missing.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -99,7 +99,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
         return f"{day:g}" if day.is_integer() else ""
 
     def draw_levels(picture: Picture) -> None:
-        """Draw each recording as a point with its interval, or as the symbol of a bound, a large or a missing value."""
+        """Draw a point with its interval for each recording, or a symbol for a bound, large or missing value."""
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, picture.height - 4.0)
@@ -135,10 +135,11 @@ def _dates(ordered: Sequence[Judged]) -> list[str]:
 
 
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the channels of the newest recording with those of the last one before it, if possible judged `no leak`.
+    """Draw the channels of the newest recording over those of an earlier one.
 
-    Both are drawn from a common start. Returns (charts, drawn charts, names of the two files), empty if there is no
-    earlier recording, no common channel or a clock that does not increase.
+    The earlier one is the last before it that was judged `no leak`, or else the last of all. Both are drawn from a
+    common start. Returns (charts, drawn charts, names of the two files), empty if there is no earlier recording, no
+    common channel or a clock that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]

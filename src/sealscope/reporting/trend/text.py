@@ -54,7 +54,7 @@ def headline(trend: Trend) -> str:
 
 
 def verdict_sentence(trend: Trend) -> str:
-    """Return the verdict as a sentence."""
+    """Format the verdict as a sentence."""
     if trend.decision.summary != trend.verdict:
         return trend.decision.summary.capitalize()
     key = "ringing"
@@ -114,7 +114,10 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 
 
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
-    """Format the limit and the date of reaching it; `reach`: days from the last recording until then."""
+    """Format the repair limit and a prediction of the date at which the level reaches it.
+
+    `limit`: in the unit of the trend; `reach`: days from the last recording until then, with interval.
+    """
     limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
     expected, earliest, latest = (moment(trend, last + days) if days <= max_days else "later" for days in reach)
@@ -146,7 +149,7 @@ def assumptions_text(trend: Trend) -> str:
 
 
 def limit_note(trend: Trend) -> str:
-    """Format the repair limit, its origin, and whether healthy recordings scatter as far."""
+    """Format the repair limit and its origin, with a remark if healthy recordings scatter beyond it."""
     origin = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
     wear = trend.wear
     is_in_scatter = wear is not None and wear.limit is not None and wear.limit < wear.healthy.high

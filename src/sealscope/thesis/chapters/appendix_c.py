@@ -21,7 +21,10 @@ def _percent_change(pairs: Array) -> Array:
 
 
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
-    """Tabulate one chamber as the thesis does: RMS without leak, with leak and change [%], simulated and measured."""
+    """Tabulate one chamber in the thesis's form: RMS without leak, with leak, and change [%].
+
+    `sheet`: simulated; `measured`: None if not given.
+    """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
     for name in QUANTITIES:

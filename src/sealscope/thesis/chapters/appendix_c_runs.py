@@ -55,7 +55,10 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of a test on the identified rig, of twice `half` [s], with its leak in the second half."""
+    """Build the experiment of a test on the identified rig, with its leak in the second half.
+
+    `half`: half the duration [s]; `leak`: False for no leak; `drifts`: steps of parameters; `seed`: seed of the noise.
+    """
     return Experiment.of(
         rig=BENCH_RIG,
         command=condition.command,
@@ -78,7 +81,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe what changes at half time: an opened leak, parameters with their factors, or nothing."""
+    """Describe the change at half time: an opened leak, parameters with their factors, or nothing."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -89,7 +92,7 @@ def _describe_change(experiment: Experiment) -> str:
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
     """Compute the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers within each part (from, to) [s].
 
-    A part is narrowed by the filters' reach, so that no coefficient depends on samples outside of it.
+    A part is narrowed by the filters' reach: no coefficient depends on samples outside of it.
     """
     before, after = reach("db8", 4)[-1]
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])

@@ -98,8 +98,9 @@ def scales_for(frequencies: Array) -> Array:
 
 
 def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
-    """Compute CWT(a, b) of samples `x` (n,) at `rate` [Hz] for scales a [s]: (scales, n) [unit of x times s^0.5].
+    """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
+    Returns (scales, n) [unit of x times s^0.5].
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with the sum over samples as the
     integral. b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
     """
@@ -117,8 +118,9 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
 
 
 def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
-    """Compute the gain, at `frequencies` [Hz], of transform (3.4) followed by its inverse with da db / |a|^weight.
+    """Compute the gain of transform (3.4) followed by its inverse, at `frequencies` [Hz].
 
+    The inverse integrates with da db / |a|^weight:
     gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da, over six decades of scales around the frequencies.
     With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and dividing by it
     recovers the signal. Eq. (3.5) is printed with weight 0, for which the gain falls as 1/w^2.
@@ -146,7 +148,10 @@ def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
 
 
 def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectrogram:
-    """Compute the amplitudes in Hann windows of `window` samples, `step` samples apart, at `rate` [Hz]."""
+    """Compute the amplitudes of the cosines in successive Hann windows of `x` (n,), sampled at `rate` [Hz].
+
+    `window`: length of a window [samples]; `step`: distance between the starts of windows [samples].
+    """
     starts = np.arange(0, x.size - window + 1, step)
     hann = np.hanning(window + 1)[:-1]
     segments = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * hann

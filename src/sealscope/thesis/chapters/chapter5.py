@@ -83,7 +83,10 @@ def make_test_experiment(test: PrintedTest) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class FigureView:
-    """Draws a simulated test over the interval `span` [s]; views of wavelet details show the pressure of `chamber`."""
+    """The views of a simulated test over the interval `span` [s].
+
+    `chamber`: pressure that the views of wavelet details show.
+    """
 
     run: SimulatedRun
     test: PrintedTest
@@ -109,13 +112,19 @@ class FigureView:
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
     def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
-        """Build the curve of `y` over `t` (default: the recording's time) within the span, from `start` [s] on."""
+        """Build the curve of `y` over `t` [s] within the span, from `start` [s] on.
+
+        `t`: None for the time of the recording.
+        """
         t = self.recording.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
-        """Build the two curves of a series, without and with the leak."""
+        """Build two curves of the series `y` over `t` [s], one without and one with the leak.
+
+        `t`: None for the time of the recording.
+        """
         half, (start, stop) = self.test.half, self.span
         before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
         return [before, self._curve(y, "leak", "leak", t, start=half)]
@@ -254,9 +263,9 @@ class LeakTestMeasures:
 
 
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
-    """Estimate the time of a single step in a series by least squares, halfway between two points.
+    """Estimate the time [s] of a single step in a series `y` (n,) over `t` (n,) [s] by least squares.
 
-    At least `min_points` points are on each side of the step.
+    The estimate is halfway between two points. At least `min_points` points are on each side of the step.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)

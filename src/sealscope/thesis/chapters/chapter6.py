@@ -83,13 +83,13 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the flow [m^3/s] that a servo valve without overlap takes from its supply, through its open edge."""
+    """Compute the supply flow [m^3/s] of a servo valve without overlap, the flow through its open edge."""
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
 @dataclass(frozen=True)
 class ControlledRig:
-    """A rig with `PLANT_MISMATCH` and a leak of `lpm` [L/min] under `LOAD`, and its controller.
+    """A rig with `PLANT_MISMATCH`, a controller and a leak of `lpm` [L/min] under `LOAD`.
 
     `controller`: name of the controller, "" for an open loop, `ideal` for a fault-tolerant one that knows the leak;
     `rig`: name of the rig; `values`: further parameters.
@@ -132,7 +132,10 @@ class ControlledRig:
         return STIFFNESS_FORCE / (1e3 * _amplitude_at(run, is_settled, STIFFNESS_FREQUENCY))
 
     def bandwidth(self) -> float:
-        """Compute the frequency [Hz] above which the tracking error of small sines exceeds -3 dB of the target."""
+        """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB.
+
+        The error is relative to the target; inf if no tested frequency exceeds the limit.
+        """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
         run = self.run(f"position {' + '.join(terms)}", 14.0)
@@ -199,7 +202,10 @@ def _leak_flows(context: Context) -> tuple[float, ...]:
 def _figure_over_leak(
     table: ThesisTable, title: str, roles: Mapping[tuple[str, ...], Role], columns: Sequence[str], log_y: bool = False
 ) -> Figure:
-    """Draw columns of a table over the leak; each curve shows the rows that begin with a key of `roles`."""
+    """Draw columns of a table over the leak.
+
+    `roles`: leading cells -> style; each curve shows the rows that begin with these cells.
+    """
     panels = []
     for head in columns:
         curves = []

@@ -54,7 +54,10 @@ CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format the tests in which a rule fires as cells: "k/n", rate and its 95 % interval [%]; None for no tests."""
+    """Format the number of tests in which a rule fires as cells: "k/n", rate and its 95 % interval [%].
+
+    `fires`: mask (n,) of the tests, None if there are no tests: the cells are then empty.
+    """
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -63,7 +66,7 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of the columns of `_format_count` for a sheet; `count`: head of the first one."""
+    """Build the heads of the columns of `_format_count`; `source`: name of the sheet; `count`: first head."""
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
@@ -103,7 +106,9 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 
 
 def column_tests(sheet: DataSheet) -> list[_Row]:
-    """Test whether each column of a sheet changes with the leak; return rows with the columns `TESTS` after the source.
+    """Test each column of a sheet for a change with the leak.
+
+    Returns rows with the columns `TESTS`, without the first one, the source.
 
     Holm's correction covers all ten columns, since Table 5.1 chose among them.
     """
@@ -118,17 +123,21 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
-    """Compute the log change that noise exceeds with probability `FALSE_ALARMS`, on one side or on either side.
+    """Compute the log change that noise alone exceeds with probability `FALSE_ALARMS`.
 
-    ``1.645 rms(log change of d1)``, or 1.960 times this rms for either side. d1 is noise and does not depend on the
-    leak, so its changes between the halves are those of a leak-free rig. The other details scatter at least as much.
+    `either_side`: True to count changes of either sign. The threshold is ``1.645 rms(log change of d1)``, or 1.960
+    times this rms for either side. d1 is noise and does not depend on the leak, so its changes between the halves are
+    those of a leak-free rig. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
-    """Compute the log change in the chamber's direction that drift alone exceeds with probability `FALSE_ALARMS`."""
+    """Compute the log change that drift alone exceeds with probability `FALSE_ALARMS`.
+
+    The change counts in the direction in which a leak moves the chamber (`DIRECTION`).
+    """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 

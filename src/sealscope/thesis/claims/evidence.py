@@ -110,7 +110,7 @@ def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
 
 
 def log_change_to_percent(change: Array | float) -> float:
-    """Convert a log change, or the mean of several, to percent."""
+    """Convert a log change to percent; several log changes are averaged first."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
@@ -148,10 +148,10 @@ def partial_correlation(x: Array, y: Array, controls: Array) -> float:
 
 
 def leave_one_out_r2(columns: Array, y: Array) -> float:
-    """Compute R^2 of least squares on `columns`, (n, k), with each value predicted from all others.
+    """Compute the leave-one-out R^2 of least squares of `y` (n,) on `columns` (n, k).
 
-    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
-    Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
+    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen, Technometrics
+    16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
     hat = columns @ np.linalg.pinv(columns)
     residuals = (y - hat @ y) / (1.0 - np.diag(hat))

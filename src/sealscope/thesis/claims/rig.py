@@ -113,7 +113,10 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 
 
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
-    """Judge whether a fall of d3 of p_A indicates a leak: the rule must fire rarely without a leak and with drift."""
+    """Judge the claim that a fall of d3 of p_A indicates a leak.
+
+    The rule must fire rarely without a leak, and with drift alone.
+    """
     d3_rule = CLAIMED[0]
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
     is_rare = [float(d3_rule.fires(sheets[name]).mean()) < FALSE_ALARMS for name in ("no_leak", "drift")]

@@ -72,7 +72,7 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test whether the rate is within one percentage point of a printed one, and beyond chance."""
+        """Test that the rate is within one percentage point of a printed rate, and beyond chance."""
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
         as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
@@ -121,10 +121,10 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
-    """Build the function that checks whether each rule fires in the test with the smallest mean leak."""
+    """Build the function that tests each rule in the row with the smallest mean leak."""
 
     def test_smallest(sheet: DataSheet) -> Iterator[Finding]:
-        """Test each rule in the row with the smallest mean leak."""
+        """Test that each rule fires in the row with the smallest mean leak."""
         row = int(np.argmin(mean_leaks()))
         for rule in rules:
             changes = (log_change_to_percent(sheet.log_change(c, name)[row]) for c, name in rule.details)
@@ -160,7 +160,7 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline`, by what is left out."""
+    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline` for both ways of leaving out."""
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
     for name in groups:
@@ -182,7 +182,7 @@ def _trend_test(chamber: str) -> SheetTest:
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
 
     def test_correlations(sheet: DataSheet) -> Iterator[Finding]:
-        """Test whether raw and partial correlation of each detail have the claimed sign and are significant."""
+        """Test that raw and partial correlation of each detail have the claimed sign and are significant."""
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
             raw, partial = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, conditions)
@@ -309,9 +309,10 @@ def leak_level_claims() -> Iterator[Claim]:
 def _test_rows(
     sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test whether the details `names` change beyond noise in the test's row; return a text, and each detail's result.
+    """Test the details `names` for a change beyond noise in the test's row.
 
-    If several rows can be the test, the text also counts those with a change beyond noise.
+    Returns a text, and a result for each detail. If several rows can be the test, the text also counts those with a
+    change beyond noise.
     """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}

@@ -214,7 +214,7 @@ def _thin_product(product: Product | Claim) -> Product | Claim:
 
 
 def drop_curves(product: Product | Claim) -> Product | Claim:
-    """Return a figure without its panels, which are not stored; return other products unchanged."""
+    """Remove the panels of a figure, which are not stored; return other products unchanged."""
     return replace(product, panels=()) if isinstance(product, Figure) else product
 
 

@@ -26,7 +26,7 @@ class SimulatedRun:
     """The result of a simulated run.
 
     `recording`: None if the run failed; `t` [s], `outputs`: true outputs at its samples (`TRUE_OUTPUTS` in
-    `simulation.simulate`); `resolved`: whether all channels changed little when the step was halved, None if not
+    `simulation.simulate`); `resolved`: True if all channels changed little when the step was halved, None if not
     tested; `step_changes`: these changes by channel; `diverged`: one-line reason of a failed run, "" for none.
     """
 
@@ -47,7 +47,10 @@ class SimulatedRun:
 
 
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
-    """Simulate a run, and test it with half the step if `prove`; a diverged or unresolved run does not raise."""
+    """Simulate an experiment; a run that diverges or depends on the step raises no error.
+
+    `prove`: True to test the run with half the step.
+    """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
     except SimulationFailed as error:
@@ -63,8 +66,8 @@ class Context:
     """The inputs of an item's maker.
 
     `name`: id of the item; `needs`: ids of the items it needs, whose `products` are given by id, without failed items;
-    `quick`: whether to simulate less; `sheet`: measured sheet, None if not given or not used by the item; `runs`:
-    folder of simulated runs, shared by the processes of this call.
+    `quick`: True to simulate less; `sheet`: measured sheet, None if not given or not used by the item; `runs`: folder
+    of simulated runs, shared by the processes of this call.
     """
 
     name: str
@@ -77,7 +80,7 @@ class Context:
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
         """Simulate an experiment, or load its run if any process of this call has simulated it.
 
-        `prove`: whether to test the run with half the step. Other processes that ask for the run wait for it.
+        `prove`: True to test the run with half the step. Other processes that ask for the run wait for it.
         """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with lock_file(path.with_suffix(".lock"), None):

@@ -79,7 +79,7 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the item of a row of `items.toml`, or those listed by the function that its entry `each` names."""
+    """Yield the items of a row of `items.toml`: one, or those listed by the function in its entry `each`."""
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
     row_fields["make"] = _import_function(row_fields["make"])

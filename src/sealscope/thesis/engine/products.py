@@ -70,7 +70,7 @@ class Number:
 class Figure:
     """A figure under the thesis's own number.
 
-    `claims`: ids of claims that it supports or refutes; `resolved`: whether all its runs passed the test with half the
+    `claims`: ids of claims that it supports or refutes; `resolved`: True if all its runs passed the test with half the
     step, None if nothing was simulated; an unresolved figure is marked.
     """
 

@@ -21,7 +21,7 @@ def load_texts(name: str) -> dict[str, Any]:
 
 
 def format_note(name: str, **values: Any) -> str:
-    """Return a note of `notes.toml` with `values` in its placeholders."""
+    """Format a note of `notes.toml` with `values` in its placeholders."""
     return str(load_texts("notes.toml")[name]).format(**values)
 
 

@@ -45,7 +45,7 @@ def write_thesis_page(
 ) -> Path:
     """Write `index.html` into `folder` from the statuses of all items; return its path.
 
-    The page links to nothing but the files in the folder. `quick`: whether shorter runs were made; `sheet`: whether the
+    The page links to nothing but the files in the folder. `quick`: True if shorter runs were made; `sheet`: True if the
     measured sheet was given. Raises InputError if the page cannot be written.
     """
     claims: dict[str, Claim] = {}

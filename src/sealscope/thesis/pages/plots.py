@@ -159,7 +159,7 @@ def _draw_figure(figure: Figure) -> MplFigure:
 
 
 def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: bool) -> None:
-    """Draw a panel's image, curves, marks and axes; `label_marks`: whether to write the texts of the marks."""
+    """Draw a panel's image, curves, marks and axes; `label_marks`: True to write the texts of the marks."""
     if panel.image is not None:
         image = panel.image
         mesh = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
@@ -207,7 +207,10 @@ def _use_plain_numbers(axis: Axis) -> None:
 
 
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points (x, y) of a curve to draw: those in `x_range` and one on each side; a long line is thinned."""
+    """Select the drawn points (x, y) of a curve: those in `x_range`, and one on each side.
+
+    `x_range`: None for all points. A long line is thinned.
+    """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
         first, stop = np.searchsorted(x, sorted(x_range))
@@ -219,7 +222,7 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
     """Draw a curve in the style of its role; `n_before`: number of earlier curves with this role in the panel.
 
-    `is_only`: whether it is the panel's only curve, which is drawn in colour even if it is a reference.
+    `is_only`: True for the panel's only curve, which is drawn in colour even if it is a reference.
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)

@@ -125,7 +125,10 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build a long run of section 4.3's command, for the drift of the piston; `overrides`: as in `make_experiment`."""
+    """Build the long experiment with section 4.3's command, on which the drift of the piston is measured.
+
+    `closed_pct`, `solver`, `overrides`: as in `make_experiment`.
+    """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
 
@@ -133,7 +136,7 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command with the thesis's solver and with a converged one."""
+    """Simulate a command with the thesis's solver and with a converged one; return the runs by solver."""
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
@@ -168,9 +171,10 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Compute ranges, peaks and minimum of the pressures, mean and largest drop at the orifices [Pa], by name.
+    """Summarise the pressures [Pa] of a run in its steady part `STEADY`, by name of the number.
 
-    `flows differ`: rms of Q_A - Q_B over that of Q_A. All values are nan if the run diverged.
+    The numbers are ranges, peaks and minimum of the pressures, and mean and largest drop at the orifices. `flows
+    differ`: rms of Q_A - Q_B over that of Q_A. All values are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
@@ -185,7 +189,10 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Compute the shift [m] of the piston's mean position from the first to the last whole period; nan if diverged."""
+    """Compute the drift [m] of the piston: its mean position in the last whole period minus the first.
+
+    nan if the run diverged.
+    """
     if run.diverged:
         return math.nan
     t, x = run.t, run.outputs["x"]

@@ -155,7 +155,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 
 
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Format the number of passed tests; if only some passed, also the readings under which all did."""
+    """Format the number of passed tests; if only some passed, also the readings that pass all tests."""
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
     text = f"{sum(results)} of {len(results)} tests pass"
@@ -170,7 +170,7 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` by the converged runs under both readings, and state the results of both solvers.
+    """Judge claim 4.`number` by the converged runs of both readings, and state the results of both solvers.
 
     `numbers`: by solver and reading; `test`: tests the numbers of one reading; `format_numbers`: formats those of all.
     """
@@ -192,18 +192,24 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats `head` and the range [kPa] of the `values` in the rows of all readings."""
+    """Build a function that formats `head` and a range [kPa] over the rows of all readings.
+
+    `values`: extracts the numbers [Pa] from the rows of one reading.
+    """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Subtract the first row's "peak" or "range" (`statistic`) of each pressure from those of the later rows."""
+    """Compute the change of each pressure's `statistic` from the first row to each later row, as one list.
+
+    `statistic`: "peak" or "range".
+    """
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Simulate each (command, closing [%]) with both solvers and readings; return the numbers of `summarise_run`."""
+    """Simulate cases (command, closing [%]) and summarise each run, by solver and reading (`summarise_run`)."""
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
@@ -249,7 +255,7 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
         return _changes([rows[0], rows[-1]], "range")
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Test whether the range of each pressure grows with the closing, visibly in total."""
+        """Test for each pressure that its range grows with the closing, and visibly from 25 to 75 %."""
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
@@ -285,7 +291,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     }
 
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build the function that formats the range of the added drift over the readings, at each closing."""
+        """Build the function that formats the drift added by the orifices at each closing, as a range."""
 
         def format_drift(rows: list[list[float]]) -> str:
             parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
@@ -295,11 +301,11 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Test at each closing whether the drift differs from that without orifices."""
+        """Test at each closing that the drift differs from the drift without orifices."""
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Test whether the drift grows from each closing to the next."""
+        """Test that the drift grows from each closing to the next."""
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 
     head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"

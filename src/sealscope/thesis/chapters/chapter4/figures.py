@@ -65,7 +65,7 @@ def item_reading(item: Item) -> Reading:
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Run the case of Table 4.2 or 4.3 that an item shows; return its runs and the notes on them."""
+    """Simulate the case of Table 4.2 or 4.3 that an item shows; return its runs and the notes on them."""
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
     return runs, _run_notes(runs, reading if closed_pct is not None else None)
@@ -114,7 +114,10 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 
 
 def _rms_difference(runs: Runs, name: str) -> float:
-    """Compute the rms difference of the two runs over the steady periods, in the figure's unit; nan if one diverged."""
+    """Compute the rms difference of an output between the runs of both solvers, in the figure's unit.
+
+    The difference is over the steady periods; nan if a run diverged.
+    """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
 
@@ -183,9 +186,10 @@ def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureC
 def _sweep_curves(
     template: str, sweep: Mapping[float, Runs], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
-    """Build curves and numbers [MPa] of a measure [Pa] over the varied parameter, the key of `sweep`.
+    """Build curves and numbers [MPa] of a measure over a varied parameter.
 
-    `template`: name of a number with a placeholder for the parameter's value.
+    `sweep`: value of the parameter -> runs; `measure`: computes the measure [Pa] of a run; `template`: name of a number
+    with a placeholder for the parameter's value.
     """
     curves, numbers = [], []
     for solver in solvers:
