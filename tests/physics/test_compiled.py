@@ -118,9 +118,9 @@ def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
     [
         "another user's",
         "open to all",
-        pytest.param("kernels open to all", marks=pytest.mark.long),
+        "kernels open to all",
         "a link",
-        pytest.param("kernels a link", marks=pytest.mark.long),
+        "kernels a link",
     ],
 )
 @pytest.mark.slow
