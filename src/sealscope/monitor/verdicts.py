@@ -119,7 +119,10 @@ class RecordingVerdict:
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
-        """Make the neutral verdict that replaces this one from a person's mark until the next recording."""
+        """Build the neutral verdict that is shown after a person marks this one, until the next recording.
+
+        `mark`: the person's mark, which the new verdict quotes. The file and its times stay.
+        """
         state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
         texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
         texts |= {"size": "", "cause": "", "mark": mark}

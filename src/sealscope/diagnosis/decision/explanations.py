@@ -139,9 +139,10 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 def _possible_gains(
     event: Event, factors: Sequence[tuple[Observable, float]], rise: LeakRise | None
 ) -> Sequence[_Gains]:
-    """Compute the log Bayes factors of an event by kind of data, one mapping for each possible time of its onset.
+    """Compute an event's log Bayes factors by kind of data, one mapping for each possible time of onset.
 
-    The first is for an onset within the recording. A leak may also have begun before: it then explains the rise alone.
+    The first mapping is for an onset within the recording. For a leak, if `rise` is given, a second one is for an onset
+    before the recording: such a leak explains only the rise and no other data.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:

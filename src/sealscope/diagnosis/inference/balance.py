@@ -426,7 +426,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
     @cache
     def blocks_about(offset: float) -> Blocks | None:
-        """Compute the blocks with an offset [Pa] subtracted from p_A - p_B."""
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B; None if no block is complete."""
         stream = BlockStream(stream_balances, recording.rate, block_s, n_first=None, start=start, offset=offset)
         return stream.push(samples, last=True)
 

@@ -415,10 +415,11 @@ class _EquationFit(NamedTuple):
 
 
 def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
-    """Fit one equation's nuisance coefficients and the offset z of p_A - p_B; the tested one is free in each block.
+    """Fit the nuisance coefficients of one equation and the offset z of p_A - p_B by Gauss-Newton steps.
 
-    The leakage is g (p_A - p_B - z), so that a change of g changes the bias by -g z. About the offset of the sums
-    (`pressure_offset.remove_pressure_offset`) z is small, and Gauss-Newton steps find it.
+    The tested coefficient g takes its own value in each block. The leakage is g (p_A - p_B - z): a change of g between
+    blocks also changes the bias, by -g z. z is small, as it is relative to the offset that is already removed from the
+    sums (`pressure_offset.remove_pressure_offset`).
     """
     offset, deviation = 0.0, roles.offset_deviation(test, blocks)
     polynomials, minutes = _drift_polynomials(blocks)

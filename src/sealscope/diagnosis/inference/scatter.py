@@ -143,9 +143,9 @@ class Rise(NamedTuple):
         return self.mixture.quantile(1.0 - chance) / self.deviation
 
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
-        """Compute the log likelihood ratio of a true rise against no rise.
+        """Compute the log likelihood ratio of the estimated value: for a true rise of size `rise` against none.
 
-        `log_deviation`: standard deviation of the logarithm of the true rise about that of `rise`.
+        `log_deviation`: standard deviation of log(true rise) about log(`rise`); 0 if the rise is exact.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)

@@ -40,7 +40,10 @@ class Admission:
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Compute the time until the next token of an address is checked [s], 0 if there is no pause."""
+        """Compute the time [s] that an address must wait until its next token is checked; 0 if it need not wait.
+
+        After `_FREE_ATTEMPTS` failures from its network the pause doubles with each one, up to `_MAX_PAUSE_S`.
+        """
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
             return 0.0

@@ -45,14 +45,18 @@ def duty_tests(recording: Recording) -> list[StepTest]:
 
 
 def time_in_motion(speeds: Array, max_speed: float) -> Array:
-    """Compute the fraction of time (K,) for which blocks of speeds (K, length) move; NaN counts as rest."""
+    """Compute the fraction of each block's samples in which the piston moves, (K,).
+
+    `speeds` (K, length): speeds of K blocks; NaN counts as rest. A sample is in motion if its absolute speed exceeds
+    the fraction `CHANGES.levels.slowest` of `max_speed`.
+    """
     return np.asarray((np.abs(speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks whose fraction of time in motion is large, compared with the largest one.
+    """Flag the blocks (K,) that move for at least `_PRIORS.busy` of the time of the busiest block.
 
-    `fractions` (K,): of each block (`time_in_motion`).
+    `fractions` (K,): fraction of time in motion of each block, from `time_in_motion`.
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 

@@ -189,11 +189,14 @@ class BalanceLeak:
         return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
-        """Compute the mean flow per unit rise, and the log weight, of each leak law of `EXPONENTS`.
+        """Compute the mean flow per unit rise and the log weight of each leak law in `EXPONENTS`.
 
-        A law of exponent n lies the fraction f = 2 (1 - n) of the way from laminar to orifice flow: its flow is
-        laminar^(1 - f) orifice^f, its log weight log prior + f N (log likelihood ratio of one reading), N the number of
-        independent readings of a recording.
+        A law with exponent n lies the fraction f = 2 (1 - n) of the way from laminar to orifice flow:
+
+            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one reading),
+
+        with N independent readings in a recording. If the laws cannot be compared, each has the laminar flow and the
+        log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()

@@ -73,7 +73,11 @@ def rival_rises(
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Compare the leaks from A and from B to the outside during holds; None if too few recordings have holds."""
+    """Compare the external leaks of chambers A and B during holds with those of healthy recordings.
+
+    Returns one observable for each chamber that can be compared; None if the judged recording has no holds, or fewer
+    than `MIN_WITH_HOLDS` healthy recordings have any.
+    """
     healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
         return None
