@@ -538,7 +538,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of nuisance coefficients and its standard error.
 
-    `weights`: by column index, of sum 1; they apply to the constant parts of the coefficients, without drift.
+    `weights` maps the index of a column to its weight; the weights sum to 1. Only the constant part of each coefficient
+    is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)

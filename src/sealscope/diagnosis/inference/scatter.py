@@ -171,7 +171,10 @@ class Rise(NamedTuple):
         return log_densities[0] - log_densities[1]
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
-        """Integrate `log_ratio` over a log-normal true rise, on a grid that resolves prior and likelihood."""
+        """Compute `log_ratio` with the true rise integrated over a log-normal prior about `rise`.
+
+        The grid resolves both the prior and the likelihood.
+        """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
             [rise * np.exp(log_deviation * grid_deviations), self.value + self.deviation * grid_deviations]
@@ -533,11 +536,13 @@ class Population:
         log_priors: Array,
         sigma_log_prior: Array | float = 0.0,
     ) -> Mixture:
-        """Predict the judged value relative to `values` (s,): log weights, deviations and centres (s, g, nodes).
+        """Predict the judged value from the healthy ones by kriging, as a mixture of normal laws.
 
-        `healthy_values` (s, n): the other values x, in s ways with `log_priors` (s,); `sigma` (s, nodes): log-spaced
-        grid, with log prior densities `sigma_log_prior` (s, nodes). With covariances V of the healthy values and c with
-        the judged one, the prediction is m + c' V^-1 (x - m), m the generalised least-squares mean (kriging).
+        `values` (s,): the judged value by s alternative estimates, which have log priors `log_priors` (s,);
+        `healthy_values` (s, n): the values x of the healthy recordings by the same; `sigma` (s, nodes): log-spaced grid
+        of the scatter, with log prior densities `sigma_log_prior` (s, nodes). Returns log weights, deviations and
+        centres (s, g, nodes) for g candidate covariances, the centres relative to `values`. The prediction is
+        m + c' V^-1 (x - m): V covariance of x, c that of x with the judged value, m the generalised least-squares mean.
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)

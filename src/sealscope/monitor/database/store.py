@@ -267,9 +267,9 @@ class MonitorStore:
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Note that a reader starts to decode a message; return the number of earlier starts without an end.
+        """Record that a reader starts to decode a message; return how many earlier attempts never finished.
 
-        A message whose decoding ends the process can thus be refused after a restart.
+        A message whose decoding crashes the process can thus be refused after the restart.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)

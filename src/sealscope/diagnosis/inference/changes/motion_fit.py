@@ -52,7 +52,11 @@ class Motion(NamedTuple):
 
 
 def select_motion(recording: Recording) -> Motion | None:
-    """Select the samples in motion; None without both chamber pressures, a motion, or enough samples."""
+    """Select the samples in which the piston moves, and build the design matrix of their fit.
+
+    Many samples are thinned. Returns None if a chamber pressure or a signal of the motion is not recorded, or if fewer
+    than `MIN_ROWS` samples move.
+    """
     if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
     motion = motion_columns(recording.channels, recording.rate)

@@ -124,9 +124,10 @@ class VolumeBalance:
         return self._balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
-        """Choose the balance without a position that bounds a leak most closely; None if none is usable.
+        """Choose, of the balances that need no position, the one that bounds a leak most closely.
 
-        Without shut valves a balance is usable if the pump compensates the leakage.
+        A balance of holds behind shut valves is always usable, another one only if the pump compensates the leakage.
+        Returns None if none is usable.
         """
         cycle_balances = compute_once(
             recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), READ
