@@ -75,7 +75,7 @@ ATTRIBUTES = {
 
 
 class TolerantCache(FunctionCache):  # type: ignore[misc]
-    """Cache of numba that treats files that cannot be read or written as cache misses."""
+    """Cache of numba in which an unreadable or unwritable file is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a signature; None if there is none or it is damaged.

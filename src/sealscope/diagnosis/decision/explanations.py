@@ -68,7 +68,7 @@ def explain(
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
-    factors = _correct_for_misfit(_compare_by_likelihood(log_factors))
+    factors = _compare_by_likelihood(_correct_for_misfit(log_factors))
     gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}
     supported = [
         event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
@@ -88,6 +88,7 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
     The terms are rival descriptions of the same residual. Healthy recordings calibrate how rare the best of them is,
     but are too few to tell which term describes it best: for that the likelihoods in the judged recording alone count.
+    `log_factors` are corrected for misfit; so are the differences (`_correct_for_misfit`).
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
