@@ -6,8 +6,8 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class WalkPriors(PriorTable):
     """Random walk of the log RMS levels over time.
 
-    `machine`, `noise`, `duty`: half-Cauchy scales of the deviation gained in `time` [s], [1 in 90 s]; `tried`: number of
-    rates tried; `least`: smallest fraction of a level that is due to the machine.
+    `machine`, `noise`, `duty`: half-Cauchy scales of the deviation gained in `time` [s], [1 in 90 s]; `tried`: number
+    of rates tried; `least`: smallest fraction of a level that is due to the machine.
     """
 
     machine: float
