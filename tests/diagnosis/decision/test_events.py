@@ -16,6 +16,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
@@ -56,7 +57,8 @@ def known_names() -> frozenset[str]:
     """Collect what providers report, as "data: name"."""
     names = {f"volumes: {name}" for name in volume_names()} | {f"response: {name}" for name in PARAMETERS}
     names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
-    names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in DRIFTS}
+    names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in (*DRIFTS, FALL)}
+    names |= {f"drift: {LOW.format(side)}" for side in "AB"}
     names |= {"motion: motion", "sides: p_A beside p_B", f"{TURNING_DATA}: {TURNING}"}
     names |= {f"rise: {name}" for name in volume_names() if name == AIR or name.startswith("external leak")}
     names |= {f"levels: scale of {chamber}" for chamber in ("p_A", "p_B")}

@@ -31,8 +31,8 @@ from sealscope.diagnosis.priors.inference import StepSize
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
-#: Number of grid points of the scatter, and its largest ratio to the prior's, either way.
-NODES, MAX_RATIO = 64, 100.0
+#: Number of grid points of the scatter, and its largest ratio to the prior's, either way, and to that of the values.
+NODES, MAX_RATIO, MAX_RATIO_TO_VALUES = 64, 100.0, 10.0
 #: Smallest positive number that is divided by.
 TINY = float(np.finfo(float).tiny)
 
@@ -114,7 +114,8 @@ def compare_estimates(
     if len(healthy) < MIN_HEALTHY or not np.isfinite([judged, *healthy]).all():
         return None
     values, errors = np.array(healthy, dtype=float).T
-    ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(MAX_RATIO), NODES))
+    max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
+    ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
     scatter = prior.deviation * ratios
     weights = 1.0 / (scatter[:, None] ** 2 + errors**2)
     precision = weights.sum(axis=1)

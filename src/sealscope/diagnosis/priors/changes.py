@@ -1,5 +1,6 @@
 """Typed tables of `inference/changes/priors.toml`: priors on signals that a leak does not change."""
 
+from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
@@ -53,6 +54,19 @@ class FilteredPriors(PriorTable):
     spread: float
 
 
+class ChargePriors(PriorTable):
+    """Drifts of the low values of the pressures.
+
+    `near` [Pa]: range above the lowest value; `seconds` [s]: averaging time; `scatter` [Pa/s]: standard deviation
+    between days, believed as if it came from `recordings` recordings.
+    """
+
+    near: float
+    seconds: float
+    scatter: float
+    recordings: float
+
+
 class ChangePriors(PriorTable):
     """The tables of `inference/changes/priors.toml`."""
 
@@ -61,6 +75,9 @@ class ChangePriors(PriorTable):
     healthy: HealthyLevelPriors
     octaves: OctavePriors
     filtered: FilteredPriors
+    charge: ChargePriors
+    charge_fall: StepSize
+    zero_drift: StepSize
 
 
 CHANGES = read_priors("sealscope.diagnosis.inference.changes", ChangePriors)

@@ -101,7 +101,10 @@ class GrowthPriors(PriorTable):
 
 
 class StepSize(PriorTable):
-    """Size of a change: median, of an outside leak in m^3/s, of air in Pa, and standard deviation of its logarithm."""
+    """Size of a change: its median, and the standard deviation of its logarithm.
+
+    `size` [m^3/s] of an external leak, [Pa] of free air, [Pa/s] of a drift.
+    """
 
     size: float
     spread: float

@@ -2,9 +2,10 @@
 
 The friction is half the part of p_A - p_B that reverses with the motion, as a logarithm: friction of seals and guides
 changes in proportion. A drift of one pressure alone over the recording is a drift of its sensor's offset; the charge
-pressure changes both alike. Both are fitted over the samples in which the piston moves (`motion_fit`). A filter of one
-sensor makes the spectra of the pressures unlike (`pressure_bands`). The scatter of these numbers between healthy
-recordings is their null (`differences`). Called for recordings with both chamber pressures and a motion.
+pressure changes both alike. Both are fitted over the samples in which the piston moves (`motion_fit`), and a second
+time over the low values of each pressure, by which oil that leaves the circuit is told (`charge_pressure`). A filter
+of one sensor makes the spectra of the pressures unlike (`pressure_bands`). The scatter of these numbers between
+healthy recordings is their null (`differences`). Called for recordings with both chamber pressures and a motion.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.inference.changes.charge_pressure import LowDrifts, compare_low_drifts, estimate_low_drifts
 from sealscope.diagnosis.inference.changes.motion_fit import TIME, fit_difference, fit_robustly, select_motion
 from sealscope.diagnosis.inference.changes.pressure_bands import Octaves, compare_octaves, compare_spectra
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
@@ -52,6 +54,11 @@ class HealthyLevels:
         summaries, judged = healthy_summaries(self, baseline), self.learn(recording)
         if judged is None:
             return
+        if (low_drifts := _low_drifts(judged)) is not None:
+            yield from compare_low_drifts(low_drifts, [day for day in map(_low_drifts, summaries) if day is not None])
+        summaries = [summary for summary in summaries if "drift_A" in summary]
+        if "drift_A" not in judged:
+            return
         changes = [_compare_friction(judged, summaries)]
         if (octaves := _octaves(judged)) is not None:
             healthy = [day for day in map(_octaves, summaries) if day is not None]
@@ -72,6 +79,13 @@ def _octaves(summary: Summary) -> Octaves | None:
     if not set(Octaves._fields) <= set(summary):
         return None
     return Octaves(*(float(summary[name]) for name in Octaves._fields))
+
+
+def _low_drifts(summary: Summary) -> LowDrifts | None:
+    """Restore the drifts of the low pressures from a summary; None if it has none."""
+    if not set(LowDrifts._fields) & set(summary):
+        return None
+    return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
 
 
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
@@ -113,15 +127,21 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 def _estimate_levels(recording: Recording) -> Summary | None:
     """Estimate friction, drifts and spectra; None without a channel or enough motion."""
     motion, fit = select_motion(recording), fit_difference(recording)
-    if motion is None or fit is None:
-        return None
-    drift_A, drift_B = (float(fit_robustly(motion.design, recording[name][motion.rows])[0][TIME]) for name in CHAMBERS)
-    levels = {
-        "friction_pressure": fit.friction,
-        "friction_error": fit.friction_error,
-        "drift_A": drift_A,
-        "drift_B": drift_B,
-    }
-    if (octaves := compare_octaves(recording)) is not None:
-        levels |= octaves._asdict()
-    return levels if np.isfinite(list(levels.values())).all() else None
+    levels = dict[str, float]()
+    if motion is not None and fit is not None:
+        drift_A, drift_B = (
+            float(fit_robustly(motion.design, recording[name][motion.rows])[0][TIME]) for name in CHAMBERS
+        )
+        levels |= {
+            "friction_pressure": fit.friction,
+            "friction_error": fit.friction_error,
+            "drift_A": drift_A,
+            "drift_B": drift_B,
+        }
+        if (octaves := compare_octaves(recording)) is not None:
+            levels |= octaves._asdict()
+    if not np.isfinite(list(levels.values())).all():
+        levels = {}
+    if (low_drifts := estimate_low_drifts(recording)) is not None:
+        levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
+    return levels or None

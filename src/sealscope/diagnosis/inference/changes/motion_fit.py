@@ -15,6 +15,7 @@ Zeger, Biometrika 73 (1986) 13 (the standard error).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -91,6 +92,22 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     return np.asarray(coefficients), weight
 
 
+def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Array:
+    """Compute standard errors of the coefficients `columns` of a weighted least-squares fit.
+
+    The residuals (n,), in the order of time, are correlated within each of P parts of the recording. With the influence
+    of a part's residuals on a coefficient,
+
+        error^2 = P / (P - 1) sum over parts of influence^2.
+
+    `design` (n, m), `residual`: both multiplied by the weights.
+    """
+    edges = np.linspace(0, len(residual), PARTS + 1).astype(int)[:-1]
+    scores = np.add.reduceat(design * residual[:, None], edges, axis=0)
+    influences = np.linalg.pinv(design.T @ design)[list(columns)] @ scores.T
+    return np.asarray(np.sqrt(PARTS / (PARTS - 1.0) * (influences**2).sum(axis=1)))
+
+
 class DifferenceFit(NamedTuple):
     """Fit of p_A - p_B by friction, which reverses with the motion, and a viscous drop.
 
@@ -119,11 +136,7 @@ def _fit_difference(recording: Recording) -> DifferenceFit | None:
     coefficients, weight = fit_robustly(design, difference)
     weighted = design * weight[:, None]
     residual = (difference - design @ coefficients) * weight
-    edges = np.linspace(0, len(rows), PARTS + 1).astype(int)[:-1]
-    # error^2 = P / (P - 1) sum over P parts of (influence of the part's residuals on the coefficient)^2
-    scores = np.add.reduceat(weighted * residual[:, None], edges, axis=0)
-    influences = np.linalg.pinv(weighted.T @ weighted)[[DIRECTION, SPEED]] @ scores.T
-    errors = np.sqrt(PARTS / (PARTS - 1.0) * (influences**2).sum(axis=1))
+    errors = cluster_errors(weighted, residual, [DIRECTION, SPEED])
     fit = DifferenceFit(
         float(coefficients[DIRECTION]),
         float(errors[0]),

@@ -1,0 +1,180 @@
+"""Drift of the charge pressure, which falls where oil leaves the circuit.
+
+In a closed circuit an accumulator keeps the chamber that carries no load at the charge pressure. A leak past the piston
+returns its oil to the circuit; an external leak empties the accumulator, so that its pressure falls through the whole
+recording. A sensor whose offset drifts moves the low values of its own chamber alone. Of each pressure, the samples
+near its lowest values are fitted by
+
+    p = level + k x + r_+ max(q, 0) + r_- min(q, 0) + drift t,
+
+with the position x, whose rod volume moves oil into the accumulator, and the flow q of the pump, which drops pressure
+in lines and check valves (without a pump signal, the speed of the piston). The fit is robust (Cauchy weights) and gives
+samples above it less weight than those below: where valves shut a chamber off, its pressure lies above the charge
+pressure. Standard errors are cluster-robust. Called for healthy and judged recordings by `healthy_levels`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.inference.changes.motion_fit import PARTS, cluster_errors
+from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.diagnosis.priors.inference import StepSize
+from sealscope.recordings.channels import flow_source
+from sealscope.recordings.recording import Array, Recording
+
+#: `Observable.data` of all drifts, rival descriptions of one another; names of those of low pressures.
+DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
+#: Quantile of a pressure that counts as its lowest value, and fraction of the lowest samples with which a fit begins.
+LOWEST, BEGIN = 0.02, 0.3
+#: Maximum and minimum number of samples of a fit, and its number of iterations.
+MAX_SAMPLES, MIN_SAMPLES, ITERATIONS = 4000, 200, 15
+#: Weight of samples above the fit, over that of samples below.
+ABOVE = 0.1
+#: Scale of the weights' decrease over the median residual below the fit, and smallest scale [Pa].
+WEIGHT_SCALE, MIN_SCALE = 2.0, 300.0
+#: Smallest number that is divided by.
+TINY = 1e-300
+
+
+class LowDrifts(NamedTuple):
+    """Drifts of the low values of p_A and p_B [Pa/s], with standard errors; NaN for a chamber that is never low."""
+
+    low_A: float
+    low_A_error: float
+    low_B: float
+    low_B_error: float
+
+    def estimate(self, side: str) -> Estimate | None:
+        """Return the drift of one chamber, "A" or "B", with its error; None if it is unknown."""
+        estimate = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
+        return estimate if np.isfinite(estimate).all() else None
+
+
+@np.errstate(all="ignore")
+def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
+    """Estimate the drifts of the low values of both pressures; None without both, or if neither can be fitted."""
+    if len(recording) < MIN_SAMPLES or not {"p_A", "p_B"} <= set(recording.channels):
+        return None
+    regressors = _regressors(recording)
+    pressures = [_average(recording[name], recording.rate) for name in ("p_A", "p_B")]
+    lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
+    drifts = list[float]()
+    for p, low in zip(pressures, lowest, strict=True):
+        near = CHANGES.charge.near
+        is_low = np.isfinite(p) & np.isfinite(regressors).all(axis=1) & (p < low + near) & (low < min(lowest) + near)
+        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low))
+    return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
+
+
+def _average(values: Array, rate: float) -> Array:
+    """Average values (n,) over a fixed time around each sample, which removes the ripple of the pump."""
+    from scipy.ndimage import uniform_filter1d
+
+    return np.asarray(uniform_filter1d(values, max(1, round(CHANGES.charge.seconds * rate))))
+
+
+def _regressors(recording: Recording) -> Array:
+    """Compute the columns (n, 3 or fewer) of the fit: position, and flow of the pump in either direction."""
+    position = _average(recording["x"], recording.rate) if "x" in recording else None
+    source = flow_source(recording.channels)
+    if source is None:
+        flow = None if position is None else np.gradient(position)
+    else:
+        flow = _average(recording[source], recording.rate)
+        flow = np.gradient(flow) if source == "theta" else flow
+    columns = [] if position is None else [position - np.nanmean(position)]
+    if flow is not None:
+        flow = flow / max(float(np.nanmax(np.abs(flow))), TINY)
+        columns += [np.maximum(flow, 0.0), np.minimum(flow, 0.0)]
+    return np.column_stack(columns) if columns else np.zeros((len(recording), 0))
+
+
+def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
+    """Fit the lower envelope of the samples `rows` of a pressure; return its drift [Pa/s] and the standard error.
+
+    Both are NaN for too few samples.
+    """
+    rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
+    if len(rows) < MIN_SAMPLES:
+        return np.nan, np.nan
+    time, values = t[rows] - t[rows].mean(), pressure[rows]
+    varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]
+    design = np.column_stack([time, np.ones(len(rows)), varying])
+    weight = np.zeros(len(rows))
+    for part in np.array_split(np.arange(len(rows)), PARTS):  # each part begins with its lowest samples
+        weight[part] = values[part] <= np.quantile(values[part], BEGIN)
+    for _ in range(ITERATIONS):
+        coefficients = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
+        residual = values - design @ coefficients
+        below = np.abs(residual[residual < 0.0])
+        scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
+        weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
+    error = cluster_errors(design * weight[:, None], residual * weight, [0])[0]
+    return float(coefficients[0]), float(error)
+
+
+def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
+    """Yield the drift of the low values of each pressure, and the fall of the charge pressure, beside healthy ones.
+
+    They are alternatives. The fall lowers both pressures alike; its chance is that of the fall of their weighted mean
+    over that of the difference between them, which it does not explain.
+    """
+    prior = CHANGES.charge
+    scatter = PriorScatter(prior.scatter, prior.recordings)
+    sides = {side: drift for side in "AB" if (drift := judged.estimate(side)) is not None}
+    known = {side: [drift for day in healthy if (drift := day.estimate(side)) is not None] for side in sides}
+    for side, drift in sides.items():
+        change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
+        if change is not None:
+            yield _with_size(change, CHANGES.zero_drift)
+    # the variance of each side's drift, with the scatter between the healthy recordings that have one
+    variances = {
+        side: prior.scatter**2 + drift.deviation**2 + float(np.var([day.value for day in known[side]] or [0.0]))
+        for side, drift in sides.items()
+    }
+    falls = [mean for day in healthy if (mean := _mean_fall(day, variances)) is not None]
+    judged_fall = _mean_fall(judged, variances)
+    assert judged_fall is not None
+    fall = compare_estimates(FALL, DRIFT, judged_fall, falls, scatter, above=True)
+    if fall is None:
+        return
+    if len(sides) > 1:
+        days = [day for day in healthy if np.isfinite(day).all()]
+        difference = compare_estimates(FALL, DRIFT, _difference(judged), [_difference(day) for day in days], scatter)
+        chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
+        fall = replace(fall, chance=chance)
+    yield _with_size(fall, CHANGES.charge_fall)
+
+
+def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
+    """Compute minus the mean drift of the low pressures, weighted by the inverse `variances` of the sides [Pa^2/s^2].
+
+    None if the recording has no drift of these sides.
+    """
+    known = [
+        (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
+    ]
+    if not known:
+        return None
+    total = sum(weight for _, weight in known)
+    mean = sum(weight * drift.value for drift, weight in known) / total
+    return Estimate(-mean, float(np.sqrt(sum((weight * drift.deviation) ** 2 for drift, weight in known))) / total)
+
+
+def _difference(drifts: LowDrifts) -> Estimate:
+    """Compute the drift of low p_A less that of low p_B."""
+    error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
+    return Estimate(drifts.low_A - drifts.low_B, error)
+
+
+def _with_size(observable: Observable, size: StepSize) -> Observable:
+    """Set the advantage of a description by the prior on the size of its drift."""
+    return replace(observable, advantage=-size_penalty(size, observable.size))

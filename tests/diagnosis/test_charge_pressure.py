@@ -1,0 +1,105 @@
+"""Drift of the charge pressure: oil that leaves a circuit, beside sensors whose offset drifts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.inference.changes.charge_pressure import (
+    FALL,
+    LowDrifts,
+    compare_low_drifts,
+    estimate_low_drifts,
+)
+from sealscope.recordings.recording import Recording
+
+RATE, SECONDS = 100.0, 100.0
+T = np.arange(round(RATE * SECONDS)) / RATE
+
+
+def record(
+    *, fall: float = 0.0, zero_A: float = 0.0, zero_B: float = 0.0, held: float = 0.0, load: float = 30e5, seed: int = 0
+) -> Recording:
+    """Record a single rod whose accumulator feeds the unloaded chamber.
+
+    `fall` of the charge pressure and drifts of the sensors' zeros [Pa/s]; `load` [Pa] at one end of the stroke and
+    minus that at the other; `held`: pressure by which a shut-off chamber B lies above the charge pressure [Pa].
+    """
+    rng = np.random.default_rng(seed)
+    x = 0.1 * np.sin(2.0 * np.pi * 0.2 * T)
+    speed = np.cos(2.0 * np.pi * 0.2 * T)
+    charge = 8e5 - fall * T - 4e5 * x  # the rod's volume comes from the accumulator
+    force = load * np.sin(2.0 * np.pi * 0.2 * T + rng.uniform(0.0, 1.0))
+    p_A = charge + np.maximum(force, 0.0) - 3e4 * np.minimum(speed, 0.0)
+    p_B = (
+        charge + np.maximum(-force, 0.0) + 3e4 * np.maximum(speed, 0.0) + held * (np.sin(2.0 * np.pi * 0.05 * T) > 0.0)
+    )
+    noise = 5e3 * rng.standard_normal((2, len(T)))
+    return Recording(
+        T,
+        {"p_A": p_A + zero_A * T + noise[0], "p_B": p_B + zero_B * T + noise[1], "x": x, "omega": 100.0 * speed},
+        {"p_A": "Pa", "p_B": "Pa", "x": "m", "omega": "rad/s"},
+        RATE,
+    )
+
+
+def drifts(recording: Recording) -> LowDrifts:
+    estimated = estimate_low_drifts(recording)
+    assert estimated is not None
+    return estimated
+
+
+HEALTHY = [drifts(record(seed=seed)) for seed in range(1, 7)]
+
+
+def rarest(recording: Recording) -> str:
+    changes = list(compare_low_drifts(drifts(recording), HEALTHY))
+    return min(changes, key=lambda change: change.chance).name
+
+
+@pytest.mark.parametrize("fall", [0.0, 200.0, 1000.0])
+@pytest.mark.parametrize("held", [0.0, 2e5])
+def test_the_fall_is_that_of_the_accumulator_whatever_shut_valves_hold(fall: float, held: float) -> None:
+    estimated = drifts(record(fall=fall, held=held, seed=20))
+    for drift in (estimated.estimate("A"), estimated.estimate("B")):
+        assert drift is not None
+        assert drift.value == pytest.approx(-fall, abs=0.03 * fall + 30.0)
+
+
+def test_a_fall_of_both_pressures_is_one_of_the_charge_pressure() -> None:
+    assert rarest(record(fall=300.0, seed=21)) == FALL
+
+
+@pytest.mark.parametrize("side", "AB")
+def test_a_drift_of_one_pressure_is_one_of_its_sensor(side: str) -> None:
+    zero = {f"zero_{side}": -1000.0}
+    assert rarest(record(**zero, seed=22)) == f"drift of low p_{side}"
+
+
+def test_a_healthy_recording_shows_no_drift_and_a_rise_is_no_loss_of_oil() -> None:
+    healthy = compare_low_drifts(drifts(record(seed=23)), HEALTHY)
+    assert min(change.chance for change in healthy) > 0.01
+    rising = {change.name: change for change in compare_low_drifts(drifts(record(fall=-500.0, seed=24)), HEALTHY)}
+    assert rising[FALL].chance > 0.5
+    assert rising["drift of low p_A"].chance < 1e-4
+
+
+def test_a_chamber_that_always_carries_the_load_is_left_out() -> None:
+    recording = record(fall=300.0, seed=25)
+    loaded = Recording(T, {**recording.channels, "p_A": recording["p_A"] + 50e5}, dict(recording.units), recording.rate)
+    estimated = drifts(loaded)
+    assert estimated.estimate("A") is None
+    drift = estimated.estimate("B")
+    assert drift is not None and drift.value == pytest.approx(-300.0, rel=0.05)
+
+
+def test_a_recording_without_both_pressures_has_no_drifts() -> None:
+    recording = record()
+    one = Recording(T, {"p_A": recording["p_A"]}, {"p_A": "Pa"}, RATE)
+    assert estimate_low_drifts(one) is None
+
+
+def test_only_external_leaks_make_the_charge_pressure_fall() -> None:
+    change = next(change for change in compare_low_drifts(drifts(record(fall=300.0)), HEALTHY) if change.name == FALL)
+    assert {event.cause for event in load_events() if event.affects(change)} == {"external leak"}
