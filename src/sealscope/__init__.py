@@ -20,7 +20,7 @@ _DEPRECATED = {
     "load_machine": ("read_machine", "sealscope.diagnosis.commissioned.machine_file", "read_machine"),
     "write_page": ("report(recording, path, diagnosis)", "sealscope.reporting.page", "write_page"),
 }
-# LeakDetector needs the extra `learn`, so that `import *` must not load it
+# `import *` must not load LeakDetector, which needs the extra `learn`
 __all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 

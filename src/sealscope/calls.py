@@ -22,15 +22,19 @@ _MAX_WORD = 200
 
 
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
-    """Find up to `count` known words that are similar to `word`, the most similar first.
+    """Find up to `count` words of `known` that resemble `word`, the most similar first.
 
-    `share`: smallest similarity, as ratio of difflib. Empty if none is similar, or if `word` is very long.
+    `share` (0 to 1): smallest similarity that counts, the `ratio` of difflib. The list is empty if no known word is
+    similar enough, or if `word` is longer than 200 characters.
     """
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
-    """Format ``; did you mean NAME?`` with the known name nearest to `word`; empty if none is near."""
+    """Format the end of an error message that suggests the known name nearest to `word`.
+
+    The text is ``; did you mean NAME?``, or empty if no known name is similar. Upper and lower case count as equal.
+    """
     name_of = {name.casefold(): name for name in known}
     near = nearest(word.casefold(), name_of)
     return f"; did you mean {name_of[near[0]]}?" if near else ""
@@ -68,9 +72,10 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
-    """Declare an argument of a function as a dataclass field.
+    """Declare an argument of a function as a dataclass field with a default value and documentation.
 
-    `kind`: its type in words; `text`: its meaning; `unit`: SI unit of a number, else empty.
+    `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number, empty
+    for other values. The field's metadata contain them under these names, with the unit appended to the text.
     """
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
@@ -78,9 +83,11 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 
 
 def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
-    """Build a decorator that makes a function of one dataclass take its fields as arguments.
+    """Build a decorator that lets callers of a function pass the fields of a dataclass as its arguments.
 
-    `declared`: the dataclass. Its fields, declared by `argument`, replace it in signature and docstring.
+    `declared`: the dataclass, with fields declared by `argument`. The function itself takes an instance of it as its
+    only argument. The decorator puts the fields into the signature, and a section "Parameters" on them into the
+    docstring. Wrong arguments raise InputError.
     """
     lines: list[str] = []
     for declared_field in fields(declared):  # type: ignore[arg-type]
@@ -93,7 +100,7 @@ def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Cal
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            """Make the dataclass of the arguments, and call `function` with it."""
+            """Build the dataclass from the arguments, and call `function` with it."""
             return function(declared(*args, **kwargs))
 
         returns = inspect.signature(function).return_annotation

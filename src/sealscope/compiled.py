@@ -1,9 +1,13 @@
 """Compile functions by numba, with a cache that never returns code of outdated sources.
 
-Numba's ``cache=True`` keys a kernel by its own file only: after an edit to a law in another file it would silently
-return the old machine code. Here the name of the cache folder is a hash over the sources of all packages with compiled
-code, the versions of numba and Python, and the processor. It lies in the user's cache folder, as site-packages may be
-read-only. `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
+Numba's ``cache=True`` stores the machine code of a function by the source of its own file only. After an edit to
+another file, with a function that it calls, it would silently return the old machine code. Here the name of the cache
+folder is a hash over the sources of all packages with compiled code, the versions of numba and Python, and the
+processor. The folder is in the user's cache folder, as site-packages may be read-only. `SEALSCOPE_CACHE_DIR` moves
+it; an empty value turns caching off.
+
+Two kinds of functions are compiled: kernels, which Python calls, and laws, small functions such as a formula of
+physics that kernels call.
 
 Compiled code is unpickled, which can run any command: only folders that no other user can write are used. A file of
 the cache that is truncated or cannot be written is a cache miss.
@@ -50,14 +54,21 @@ _log = logging.getLogger(__name__)
 
 
 def is_known_version(version: str) -> bool:
-    """Test whether the private names of this numba version are known."""
+    """Test whether `KNOWN_VERSIONS` includes a numba version, such as "0.61.2".
+
+    In these versions numba has the private names that `numba_private` uses.
+    """
     first, after = KNOWN_VERSIONS
     return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
 
 
 @cache
 def _compiler() -> ModuleType:
-    """Import the compiler, `numba_private` for a known version of numba, else `numba_pipeline`."""
+    """Import the module that compiles functions with the installed version of numba.
+
+    This is `numba_private` for a version in `KNOWN_VERSIONS`. For other versions it is `numba_pipeline`, which
+    compiles slowly and does not cache; a warning is then logged.
+    """
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -69,7 +80,10 @@ def _compiler() -> ModuleType:
 
 
 def source_hash(root: Path) -> str:
-    """Compute a hash over the Python and TOML files of the compiled packages under `root`."""
+    """Compute a hash over the Python and TOML files of all packages with compiled code, as hexadecimal digits.
+
+    `root`: folder that contains the packages.
+    """
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         place = root / package
@@ -81,9 +95,10 @@ def source_hash(root: Path) -> str:
 
 
 def _user_cache_folder() -> Path | None:
-    """Choose the folder for compiled code.
+    """Choose the folder in which compiled code of this user is cached.
 
-    None if caching is turned off or the user has no home folder.
+    It is `SEALSCOPE_CACHE_DIR` if this environment variable is set, else a folder in the user's cache folder. None if
+    the variable is empty, which turns caching off, or if the user has no home folder.
     """
     setting = os.environ.get("SEALSCOPE_CACHE_DIR")
     if setting is not None:
@@ -93,9 +108,9 @@ def _user_cache_folder() -> Path | None:
 
 
 def _prune(kernels: Path, current: str) -> None:
-    """Remove old folders of compiled code in `kernels`.
+    """Remove old subfolders of `kernels`, which has one for each version of the sources.
 
-    Keeps `current` and the `_MAX_GENERATIONS` - 1 most recently used others.
+    The subfolder named `current` is kept, and so are the `_MAX_GENERATIONS` - 1 most recently used others.
     """
     older = sorted(
         (entry for entry in kernels.iterdir() if entry.is_dir() and entry.name != current),
@@ -109,7 +124,8 @@ def _prune(kernels: Path, current: str) -> None:
 def _check_owner(folder: Path, forbidden: int) -> None:
     """Raise PermissionError unless `folder` is a private directory of this user, and no link.
 
-    `forbidden`: mode bits that must not be set. On Windows all folders pass.
+    `forbidden`: permission bits that must not be set, such as 0o022, with which others can write. On Windows all
+    folders pass.
     """
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
@@ -119,7 +135,10 @@ def _check_owner(folder: Path, forbidden: int) -> None:
 
 
 def _make_private(folder: Path) -> None:
-    """Make a folder with mode 0700; raise OSError if another user owns it or can write to it."""
+    """Create a folder that only this user can read and write (mode 0700), or restrict an existing one to that.
+
+    Raises OSError if the folder belongs to another user, or if others could write to it until now.
+    """
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_owner(folder, 0o022)
     if folder.lstat().st_mode & 0o077:
@@ -129,7 +148,12 @@ def _make_private(folder: Path) -> None:
 
 @cache
 def cache_directory() -> Path | None:
-    """Make and return the folder for compiled code of these sources; None if none can be written safely."""
+    """Create the folder for the compiled code of these sources, and return its path.
+
+    The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary
+    files is used. Folders of older sources are removed (`_prune`). None if caching is turned off or no folder can be
+    used.
+    """
     base = _user_cache_folder()
     if base is None:
         return None
@@ -160,41 +184,55 @@ def cache_directory() -> Path | None:
 
 
 def kernel(function: _F, fastmath: Any = False) -> _F:
-    """Compile a function that runs without Python objects and the GIL, and cache its code.
+    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code.
 
-    By default floating-point errors follow IEEE 754; `fastmath`: numba's flags that relax it.
+    Floating-point arithmetic follows IEEE 754, unless `fastmath` allows deviations: True, or a set of LLVM's
+    fast-math flags, as for `numba.njit`.
     """
     return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
 
 
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a law for calls from other compiled functions; return it unchanged if numba is disabled."""
+    """Compile a law, a function that other compiled functions call.
+
+    `fastmath`: as for `kernel`; `inlined`: insert its code in place of each call. The function is returned unchanged
+    if numba's compilation is disabled.
+    """
     if numba.config.DISABLE_JIT:
         return function
     return _compiler().compile_law(function, fastmath, inlined, cache_directory())  # type: ignore[no-any-return]
 
 
 def law(function: _F) -> _F:
-    """Compile a small law that is inlined in other compiled functions; called from Python it is plain Python."""
+    """Compile a small function, such as a formula of physics, for inlining in the kernels that call it.
+
+    A call from Python runs the uncompiled function.
+    """
     return _compile_law(function, False)
 
 
 def large_law(function: _F) -> _F:
-    """Compile a law that is too large to be inlined in other compiled functions, which call it."""
+    """Compile a function for calls from kernels that is too large to be inlined in them.
+
+    A call from Python runs compiled code, too.
+    """
     return _compile_law(function, False, inlined=False)
 
 
 def contracted(function: _F) -> _F:
-    """Compile a law whose products and sums may be contracted to fused multiply-adds.
+    """Compile a law, as `law` does, whose products and sums may be contracted to fused multiply-adds.
 
-    Divisions may become products with the reciprocal. The last digits depend on the processor, but not on the block or
-    the lane.
+    Divisions may become products with the reciprocal. The last digits of the results depend on the processor, but not
+    on how the data are split into blocks or lanes (`physics.lanes`).
     """
     return _compile_law(function, {"contract", "arcp"})
 
 
 class Entry:
-    """A function double f(double *memory, double *input), compiled when its address is first requested."""
+    """A compiled function with the C signature double f(double *memory, double *input), called by its address.
+
+    It is compiled when its `address` is first requested.
+    """
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
@@ -203,18 +241,22 @@ class Entry:
 
     @cached_property
     def address(self) -> int:
-        """Address of the compiled function, for C, `call_at` and ctypes."""
+        """Address of the compiled function, for calls from C, ctypes and `call_at`."""
         return int(self._address())
 
 
 def entry(function: Callable[..., Any]) -> Entry:
-    """Compile a function of two arrays of doubles that kernels call by its address."""
+    """Wrap a function of two arrays of doubles in an `Entry`, for calls by its address from kernels and from C."""
     return Entry(function)
 
 
 @intrinsic  # type: ignore[misc]
 def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
-    """Call double f(double *memory, double *sample) by its address; all three arguments are integer addresses."""
+    """Call the function double f(double *memory, double *sample) at an address, and return its result.
+
+    Compiled code only. The arguments `address`, `memory` and `sample` are addresses as 64-bit integers; numba passes
+    `context`.
+    """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit the LLVM instructions that call the function at the address."""
@@ -228,7 +270,10 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
 
 @intrinsic  # type: ignore[misc]
 def address_of(context: Any, pointer: Any) -> Any:
-    """Return the address of a pointer as an integer."""
+    """Convert a pointer to a 64-bit integer, its address; for use in compiled code only.
+
+    Numba passes `context`.
+    """
 
     def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit the LLVM instruction that converts the pointer to a 64-bit integer."""
@@ -238,7 +283,11 @@ def address_of(context: Any, pointer: Any) -> Any:
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
-    """Build the dtype of a record of doubles `numbers`, and of `parts`, each an array's shape or a record's dtype."""
+    """Build the NumPy dtype of a record of doubles.
+
+    `numbers`: names of the fields that are single doubles. `parts`: name of a field -> shape of an array of doubles,
+    or dtype of a nested record.
+    """
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
 
@@ -255,9 +304,9 @@ def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> 
 
 
 def record_view(layout: Any) -> Callable[[Any], Any]:
-    """Build the law that views the doubles at a pointer as a record, without copying them.
+    """Build a compiled function that views the doubles at a pointer as a record, without copying them.
 
-    `layout`: NumPy's dtype of a record of doubles and arrays of them.
+    `layout`: NumPy dtype of the record, with doubles and arrays of doubles as fields.
     """
     kind = numba.types.CPointer(numba.from_dtype(layout))
 
@@ -273,17 +322,17 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
 
     @law
     def record(pointer: Any) -> Any:
-        """View the doubles at a pointer as the record."""
+        """View the doubles at a pointer as the record with the dtype `layout`."""
         return numba.carray(cast_pointer(pointer), 1)[0]
 
     return record  # type: ignore[no-any-return]
 
 
 def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
-    """Compile a function to LLVM code without Python; return the code and the function's symbol.
+    """Compile a function to LLVM code that needs no Python; return the code and the function's symbol.
 
-    `arguments`: "double*", "double" or "int64" each. The function returns an integer, takes pointers and numbers, and
-    allocates nothing; C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
+    `arguments`: type of each argument, "double*", "double" or "int64". The function must return an integer and
+    allocate nothing. C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
     """
     kinds = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
     signature = numba.int64(*(kinds[argument] for argument in arguments))

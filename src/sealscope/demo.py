@@ -25,10 +25,10 @@ LEAK = "0.0042 L/min from 30 s"
 
 @dataclass(frozen=True)
 class Demo:
-    """Results of the demo.
+    """Results of the demo: the commissioned machine, two diagnoses, and the files written.
 
-    `healthy`, `diagnosis`: diagnoses of a healthy and of the leaking recording; `truth`: the simulated leak; then the
-    files of machine, leaking recording and page.
+    `healthy`, `diagnosis`: diagnoses of a healthy recording and of the leaking one; `truth`: the simulated leak;
+    `machine_file`, `recording`, `page`: paths of the machine's file, the leaking recording and its page.
     """
 
     machine: CommissionedMachine
@@ -41,7 +41,11 @@ class Demo:
 
 
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
-    """Simulate recordings, commission the machine, diagnose two of them and write a page, all into `folder`."""
+    """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
+
+    All files are written into `folder`, with a page on the leaking recording. `seed`: seed of the simulated noise;
+    `progress`: called with the name of a task and the completed fraction of it.
+    """
     update = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}
@@ -76,5 +80,5 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
 
 
 def _diagnose_file(machine: CommissionedMachine, folder: Path, name: str) -> Diagnosis:
-    """Diagnose the recording `name` in `folder`; the diagnosis states this name as its file."""
+    """Diagnose the recording in the file `name` of `folder`; the diagnosis states `name` as its file."""
     return replace(machine.diagnose(machine.read(folder / name)), file=name)

@@ -13,7 +13,7 @@ _MAX_BEGINNING, _MAX_END = 1500, 2500
 def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTER}") -> str:
     """Replace unprintable characters, which may control a terminal, by `instead`.
 
-    Those in `kept` stay.
+    Unprintable characters that occur in `kept`, such as a line break, stay.
     """
     return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
@@ -40,7 +40,7 @@ class UnreadableFile(InputError):  # noqa: N818 (says what happened)
 
 
 class SimulationFailed(SealscopeError, ArithmeticError):  # noqa: N818 (says what happened)
-    """A run diverged, or proved to be under-resolved; no result is returned."""
+    """A simulation diverged, or its time step proved to be too large; no result is returned."""
 
 
 class MissingExtra(SealscopeError, ImportError):  # noqa: N818 (says what happened)

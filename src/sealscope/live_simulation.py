@@ -1,4 +1,4 @@
-"""Simulated actuators as sources of a monitor, at a multiple of real time.
+"""Simulated actuators as sources of blocks for the monitor, at a multiple of real time.
 
 A simulation is reproducible, and the identity of a block contains everything that it depends on. A restarted monitor
 therefore continues after the last block that it stored, and counts no block twice.
@@ -53,10 +53,10 @@ _simulation_lock = Lock()
 
 
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
-    """Build a simulated source for each actuator whose settings contain `simulate`.
+    """Build a source of samples for each actuator whose settings contain `simulate`.
 
-    `say`: called with a message when a simulation begins, and when its time is over. Raises InputError if the settings
-    make no experiment.
+    `say`: called with a message when a simulation begins, and when its time is over. Raises InputError if the
+    settings of an actuator do not describe a valid experiment.
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
@@ -66,7 +66,11 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 
 
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
-    """Make the experiment of an actuator; raise InputError, with its name, for wrong settings."""
+    """Build the experiment that simulates an actuator.
+
+    Raises InputError, with the actuator's name, for invalid settings, or if the experiment has more than
+    `MAX_IDENTITIES` blocks.
+    """
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
         if experiment.duration / BLOCK_S > MAX_IDENTITIES:
@@ -77,13 +81,17 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 
 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
-    """Make the source of an actuator that simulates it, and delivers its blocks in scaled real time.
+    """Build a source that simulates an actuator and delivers its samples in blocks of 1 s.
 
-    Blocks that the store already has are left out. `say`: prints messages.
+    The blocks arrive at `settings.speed` times real time; those that the monitor has already stored are left out.
+    `name`: the actuator's name; `say`: function that prints a message.
     """
 
     def play(receiver: BlockReceiver) -> None:
-        """Simulate if the store lacks any block, and deliver each missing block when its time has passed."""
+        """Simulate the actuator, and submit each block to `receiver` at the time at which a real one would arrive.
+
+        Blocks in the receiver's store are skipped; if it has all of them, nothing is simulated.
+        """
         blocks = range(math.floor(experiment.duration / BLOCK_S))
         # the store knows all blocks before some block, and none after it
         first = bisect_left(blocks, True, key=lambda number: not receiver.store.is_known(name, block_identity(number)))
@@ -105,7 +113,7 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
         say(f"{name}: the simulated time is over")
 
     def block_identity(number: int) -> str:
-        """Return the identity of a block, by which the store recognises it."""
+        """Return the text by which the store recognises a block: the experiment's key and the number of the block."""
         return f"simulated {experiment.key()} {number}"
 
     return play

@@ -36,11 +36,11 @@ EXTENSION_NAMES = {
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
 class ConstantLengths(FunctionPass):  # type: ignore[misc]
-    """Compiler pass that replaces the length of a tuple or array in an argument by a constant.
+    """Compiler pass that replaces `len` of a tuple or array of known size by a constant.
 
-    In len(p.law), `p` is an argument that is a named tuple or record, and `law` a tuple or array; the len of an
-    argument that is a tuple is replaced, too. Branches on the length are then decided before types are inferred, and an
-    absent law is not compiled.
+    It applies to `len(p)` of an argument `p` that is a tuple, and to `len(p.law)` if `p` is a named tuple or a record
+    and its field `law` a tuple or an array. A law of physics that a rig lacks has the length 0. Branches on the
+    length are thus decided before types are inferred, and the code of an absent law is not compiled.
     """
 
     _name = "sealscope_settled_laws"
@@ -49,7 +49,10 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace each len() of an argument of fixed size by a constant; return True if any was."""
+        """Replace each `len` of an argument of fixed size by a constant in the code of `state`.
+
+        Returns True if there was one.
+        """
         code, changed = state.func_ir, False
 
         def find_definition(variable: Any) -> Any:
@@ -67,7 +70,7 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return kind.typeof(source.attr) if isinstance(kind, types.Record) and source.attr in kind.fields else None
 
         def find_length(value: Any) -> int | None:
-            """Find the constant value of a call of `len`; None for other expressions or unknown lengths."""
+            """Find the value of a call of `len`; None for other expressions and for unknown lengths."""
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:
@@ -93,7 +96,7 @@ class _FullCompiler(CompilerBase):  # type: ignore[misc]
     """numba's own compiler, with `ConstantLengths` after its pass that replaces other constants."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the only pipeline."""
+        """Build the list of numba's pipelines, which has one entry: the usual passes and `ConstantLengths`."""
         pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state, "sealscope")
         pipeline.add_pass_after(ConstantLengths, RewriteSemanticConstants)
         pipeline.finalize()
@@ -104,19 +107,29 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _FullCompil
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Compile a function that Python calls; `folder` is not used."""
+    """Compile a function that Python calls, when it is first called.
+
+    `fastmath`: as for `numba.njit`; `folder` is not used, as nothing is cached here.
+    """
     return numba.njit(fastmath=fastmath, **_OPTIONS)(function)
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function for calls from other compiled functions; Python runs an `inlined` one uncompiled."""
+    """Compile a function for calls from other compiled functions.
+
+    `fastmath`: as for `numba.njit`; `inlined`: numba may insert its code in place of a call, and Python runs the
+    uncompiled function; `folder` is not used, as nothing is cached here.
+    """
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)
     return compile_kernel(function, fastmath, folder)
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Return a function that compiles `function` for calls from C and returns its address."""
+    """Build a function without arguments that compiles `function` for calls from C and returns its address.
+
+    `signature`: numba's signature of `function`; `folder` is not used, as nothing is cached here.
+    """
 
     def compile_address() -> int:
         """Compile the function and return its address."""

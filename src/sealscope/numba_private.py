@@ -1,7 +1,8 @@
 """Compile by numba's private classes: fewer passes, and a cache that treats damaged files as cache misses.
 
-Imported only for numba versions within `compiled.KNOWN_VERSIONS`; others use `numba_pipeline`. `NAMES` and `ATTRIBUTES`
-list all private names in this module, which `tests/physics/test_numba_names.py` checks.
+A law is a function that only other compiled functions call. This module is imported only for numba versions within
+`compiled.KNOWN_VERSIONS`; others use `numba_pipeline`. `NAMES` and `ATTRIBUTES` list all private names in this
+module, which `tests/physics/test_numba_names.py` checks.
 """
 
 from __future__ import annotations
@@ -78,10 +79,10 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
     """Cache of numba in which an unreadable or unwritable file is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the compiled code of a signature; None if there is none or it is damaged.
+        """Load the compiled code of a signature; None if there is none or its file is damaged.
 
-        Only numba's reference counts are set up, which loaded code needs; the rest of its set-up takes longer than
-        loading and is left to a later compilation.
+        Loaded code needs numba's reference counting, which is set up here. The rest of numba's set-up takes longer
+        than loading, and is left to the next compilation.
         """
         try:
             rtsys.initialize(target_context)
@@ -113,7 +114,7 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
     """numba's compiler with only the passes in `_PASSES`."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the only pipeline."""
+        """Build the list of numba's pipelines, which has one entry: the passes in `_PASSES`."""
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -125,7 +126,10 @@ _config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
-    """Make numba's dispatcher of a function, with a cache in `folder` unless that is None."""
+    """Build numba's dispatcher of a function, the object that compiles it when it is called.
+
+    Compiled code is cached in `folder`, unless it is None. `options`: further arguments of `numba.njit`.
+    """
     dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
     if folder is None:
         return dispatcher
@@ -144,14 +148,18 @@ def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: P
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Compile a function that Python calls, and cache it in `folder`."""
+    """Compile a function that Python calls, and cache it in `folder`; None: no cache.
+
+    `fastmath`: as for `numba.njit`.
+    """
     return _dispatcher(function, {"no_cfunc_wrapper": True, "fastmath": fastmath}, folder)
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """The code of a law for linking with kernels, without machine code, as it is never called by address.
+    """Code of a law, i.e. a function that kernels call, for linking with these, without machine code.
 
-    The law is optimised here once, not within each kernel, so that all kernels compute identical results.
+    Machine code is not needed, as a law is never called by its address. The law is optimised here once, not within
+    each kernel, so that all kernels compute identical results.
     """
 
     def _finalize_final_module(self) -> None:
@@ -160,20 +168,20 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _LawCompiler(_ShortCompiler):
-    """The compiler of laws, without machine code, which takes a fifth of the time of a kernel."""
+    """Compiler of laws, which generates no machine code and takes a fifth of the time of a kernel."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return the only pipeline."""
+        """Turn off the generation of machine code, and return the passes in `_PASSES` as the only pipeline."""
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
 
 
 class _Law(CPUDispatcher):  # type: ignore[misc]
-    """A law for other compiled functions, without the wrapper by which Python calls it.
+    """A law, i.e. a function for other compiled functions, without numba's wrapper for calls from Python.
 
-    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Called from Python, a
-    small law is run by Python; a large one is compiled a second time, as a kernel, and cached in `folder`.
+    The wrapper, which unpacks and checks each argument, takes longer to compile than the law. If Python calls a small
+    law, the uncompiled function runs; a large one is compiled a second time, as a kernel, and cached in `folder`.
     """
 
     folder: Path | None = None
@@ -186,7 +194,7 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
     @cached_property
     def _for_python(self) -> Any:
-        """The function that runs the law for calls from Python."""
+        """Function that runs when Python calls the law: uncompiled for a small law, else a kernel."""
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
@@ -196,7 +204,11 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function that other compiled functions call, `inlined` at each of its calls."""
+    """Compile a function for calls from other compiled functions.
+
+    `fastmath`: as for `numba.njit`; `inlined`: insert its code in place of each call; `folder`: cache for a large law
+    that Python calls, None without a cache.
+    """
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     options |= {} if inlined else {"_nrt": False}  # no reference counting: a law allocates nothing
@@ -206,7 +218,10 @@ def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, fold
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:
-    """Return a function that compiles `function` for calls from C and returns its address."""
+    """Build a function without arguments that compiles `function` for calls from C and returns its address.
+
+    `signature`: numba's signature of `function`; `folder`: cache for the compiled code, None without a cache.
+    """
     dispatcher = _dispatcher(function, {"no_cpython_wrapper": True}, folder)
 
     def compile_address() -> int:

@@ -12,9 +12,10 @@ WIDTH = 80
 
 
 def paragraph(text: str, head: str = "", indent: int | None = None, width: int = WIDTH) -> str:
-    """Wrap `head` and text to lines of at most `width` columns; longer words are not broken.
+    """Wrap `head` and the text after it to lines of at most `width` columns.
 
-    Lines after the first are indented by `indent` columns, by default the length of the head.
+    Lines after the first are indented by `indent` columns, by default the length of `head`. Words are not broken,
+    even if they are longer than a line.
     """
     indentation = " " * (len(head) if indent is None else indent)
     return fill(
@@ -28,9 +29,9 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
-    """Format rows (label, text) as paragraphs with labels `columns` wide.
+    """Format rows (label, text) as paragraphs, with the labels in a first column `columns` characters wide.
 
-    Rows without a text are omitted.
+    Rows without a text are omitted. `width`: longest line in characters.
     """
     return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]
 
@@ -42,9 +43,9 @@ def format_count(count: int, noun: str) -> str:
 
 
 def join_names(names: Iterable[str], most: int = 12) -> str:
-    """Join up to `most` names by commas, followed by the number of the rest.
+    """Join up to `most` names by commas, followed by the number of the others: ``a, b and 3 more``.
 
-    "none" if there are no names. Each name is cut to `WIDTH` characters.
+    Each name is cut to `WIDTH` characters. The text is "none" if there are no names.
     """
     names = list(names)
     joined = ", ".join(name if len(name) <= WIDTH else f"{name[: WIDTH - 3]}..." for name in names[:most])

@@ -1,9 +1,9 @@
 """Convert the units of files, options and figures to the SI doubles used inside, and back.
 
-A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi, so that ``234 cm^3`` is
-exactly the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``, ``m^3/rev`` is not
-``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are looked up by pint,
-which is loaded only then.
+A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi. The conversion is exact:
+``234 cm^3`` is the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``, ``m^3/rev`` is
+not ``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are looked up by
+pint, which is loaded only then.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 class Unit(NamedTuple):
     """A unit of measurement, with an exact conversion to SI.
 
-    SI value = (value + offset) * factor * pi**pi_power, in the product of `powers` of base units.
+    SI value = (value + offset) * factor * pi**pi_power. `powers`: pairs of a base unit and its exponent; their
+    product is the SI unit.
     """
 
     factor: Fraction = Fraction(1)
@@ -51,7 +52,10 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply by a power of another unit, without its offset; raise ValueError beyond a double's range."""
+        """Multiply this unit by `other` to the power `power`; the result has no offset.
+
+        Raises ValueError if the factor exceeds the range of doubles.
+        """
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MAX_BITS:
             raise ValueError
@@ -65,16 +69,19 @@ class Unit(NamedTuple):
 
 
 def _build_unit(row: Mapping[str, Any]) -> Unit:
-    """Build the Unit of a row of `units.toml`; its keys are base units with their powers, `factor`, `pi`, `offset`."""
+    """Build the Unit of a row of `units.toml`.
+
+    The keys of a row are base units with their powers, and, if needed, `factor`, `pi` (power of pi) and `offset`.
+    """
     powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
     factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
     return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Make the absolute-pressure version of a unit.
+    """Build the unit of absolute pressure for a unit of gauge pressure, such as `bara` for `bar`.
 
-    Its offset subtracts one atmosphere, as pressures are gauge.
+    All pressures inside Sealscope are gauge pressures: the offset of the unit subtracts one atmosphere.
     """
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
@@ -112,14 +119,17 @@ _MAX_BITS, _MAX_PI = 900, 100
 
 @cache
 def _registry() -> Any:
-    """Make pint's registry of units; it is cached, as this takes long."""
+    """Create pint's registry of units, which takes long and is therefore cached."""
     import pint
 
     return pint.UnitRegistry(cache_folder=None)
 
 
 def _parse_name(name: str) -> Unit:
-    """Return the unit with this name, from `units.toml` or pint; raise InputError if there is none."""
+    """Look up a single unit by its name, in `units.toml` and then in pint.
+
+    Raises InputError for an unknown name, and for a unit of pint that is not proportional to an SI unit.
+    """
     unit_of_table = _ATOMS.get(_SPELLINGS.get(name, name))
     if unit_of_table is not None:
         return unit_of_table
@@ -139,7 +149,10 @@ def _parse_name(name: str) -> Unit:
 
 
 def _tokenize(text: str) -> list[str]:
-    """Split a product of units into names, powers (^2), brackets and slashes; raise ValueError for other text."""
+    """Split the text of a unit into names, powers such as `^2`, brackets and slashes.
+
+    Raises ValueError for other text.
+    """
     tokens, position = [], 0
     while position < len(text):
         match = _TOKEN.match(text, position)
@@ -185,7 +198,7 @@ def _parse_product(tokens: list[str]) -> Unit:
 
 
 def _parse_marked_pressure(text: str) -> Unit | None:
-    """Parse the unit of a pressure marked as absolute or gauge; None for other texts."""
+    """Parse a unit of pressure marked as absolute or gauge, such as `bar abs` or `MPa(g)`; None for other texts."""
     match = _MARKED.fullmatch(text)
     if match is None:
         return None
@@ -200,7 +213,7 @@ def _parse_marked_pressure(text: str) -> Unit | None:
 
 @lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
-    """Parse the unit in `text`; raise InputError if it is none."""
+    """Parse the text of a unit, such as `L/min`, `m^3/(s Pa)` or `bar abs`; raise InputError if it is none."""
     text = text.strip()
     text = _SPELLINGS.get(text, text)
     if text in _ATOMS:
@@ -224,7 +237,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def _describe_dimension(si_unit: str) -> str:
-    """Describe the valid units of a dimension in a message: `a unit of pressure, such as Pa`."""
+    """Describe the units that have the dimension of `si_unit`, for a message: `a unit of pressure, such as Pa`."""
     if parse_unit(si_unit).powers == ():
         return "no unit, or %"
     return f"a unit of {_KINDS[si_unit]}, such as {si_unit}" if si_unit in _KINDS else f"a unit such as {si_unit}"
@@ -241,7 +254,7 @@ def same_dimension(unit: str, other: str) -> bool:
 def is_familiar(unit: str) -> bool:
     """Test whether a unit consists of units known without pint, such as `bar`, `psig` and `cm3/s`.
 
-    Many of pint's thousands of names are ordinary words, such as `rod`, which is 5 m.
+    Pint knows thousands of names, many of them ordinary words, such as `rod`, which is 5 m.
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
@@ -250,9 +263,10 @@ def is_familiar(unit: str) -> bool:
 
 @lru_cache(maxsize=1024)
 def _conversion(unit: str, si_unit: str) -> _Conversion:
-    """Compute the exact conversion between two units: (factor, power of pi, two offsets).
+    """Compute the exact conversion between two units: (factor, power of pi, first offset, second offset).
 
-    Target value = (value + first offset) * factor * pi**power - second offset.
+    Target value = (value + first offset) * factor * pi**power - second offset. Raises InputError if the dimensions
+    differ.
     """
     source, target = parse_unit(unit), parse_unit(si_unit)
     if source.powers != target.powers:
@@ -261,7 +275,10 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the conversion to `si_unit`; the InputError names `name`, the expected dimension and `place`."""
+    """Compute the conversion from `unit` to `si_unit` as `_conversion` does, with a complete error message.
+
+    The InputError states `name`, the expected dimension and, if it is not None, the file or option `place`.
+    """
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
@@ -270,7 +287,10 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
 
 
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
-    """Convert one number exactly and round it once; infinite if it exceeds the range of doubles."""
+    """Convert one number exactly and round it once; infinite if it exceeds the range of doubles.
+
+    `conversion`: as from `_conversion`.
+    """
     factor, pi_power, offset_before, offset_after = conversion
     exact = (value + offset_before) * factor
     try:
@@ -291,7 +311,7 @@ def to_si(
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
     One number is converted exactly and rounded once, an array to within 2 units in the last place. Raises InputError
-    for a unit of another dimension; it names `name`, the unit, the expected dimension and the file `place`.
+    for a unit of another dimension; the message states `name`, the unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:
@@ -330,10 +350,11 @@ def from_si(
 def parse_quantity(
     value: float | str, si_unit: str, *, name: str = "value", place: str | None = None, finite: bool = True
 ) -> float:
-    """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` (already SI) to a number in `si_unit`.
+    """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` to a number in `si_unit`.
 
-    A number is in SI. Raises InputError if there is no number, for another dimension and, if `finite`, for an infinite
-    number or NaN.
+    A number, and a text without a unit, are in `si_unit` already. Raises InputError if the text begins with no
+    number, for a unit of another dimension and, if `finite`, for an infinite number or NaN. The message states `name`
+    and the file or option `place`.
     """
     where = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""

@@ -1,1 +1,1 @@
-"""Campaigns: a plan of many simulated records or recordings, judged by several detectors, kept on disk, resumable."""
+"""Campaigns: many simulated or real recordings, planned in a file and judged by several detectors; resumable."""

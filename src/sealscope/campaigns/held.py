@@ -1,14 +1,17 @@
-"""Plan a locked hold: how small a piston leak shows while valves shut the cylinder from its pump.
+"""Plan a locked hold: the smallest piston leak that is found while valves shut the cylinder off from its pump.
 
-A cylinder is pressed against a stop and shut in; a leak past its piston brings the pressures together,
+The cylinder is pressed against a stop and its valves are shut. A leak past the piston then brings the two pressures
+together,
 
     d(p_A - p_B)/dt = -G (1/V_A + 1/V_B) K (p_A - p_B),
 
-with the volumes V of oil of bulk modulus K. Such holds are drawn with the noise of the rig's sensors and judged as
-those of a recording (`HeldChambers`), against as many tight ones as a machine is usually commissioned with
-(`held_rise`). The smallest leak is the one that is detected in the wanted fraction of the holds.
+with the leak's conductance G and the volumes V of oil of bulk modulus K. Such holds are simulated with the noise of
+the rig's sensors and judged like those of a recording (`HeldChambers`, `held_rise`), against as many leak-free holds
+as a machine is usually commissioned with. The smallest leak is the one that is detected in the wanted fraction of the
+holds.
 
-A hold separates the piston from the pump, which is shut off, and from a rod seal, which lowers one pressure alone.
+A hold distinguishes a leak past the piston from one of the pump, which is shut off, and from one of a rod seal, which
+lowers one pressure alone.
 """
 
 from __future__ import annotations
@@ -31,23 +34,24 @@ from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
-#: Durations that are tried [s], and the one that is planned if no leak to detect is stated.
+#: Durations that are tried [s], and the duration that is planned if no leak to detect is stated.
 HOLD_DURATIONS, DEFAULT_DURATION = (3.0, 10.0, 30.0, 60.0, 120.0), 30.0
-#: Number of healthy days that a hold is compared with.
+#: Number of healthy days, with a hold each, with which a hold is compared.
 N_HEALTHY = 5
 #: Length of the recording before the valves shut [s].
 BEFORE = 1.0
-#: Number of drawn holds with a leak, and bisections of its conductance.
+#: Number of simulated holds with a leak, and of bisections of its conductance.
 _N_DRAWS, _N_BISECTIONS = 5, 8
-#: Smallest and largest conductance that are tried, by the fraction of p_A - p_B that is gone by the end of the hold.
+#: Smallest and largest conductance that are tried, given as conductance times duration times
+#: `_decay_per_conductance`: the logarithm of the factor by which p_A - p_B falls during the hold.
 _TRIED_LOSSES = (1e-4, 10.0)
 
 
 class PlannedHold(NamedTuple):
-    """A locked hold and the smallest leak past the piston that it finds.
+    """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
-    `duration` [s]; absolute pressures of both sides, `pressure_A` and `pressure_B` [Pa]; `conductance` of the smallest
-    leak [m^3/(s Pa)].
+    `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures of the chambers at its
+    beginning; `conductance` [m^3/(s Pa)]: that of the smallest leak found, inf if none is found.
     """
 
     duration: float
@@ -57,7 +61,7 @@ class PlannedHold(NamedTuple):
 
     @property
     def difference(self) -> float:
-        """Pressure difference across the piston [Pa]."""
+        """Pressure difference across the piston at the beginning of the hold [Pa]."""
         return self.pressure_A - self.pressure_B
 
     def as_dict(self) -> dict[str, Any]:
@@ -72,7 +76,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self, stated_pressure: float) -> str:
-        """Format the hold as lines of text, with flows at the pressure difference `stated_pressure` [Pa]."""
+        """Format the hold as lines of text, with the leak as a flow at the pressure `stated_pressure` [Pa]."""
         flow = self.conductance * stated_pressure / LITRE_PER_MINUTE
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
@@ -84,7 +88,7 @@ class PlannedHold(NamedTuple):
 
 
 def has_shut_off(rig: Rig) -> bool:
-    """Return True if a rig states valves that shut the cylinder from its pump."""
+    """Return True if a rig's parameters state, not only assume, valves that shut the cylinder off from its pump."""
     sources = [rig.entry(name).source for name in ("line.open_A", "line.open_B")]
     return rig.line.orifices == "present" and not any(source.startswith(("absent", "assumed")) for source in sources)
 
@@ -94,9 +98,10 @@ def plan_hold(
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
-    Plans the longest of `HOLD_DURATIONS` if none detects it, and a hold of `DEFAULT_DURATION` if `find` is None.
-    `flow`: mean flow of the pump under the usual duty [m^3/s]; `false_alarm`, `detection`: probabilities of the verdict
-    `leak` without a leak, and with it. Raises InputError unless the load is > 0.
+    In a locked hold, valves shut the cylinder off from its pump. If none of `HOLD_DURATIONS` suffices, the longest is
+    planned; if `find` is None, a hold of `DEFAULT_DURATION` is. `flow` [m^3/s]: mean flow of the pump under the usual
+    duty; `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of this verdict
+    with the leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -107,17 +112,17 @@ def plan_hold(
 
 
 class _HoldDraws:
-    """Simulations of holds of one `duration` [s], to find their smallest detectable leak.
+    """Simulated locked holds of one duration, by which the smallest leak that they detect is found.
 
-    Other arguments as for `plan_hold`.
+    `duration` [s]; the other arguments are those of `plan_hold`.
     """
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Plan the hold, and set the limits on false alarms and missed leaks.
+        """Set the pressures of the hold, and the limits on false alarms and missed leaks.
 
-        Side B is at the charge pressure, side A above it by the load.
+        Chamber B is at the charge pressure; chamber A is higher by the load over its piston area.
         """
         pressure_B = rig.fluid.p_charge + P_ATM
         self._rig, self._flow = rig, flow
@@ -128,11 +133,11 @@ class _HoldDraws:
 
     @cached_property
     def _healthy(self) -> list[RecordingSums]:
-        """The sums of `N_HEALTHY` holds without a leak."""
+        """The results of `N_HEALTHY` simulated holds without a leak, with which other holds are compared."""
         return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
-        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the wanted fraction of simulated holds."""
+        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the wanted fraction of the holds."""
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
@@ -142,7 +147,10 @@ class _HoldDraws:
         return True
 
     def with_smallest_leak(self) -> PlannedHold:
-        """Bisect for the smallest conductance that the hold detects; return the hold with it, or with inf for none."""
+        """Find the smallest conductance that the hold detects by bisection; return the hold with that conductance.
+
+        The conductance is inf if the hold detects no leak that is tried (`_TRIED_LOSSES`).
+        """
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
         if not self.detects(float(np.exp(high))):
@@ -154,16 +162,20 @@ class _HoldDraws:
 
 
 def _decay_per_conductance(rig: Rig) -> float:
-    """Compute the rate at which p_A - p_B decays per unit of conductance [Pa/m^3], for a cylinder at mid-stroke."""
+    """Compute the decay rate of p_A - p_B [1/s] per unit of leak conductance, in Pa/m^3, for a piston at mid-stroke.
+
+    It is K (1/V_A + 1/V_B), with the dead volumes included in V.
+    """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
     length = cylinder.L * (0.5 + oil.dead)
     return float((1.0 / cylinder.A_A + 1.0 / cylinder.A_B) / (length * oil.compressibility))
 
 
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
-    """Simulate a hold with a leak past the piston and sensor noise; return its sums as those of a recording.
+    """Simulate a locked hold with a leak past the piston and with sensor noise; judge it like a hold of a recording.
 
-    `conductance` [m^3/(s Pa)]; `flow`: mean flow of the pump under the usual duty [m^3/s].
+    `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty; `seed`: of
+    the noise. Returns the sums that a recording would have, of which only the leak measured in the hold is set.
     """
     random, cylinder, sensors = np.random.default_rng(seed), rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE

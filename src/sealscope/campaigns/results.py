@@ -1,4 +1,4 @@
-"""Judge a campaign's rows, from its folder or from recordings, and write the tables of its result."""
+"""Judge a campaign, from the stored rows of its simulated records or from recordings, and write its result tables."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and its results.
 
-    `missing`: number of the plan's records without a row; `mode`: mode in which a simulated campaign was run, "" for
-    recordings; `known`: detector -> the information it was given.
+    `rows`: result of each record; `missing`: number of the plan's records that have not been run; `judgement`:
+    statistics of the verdicts; `mode`: how a simulated campaign was run, run by run or in batches, "" for recordings;
+    `known`: by detector, the information that it was given.
     """
 
     plan: AnyPlan
@@ -34,10 +35,11 @@ class CampaignResult:
 
 
 def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
-    """Collect the information that a plan gives to each of its detectors.
+    """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
-    Scorers that compare two parts of a record know the true onset of simulated records, which are split there;
-    recordings are split in the middle. Detectors that are no scorers assume the plan's rig.
+    A scorer, which computes a score but no verdict, may compare two parts of a record. It then knows the true onset
+    of simulated records, where they are split; recordings are split in the middle. All other detectors assume the
+    plan's rig.
     """
     is_simulated = isinstance(plan, SimulatedPlan)
     rig = "" if plan.assumed is None else plan.assumed.name
@@ -58,7 +60,10 @@ def _judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
-    """Judge rows with the detectors and probabilities of a plan."""
+    """Judge the rows of a campaign with the detectors and probabilities of its plan.
+
+    `onset_s` [s]: true onset of the leaks; `hours`: operating time of a record; None if they are not known.
+    """
     return judge(
         rows,
         plan.detectors,
@@ -71,7 +76,10 @@ def _judge(
 
 
 def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResult:
-    """Judge the rows of a simulated campaign; raise InputError if there are too few to judge or to set thresholds."""
+    """Judge a simulated campaign from the rows in its folder.
+
+    Raises InputError if there are too few rows to judge or to set thresholds.
+    """
     rows = tuple(store.read_plan_rows(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
@@ -84,13 +92,16 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
 def judge_recorded_campaign(
     plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None
 ) -> CampaignResult:
-    """Judge the recordings in a folder by a plan."""
+    """Judge the recordings in a folder with the detectors of a plan.
+
+    `progress`: called after each recording with the numbers of recordings done, of all, and of failed ones.
+    """
     rows = judge_recordings(plan, folder, progress)
     return CampaignResult(plan, tuple(rows), missing=0, judgement=_judge(plan, rows), known=prior_knowledge(plan))
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:
-    """Write the tables of a result into the folder; return the files."""
+    """Write the tables of a campaign's result as CSV files into a folder; return the paths of the files."""
     make_folder(folder)
     unit = result.plan.unit
     tables = build_tables(result.judgement, unit, result.known, getattr(result.plan, "part", ""))

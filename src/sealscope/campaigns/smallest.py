@@ -1,14 +1,15 @@
 """Plan a recording: the command, load and duration with which `diagnose` detects a leak of a given size on a rig.
 
-Leak-free recordings of the rig and its instruments are simulated under each duty. The smallest step of the leak's
-conductance that is detected with the probability `detection` follows from the test that `diagnose` uses
-(`StepTest.detectable_step`),
+Leak-free recordings of the rig and its instruments are simulated under each duty, that is under each combination of a
+command and a load. The smallest step of the leak's conductance that is detected with the probability `detection`
+follows from the test that `diagnose` uses (`StepTest.detectable_step`),
 
     detectable step = (threshold^(1/2) + z_detection) s,
 
-with s the standard error of a step at the median onset, and the threshold of the likelihood ratio at the false-alarm
-probability. Duties are compared by the conductance of the leak; flows are stated at the mean pressure of the usual
-duty. The step that can be separated from one of the pump's leakage follows from the Fisher information of both.
+with the standard error s of a step at the median onset, and the threshold of the likelihood ratio at the false-alarm
+probability. Duties are compared by the conductance of the leak; flows are stated at the mean pressure difference of
+the usual duty. The smallest step that can be told from a step of the pump's leakage follows from the Fisher
+information of both steps.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """A voltage command and a load as texts, such as '3 sin(4t)' [V] and '2 kN'; "" for no load."""
+    """The duty of a planned recording: its voltage command and its load.
+
+    Both are texts, such as '3 sin(4t)', in volts, and '2 kN'; "" means no load.
+    """
 
     command: str
     load: str = ""
@@ -59,11 +63,12 @@ USUAL = PlannedDuty(COMMANDS[0])
 
 
 class DetectableLeak(NamedTuple):
-    """The smallest leaks that recordings of a duty and a `duration` [s] detect.
+    """The smallest leaks that recordings of one duty and of one duration detect.
 
-    `conductance`: smallest detectable step of the leak, `separable`: smallest step that is also separable from a step
-    of the pump's leakage, both [m^3/(s Pa)], infinite if there is none; `pressure`: mean |p_A - p_B| [Pa]; `note`:
-    reason for missing numbers; `flow`: mean flow of the pump [m^3/s].
+    `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step of the leak that is detected, inf if there is none;
+    `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's leakage, inf if there is
+    none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the numbers could not be computed, else ""; `flow`
+    [m^3/s]: mean flow of the pump.
     """
 
     duty: PlannedDuty
@@ -76,12 +81,13 @@ class DetectableLeak(NamedTuple):
 
 
 class RecordingPlan(NamedTuple):
-    """The planned recording, and the duties that were compared.
+    """A planned recording, and the duties (commands and loads) that were compared for it.
 
-    `target`: conductance to detect [m^3/(s Pa)], None to detect the smallest; `for_detection`: the shortest recording
-    that detects it, or the best that was tried; `for_separation`: the same for separating it from the pump's leakage;
-    `usual_pressure`: mean pressure difference of the usual duty [Pa], at which flows are stated; `hold`: the locked
-    hold for the target, None if no valve shuts the cylinder in.
+    `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible; `for_detection`:
+    the shortest recording that detects it, or the best that was tried; `for_separation`: the shortest recording that
+    also tells it from a leak of the pump, or the best that was tried; `compared`: results of all duties;
+    `usual_pressure` [Pa]: mean pressure difference of the usual duty, at which flows are stated; `false_alarm`,
+    `detection`: the wanted probabilities; `hold`: the locked hold that detects the target, None if none was planned.
     """
 
     rig: str
@@ -100,7 +106,7 @@ class RecordingPlan(NamedTuple):
         return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Convert a conductance to the flow at the usual pressure [L/min]; return None if it is not finite."""
+        """Convert a conductance [m^3/(s Pa)] to the flow at the usual pressure [L/min]; return None for inf."""
         return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
 
     def as_dict(self) -> dict[str, Any]:
@@ -163,9 +169,9 @@ class RecordingPlan(NamedTuple):
 
 
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Build the leak-free experiment of a duty, with the piston's sweep centred in the stroke.
+    """Build the leak-free experiment of a duty; the piston starts where its motion is centred in the stroke.
 
-    Raises InputError if the duty's command is no voltage.
+    `duration` [s]. Raises InputError if the duty's command is a target of the position and not a voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -178,7 +184,12 @@ def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0)
 def detectable_leak(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
 ) -> DetectableLeak:
-    """Compute the smallest leak detected in recordings of a duty of `duration` [s]; a failure gives inf and a note."""
+    """Compute the smallest leak that is detected in recordings of a duty and of `duration` [s].
+
+    The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
+    leak; `detection`: probability of an alarm with it. If a simulation or its balance fails, the smallest leak is
+    inf, with the reason in `note`.
+    """
     steps = []
     try:
         for seed in range(N_RECORDS):
@@ -191,9 +202,10 @@ def detectable_leak(
 
 
 class _DetectableSteps(NamedTuple):
-    """Smallest steps [m^3/(s Pa)] of the leak in a recording, with its mean |p_A - p_B| [Pa] and pump flow [m^3/s].
+    """The smallest steps of the leak that are detected in one recording.
 
-    `step`: detectable; `separable`: also separable from a step of the pump's leakage.
+    `step` [m^3/(s Pa)]: smallest step that is detected; `separable` [m^3/(s Pa)]: smallest step that can also be told
+    from a step of the pump's leakage; `pressure` [Pa]: mean |p_A - p_B|; `flow` [m^3/s]: mean flow of the pump.
     """
 
     step: float
@@ -203,7 +215,11 @@ class _DetectableSteps(NamedTuple):
 
 
 def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> _DetectableSteps:
-    """Compute the smallest detectable steps of the leak from a leak-free recording."""
+    """Compute the smallest steps of the leak that would be detected, from a leak-free recording.
+
+    `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it. Raises
+    InputError if the volume balance cannot be computed from the recording.
+    """
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
         raise InputError(f"no balance: {reason}")
@@ -220,9 +236,10 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 
 
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Compute the ratio of the leak step's standard errors with an unknown and with no step of the pump.
+    """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    Both steps are at mid-record. Infinite if the balance has no term of the pump, or the two steps cannot be separated.
+    Both steps are in the middle of the recording. The factor is inf if the balance has no term for the pump's
+    leakage, or if the two steps cannot be told apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:
@@ -249,11 +266,14 @@ def plan_recording(
     held: float | None = None,
     progress: Callable[[str, float], None] = lambda label, fraction: None,
 ) -> RecordingPlan:
-    """Find the shortest recording that detects a leak of `find` [m^3/s] at the pressure of the usual duty.
+    """Find the shortest recording that detects a leak of `find` [m^3/s] at the mean pressure of the usual duty.
 
-    If `find` is None, plan the recording of `COMPARISON_SECONDS` that detects the smallest leak. `held`: force [N] that
-    the cylinder holds with its valves shut; None: the largest of `LOADS`, if the rig has such valves. Raises
-    InputError if the usual duty cannot be simulated or judged.
+    If `find` is None, the recording of `COMPARISON_SECONDS` that detects the smallest leak is planned. `usual`: the
+    machine's usual duty; `duties`: others to try, by default all combinations of `COMMANDS` and `LOADS`;
+    `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it; `held` [N]:
+    force that the cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if the rig
+    has such valves; `progress`: called with a label and the completed fraction. Raises InputError if the usual duty
+    cannot be simulated or judged.
     """
     choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]

@@ -1,4 +1,4 @@
-"""The command line, which only translates arguments to calls."""
+"""The command line of Sealscope, which only translates the words of a call to function calls."""
 
 from __future__ import annotations
 
@@ -73,7 +73,11 @@ def _root(
 
 
 def normalise_arguments(words: Sequence[str]) -> list[str]:
-    """Rearrange the arguments of a call for typer, with `-v` first and an option for each baseline."""
+    """Rearrange the words of a call to the form that typer understands.
+
+    `-v` comes first, wherever it stood; each baseline gets an option `--baseline` of its own; and `monitor FILE`
+    becomes `monitor run FILE`.
+    """
     end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
     other_words = [word for word in words[:end] if word not in ("-v", "--verbose")] + list(words[end:])
@@ -83,10 +87,11 @@ def normalise_arguments(words: Sequence[str]) -> list[str]:
 
 
 def spread_baselines(words: Sequence[str]) -> list[str]:
-    """Repeat `--baseline` before each of its files, to allow wildcards in `FILE... --baseline FILE...`.
+    """Repeat the option `--baseline` before each of the files after it, as typer requires.
 
-    All words after `--baseline` up to the next option are its files. If that would leave no FILE, only the first
-    word is one.
+    In this way `--baseline FILE...` accepts wildcards. All words after `--baseline` up to the next option are
+    baselines. If no other FILE would be left, only the first word after `--baseline` is a baseline, and the others
+    are the files to diagnose. Raises InputError if no file follows `--baseline`.
     """
     if "--baseline" not in words or words[0] not in ("diagnose", "report"):
         return list(words)
@@ -114,14 +119,14 @@ def spread_baselines(words: Sequence[str]) -> list[str]:
 
 @cache
 def _click_command() -> Any:
-    """Return the click command of the app."""
+    """Build the click command of the app, once."""
     return typer.main.get_command(app)
 
 
 def main() -> None:
-    """Run the command line.
+    """Run the command line, and end the process with an exit status.
 
-    An error that the caller can act on is printed as one line on standard error, with an exit status and no traceback.
+    An error that the caller can act on is printed as one line on standard error, without a traceback.
     """
     # some versions of typer contain a copy of click: take the exception of the module in which BadParameter is defined
     wrong_call: type[Any] = sys.modules[typer.BadParameter.__module__].ClickException
@@ -158,7 +163,10 @@ def main() -> None:
 
 @contextmanager
 def _repeating_lost_interrupts() -> Iterator[None]:
-    """Repeat an interrupt that Python ignored, for example in a finalizer of the compiler."""
+    """Send an interrupt again if Python ignored it, for example in a finalizer of the compiler.
+
+    Valid within the `with` block.
+    """
     original_hook = sys.unraisablehook
 
     def repeat_interrupt(unraisable: Any) -> None:

@@ -107,7 +107,7 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Return the folder of a campaign: `stated`, or the default one for None.
+    """Choose the folder of a campaign: `stated`, or by default `sealscope-campaigns/NAME`.
 
     Raises InputError if the default folder is a link.
     """
@@ -134,15 +134,18 @@ def _format_progress(state: CampaignProgress) -> str:
 
 @contextmanager
 def _show_progress() -> Iterator[ProgressCallback]:
-    """Show the progress of a campaign on standard error; yield a function of (done, total, failed) records."""
+    """Show the progress of a campaign on standard error; yield a function that updates it.
+
+    The function takes the numbers of records that are done, planned and failed.
+    """
     with opt.counted_progress("records") as update:
         yield lambda done, total, failures: update(done, total, f"{failures} failed" if failures else "")
 
 
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
-    """Write the tables and the page of a campaign, and print its main table.
+    """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
 
-    Returns the number of failed records.
+    `data`: folder of the recordings for a plan over recordings, else None.
     """
     from sealscope.campaigns.results import write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
@@ -158,9 +161,10 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 
 
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Judge a simulated plan by the rows in its folder, others by the recordings in the folder `data`.
+    """Judge the records of a campaign.
 
-    Raises InputError if the recordings are needed and `data` is None or no folder.
+    A simulated plan is judged by the rows stored in `folder`, others by the recordings in the folder `data`. Raises
+    InputError if the recordings are needed and `data` is None or no folder.
     """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign

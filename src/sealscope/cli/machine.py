@@ -61,7 +61,7 @@ def commission(
         paths = recordings_in(files)
 
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the files to the healthy recordings, and forget those before the repair."""
+            """Add the files to the healthy recordings of a machine; after a repair, forget those before it."""
             if repair is not None:
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
@@ -82,7 +82,7 @@ def commission(
 
 
 def _parse_date(text: str) -> float:
-    """Parse the date of `--since` to seconds since 1970, as UTC unless it states a time zone."""
+    """Parse the date of `--since` to seconds since 1970; it is in UTC unless it states a time zone."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:

@@ -103,7 +103,10 @@ def dashboard(file: FileOption = Path("grafana.json")) -> None:
 
 
 def _serve(file: Path, *, once: bool = False) -> None:
-    """Run the service with a file of settings until it ends or receives SIGTERM or SIGINT."""
+    """Run the monitor with a file of settings until it has finished, or receives SIGTERM or SIGINT.
+
+    `once`: finish when standard input and folders contain nothing new.
+    """
     from sealscope.monitor.service import Service
     from sealscope.monitor.settings import read_settings
 

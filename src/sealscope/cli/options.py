@@ -1,4 +1,4 @@
-"""Options and functions that several commands share."""
+"""Options that several commands share, and the functions that build, print and write for them."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ _log = logging.getLogger(__name__)
 
 
 def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Build the function that completes a name in the shell from `names`."""
+    """Build a function for the shell that completes a partly typed name; `names`: function that returns all names."""
 
     def complete(incomplete: str) -> list[str]:
-        """List the names that begin with the typed text; typer requires the parameter's name."""
+        """List the names that begin with the typed text; typer requires the name `incomplete`."""
         return [name for name in names() if name.startswith(incomplete)]
 
     return complete
@@ -57,7 +57,10 @@ def _rig_names() -> Sequence[str]:
 
 
 def _override_names() -> list[str]:
-    """List parameters for completion as `NAME=`: full names, and symbols that belong to only one parameter."""
+    """List the parameters of a rig for completion, as `NAME=`.
+
+    The list has the dotted names, and the symbols that belong to only one parameter.
+    """
     from sealscope.parameters import declared_names
 
     names = declared_names()
@@ -69,7 +72,7 @@ complete_rigs = make_completion(_rig_names)
 
 
 def declared_option(name: str, *, option: str = "", several: bool = False, **settings: Any) -> Any:
-    """Build the command-line option for an argument of `Experiment.of`, with the help text declared there.
+    """Build the command-line option for an argument of `Experiment.of`, with the help text that is declared there.
 
     `name`: the argument; `option`: the flag, by default made from the name; `several`: the option may be repeated;
     `settings`: further arguments of `typer.Option`.
@@ -133,11 +136,12 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """The machine that the options of a call describe.
+    """The machine that the options of a call describe, and how its files are read.
 
-    `commissioned`: the machine of `--machine`, which determines everything else; None without this option.
-    `channel_map` and `rate`: column choice and sampling rate [Hz] with which files are read. `rig`, `limit` and
-    `baseline`: None or () if not given.
+    `commissioned`: the machine of the option `--machine`, which determines everything else; None without this option.
+    `channel_map`, `rate`: choice of columns and sampling rate [Hz] for reading files. `rig`: what is known or assumed
+    of the machine; `limit`: leak to be repaired, as text; `baseline`: leak-free recordings. These are None or () if
+    not given.
     """
 
     commissioned: CommissionedMachine | None = None
@@ -159,9 +163,9 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Build the machine from the options of a call.
+        """Build the machine from the options of a call, whose types define the help texts.
 
-        Raises InputError for an invalid option, and for one that `--machine` excludes.
+        Raises InputError for an invalid option, and for one that must not stand beside `--machine`.
         """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
@@ -187,18 +191,19 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """The channel map in the rig's file, unless `--map` replaces it."""
+        """Channel map in the rig's file; empty if there is none, or if `--map` replaces it."""
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
     def has_map(self) -> bool:
-        """True if the call or its rig states a channel map."""
+        """True if the options of the call, or the file of its rig, state a channel map."""
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
-        """Read the recording in a file, or on standard input for `-`.
+        """Read the recording in a file, or on standard input for the file `-`.
 
-        The channel map of the rig applies only to files that have its columns.
+        The channel map of the rig is applied only to files that have its columns. Raises UnreadableFile for a folder
+        or an unreadable file.
         """
         if self.commissioned is not None:
             return self.commissioned.read(file)
@@ -217,7 +222,7 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read a file with the channel map of the call or the rig."""
+        """Read a file with the channel map of the call, or else of the rig."""
         if not self._rig_map:
             from sealscope.recordings import read
 
@@ -229,7 +234,8 @@ class StatedMachine:
     def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
 
-        `joined`: yield the first file with the recording of all files joined, or with None if one is unreadable.
+        `joined`: the files are parts of one recording. Only the first file is then yielded, with the whole recording,
+        or with None if a part is unreadable.
         """
         recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
         if not joined:
@@ -246,7 +252,7 @@ class StatedMachine:
         """Diagnose a recording of this machine.
 
         `baseline`: healthy recordings, or empty; `file`: name of the recording in the diagnosis; `false_alarm`:
-        probability.
+        probability of the verdict `leak` on a leak-free recording.
         """
         from dataclasses import replace
 
@@ -261,16 +267,16 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `stated` of a command by the options of a machine.
+    """Build a decorator for a command, which replaces its parameter `stated` by options that describe a machine.
 
-    `names`: the options to offer; by default all of them.
+    `names`: parameters of `StatedMachine.of` that become options; by default all of them.
     """
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
 
 def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameter `experiment` by an option for each argument of `Experiment.of`."""
+    """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`."""
     special_options = {
         "rig": RigOption,
         "set": SetOption,
@@ -291,7 +297,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
 
 
 def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
-    """Build the experiment of a call from its options."""
+    """Build the experiment of a call from its options; `set`: overrides; `arguments`: those of `Experiment.of`."""
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(rig=load_rig_with(rig, set), **arguments)
@@ -300,9 +306,9 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `name` of a command by `options`.
+    """Build a decorator for a command, which replaces its parameter `name` by `options`.
 
-    `make` builds the parameter's value from the options.
+    `make`: function that builds the value of the parameter from the values of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -312,7 +318,7 @@ def _replace_parameter(
 
         @wraps(command)
         def call(**arguments: Any) -> None:
-            """Call the command with the value built from the options."""
+            """Build the value of the parameter from the options, and call the command with it."""
             value = make(**{option.name: arguments.pop(option.name) for option in options})
             command(**{name: value}, **arguments)
 
@@ -327,7 +333,10 @@ def _replace_parameter(
 
 
 def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Build the rig of `--rig` with the values of `--area` and `--displacement`; None without these options."""
+    """Build the rig named by `--rig`, with the values of `--area` and `--displacement`; None without these options.
+
+    Without `--rig`, values that are not stated are assumed. Raises InputError for an invalid option.
+    """
     from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
@@ -346,7 +355,7 @@ def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacemen
 
 
 def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """Load a rig by name or file, with the values of `--set`."""
+    """Load a rig by its name or file, and replace the values that `--set` states."""
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
@@ -354,9 +363,10 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 
 
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
-    """Parse the `--map` options to channel -> column; raise InputError for a channel that is given twice.
+    """Parse the `--map` options to a channel map: channel -> column.
 
-    With `auto` the remaining channels are found by the names of the columns.
+    With `auto` the remaining channels are found by the names of the columns. Raises InputError for a channel that is
+    given twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
@@ -381,7 +391,10 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print a paragraph on standard output, wrapped at 80 columns and indented after `head`."""
+    """Print a paragraph on standard output, `head` and the text, wrapped at 80 columns.
+
+    Lines after the first are indented by the length of `head`, or by 2 without it.
+    """
     say(paragraph(text, head, len(head) or 2))
 
 
@@ -391,9 +404,9 @@ def complain(message: object) -> None:
 
 
 def attempt(file: Path, work: Callable[[], T]) -> T | None:
-    """Return the result of `work`; if it fails, print a message on standard error and return None.
+    """Return the result of `work`, or print a message on standard error and return None if it fails.
 
-    `file`: the file that `work` handles, for the message. The command can then go on with other files.
+    The command can then go on with other files. `file`: the file on which it works, for the message.
     """
     try:
         return work()
@@ -408,9 +421,9 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 
 
 def check_folder(file: Path) -> None:
-    """Check before a long run that the folder of a file to write exists; raise InputError otherwise.
+    """Check before a long run that the folder of the file to write exists; raise InputError otherwise.
 
-    Also removes the temporary files that killed calls left for this file.
+    Temporary files that calls left when they were killed while writing this file are removed.
     """
     from sealscope.storage import atomic
 
@@ -419,7 +432,7 @@ def check_folder(file: Path) -> None:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a text file atomically."""
+    """Write a text file atomically: whole or not at all."""
     from sealscope.storage.atomic import atomic_write
 
     with atomic_write(file) as temporary:
@@ -428,7 +441,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Warn on standard error if fewer processes are started than `--jobs` asks for."""
+    """Warn on standard error if fewer processes will be started than `--jobs` asks for."""
     from sealscope.campaigns.execution.workers import process_count
 
     if jobs is not None and jobs > (n_processes := process_count(jobs)):
@@ -437,10 +450,10 @@ def say_jobs(jobs: int | None) -> None:
 
 @contextmanager
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
-    """Show progress bars on standard error until the block ends; yield a function of (task, fraction).
+    """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    `noun`: the things that are counted, to show a single bar; by default there is one bar for each task. If standard
-    error is no terminal, a line is printed once a minute with `noun`, and nothing without it.
+    `noun`: name of the things that are counted, for a single bar; by default each task has a bar. If standard error
+    is no terminal, a line is printed once a minute if `noun` is given, and else nothing.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -454,7 +467,7 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
         tasks: dict[str, Any] = {}
 
         def update(task: str, fraction: float) -> None:
-            """Show the bar of a task, or the only bar, at a fraction of its length."""
+            """Set the bar of a task, or the only bar, to a fraction of its length."""
             key = noun or task
             if key not in tasks:
                 tasks[key] = bar.add_task(task, total=1.0)
@@ -484,7 +497,10 @@ def _minute_reporter() -> Callable[[str, float], None]:
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show `noun` done and time left on standard error; yield a function of (done, total, note)."""
+    """Show how many things are done and the time left, on standard error; yield a function of (done, total, note).
+
+    `noun`: name of the things, in the plural.
+    """
     with progress(noun) as show:
         yield lambda done, total, note: show(
             f"{done} of {total} {noun}{', ' if note else ''}{note}", done / max(total, 1)
@@ -492,7 +508,7 @@ def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration [s] in hours, minutes or seconds."""
+    """Format a duration [s] in hours, minutes or seconds, whichever suits it."""
     if seconds > 5400:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

@@ -101,11 +101,10 @@ def diagnose(
 def _diagnose_in_parallel(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
-    """Diagnose each file in one of several processes.
+    """Diagnose each file in one of several processes; yield (messages for standard error, diagnoses) of each file.
 
-    Yields (messages for standard error, diagnoses) of each file. On one core, all files are diagnosed in this process
-    and a single pair is yielded. `work`: function that yields the dated diagnoses of some files, with None for an
-    unreadable file.
+    `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. On a single core
+    all files are diagnosed in this process, and one pair is yielded.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -120,7 +119,11 @@ def _diagnose_in_parallel(
 
 
 def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
-    """Format a diagnosis for printing, in one of the forms jsonl, whole, short, line and table."""
+    """Format a diagnosis for printing.
+
+    `form`: "jsonl", a JSON object; "whole", all methods; "short"; "line", the first line of short; or "table", one
+    line with the start of the recording, `start_s` [s since 1970] or None.
+    """
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
     if form == "jsonl":
@@ -134,7 +137,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
     """Test whether a word of `--fail-on` applies to a diagnosis.
 
-    The word `reason` is either a verdict, or a leak level that the diagnosis must reach or exceed.
+    `reason`: the word, either a verdict or a level of severity, which the leak must reach or exceed.
     """
     level = None if diagnosis.severity is None else diagnosis.severity.level
     return reason == diagnosis.verdict or (reason in _LEVELS and level in _LEVELS[_LEVELS.index(reason) :])
@@ -143,8 +146,8 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
     """Test whether files are recordings of one machine over time.
 
-    There must be at least `_MIN_SERIES_FILES`, their names may differ only in numbers, and all `starts` [s since 1970]
-    must be known and an hour or more apart.
+    There must be at least `_MIN_SERIES_FILES`, their names may differ only in numbers, and all `starts` [s since
+    1970] must be known and at least an hour apart.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -154,7 +157,7 @@ def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bo
 
 
 def _reads_standard_input(files: Iterable[Path]) -> bool:
-    """Test whether standard input is among the files; raise InputError if it is there more than once."""
+    """Test whether standard input, `-`, is among the files; raise InputError if it is there more than once."""
     count = sum(file == opt.STANDARD_INPUT for file in files)
     if count > 1:
         raise InputError(f"standard input (-) must be given once, got it {count} times")
@@ -164,10 +167,10 @@ def _reads_standard_input(files: Iterable[Path]) -> bool:
 def _iter_diagnoses(
     files: Sequence[Path], machine: opt.StatedMachine, *, joined: bool, false_alarm: float
 ) -> Iterator[DiagnosedRecording | None]:
-    """Yield the diagnosis of each file, or None for an unreadable one.
+    """Yield each recording with its diagnosis, or None for an unreadable file or baseline.
 
     A file never serves as its own baseline. `joined`: the files are parts of a single recording; `false_alarm`:
-    probability. An unreadable baseline also yields None. Raises InputError if a file is its only baseline,
+    probability of the verdict `leak` on a leak-free recording. Raises InputError if a file is its only baseline, and
     UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
@@ -194,14 +197,14 @@ def _iter_diagnoses(
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
     """Yield (start [s since 1970] or None, diagnosis) of each recording, or None for an unreadable file.
 
-    `options`: as for `_iter_diagnoses`.
+    `options`: further arguments of `_iter_diagnoses`.
     """
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Return the start of a recording [s since 1970]; None for standard input without a date."""
+    """Find the start of a diagnosed recording [s since 1970]; None if standard input states no date."""
     from sealscope.recordings.joining import file_seconds, start_seconds
 
     path = Path(result.diagnosis.file)
@@ -211,7 +214,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Run `work` on files; return its messages for standard error, and the list of its results."""
+    """Run `work` on files; return its messages for standard error as text, and the list of its results."""
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses
@@ -278,7 +281,10 @@ def report(
 
 
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
-    """Write the page of a commissioned machine: its newest verdict, and all its recordings over time."""
+    """Write the page of a commissioned machine, with its newest verdict and all its recordings over time.
+
+    Raises UnreadableFile if no recording can be read, and ends with the exit status 1 if some cannot.
+    """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count
     from sealscope.reporting.template import parse_page_path
@@ -370,7 +376,7 @@ def convert(
 
 
 def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every: str) -> None:
-    """Write parts of length `every`, such as 1h, of a long recording into a new or empty folder."""
+    """Write a long recording as parts of the length `every`, such as 1h, to files in a new or empty folder."""
     from sealscope.paragraphs import format_count
     from sealscope.recordings import inspect, read_parts, write
     from sealscope.units import parse_quantity

@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 
 
 def _item_names() -> list[str]:
-    """List the names that can be reproduced, for completion."""
+    """List the names of all that can be reproduced, for completion: items, chapters and `all`."""
     from sealscope.thesis.engine.items import load_items
 
     items = load_items()
@@ -72,7 +72,10 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print the items that match the patterns, and mark those whose data `sheet` is missing."""
+    """Print the items whose ids match `patterns`, and mark those that need the thesis's missing data sheet.
+
+    `sheet`: folder of the data sheet, or None for the default one.
+    """
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 

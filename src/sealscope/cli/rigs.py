@@ -87,12 +87,12 @@ def new(
 
 
 def _ask_size(label: str, unit: str) -> str:
-    """Ask for a size at the terminal."""
+    """Ask the user for a size at the terminal; return the answer as text."""
     return str(prompt(f"{label} [{unit}]"))
 
 
 def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
-    """Parse the quantity of an option to `si_unit`; a number without a unit is in `default_unit`."""
+    """Parse the text of an option to a number in `si_unit`; without a unit it is in `default_unit`."""
     from sealscope.units import parse_quantity
 
     with suppress(ValueError):  # a text with a unit is no number

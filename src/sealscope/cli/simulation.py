@@ -67,7 +67,7 @@ def simulate(
 
 
 def _parse_map(text: str) -> tuple[str, str]:
-    """Parse an option `--map CHANNEL=NAME`."""
+    """Split an option `--map CHANNEL=NAME` into channel and name; raise InputError for any other text."""
     channel, delimiter, name = text.partition("=")
     if not (channel and delimiter and name):
         raise InputError(f"--map must be CHANNEL=NAME, got {text}")

@@ -92,7 +92,7 @@ def trend(
 
 
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
-    """Count the leading recordings, in the order of their dates, that the machine's file knows to be healthy."""
+    """Count the first recordings, in the order of their dates, that the machine's file states as healthy."""
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)
     # a set, as a folder may have copies of a recording

@@ -1,4 +1,4 @@
-"""Controllers around a rig; their parameters are assumptions of the machine, not its own values."""
+"""Controllers of a rig's piston position; their parameters are assumptions and may differ from the rig's values."""
 
 from sealscope.control.controller import CompiledLaw as CompiledLaw
 from sealscope.control.controller import Controller as Controller

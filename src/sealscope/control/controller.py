@@ -1,4 +1,4 @@
-"""The interface of a controller: at each of its samples it computes a voltage from its measurements."""
+"""The interface of a controller, which computes a voltage from the measurements at each of its samples."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from sealscope.recordings.recording import Array
 
 
 class Measured(NamedTuple):
-    """A sample of a controller's target and measurements.
+    """The inputs of a controller at one of its samples: time, target and measurements.
 
-    Time [s]; target [m]; mean speed of the target [m/s] while the voltage will act; measured position [m] from
-    mid-stroke; measured pressures of the chambers [Pa]; measured angle of the motor [rad].
+    `t` [s]: time; `target` [m]: target of the piston's position; `target_speed` [m/s]: mean speed of the target while
+    the computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]: measured pressures
+    of the two chambers; `theta` [rad]: measured angle of the motor.
     """
 
     t: float
@@ -34,11 +35,12 @@ measured_at = record_view(record_dtype(*Measured._fields))
 
 
 class CompiledLaw(NamedTuple):
-    """A controller's law in machine code, for one run from its beginning.
+    """A controller's control law as machine code, with its memory at the start of a run.
 
-    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or C, that
-    returns the voltage [V] for the numbers of a `Measured`; `memory` (n,): its state and parameters; memory[0] is the
-    compensated leakage flow [m^3/s], or NaN; `kept`: an object that must live as long as the law, None for none.
+    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C
+    compiler, that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): its parameters and its
+    state, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN if
+    it reports none. `kept`: an object that must not be freed while the law is in use, or None.
     """
 
     address: int
@@ -47,7 +49,7 @@ class CompiledLaw(NamedTuple):
 
 
 class Started:
-    """A compiled law as a Python function that returns the voltage [V] for a `Measured`."""
+    """A compiled control law that Python can call: it computes the voltage [V] for each `Measured`."""
 
     def __init__(self, law: CompiledLaw) -> None:
         self._law, self._measured = law, np.empty(len(Measured._fields))
@@ -55,7 +57,7 @@ class Started:
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
-        """Compute the voltage [V] of the next sample."""
+        """Compute the voltage [V] for the next sample; its state is updated, so call it once a sample."""
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))
         reraise_python_error(self._law)
@@ -63,22 +65,25 @@ class Started:
 
     @property
     def compensated(self) -> float:
-        """The compensated leakage flow [m^3/s]; AttributeError if the controller reports none."""
+        """Leakage flow [m^3/s] that the controller compensated at its last sample.
+
+        Raises AttributeError if the controller reports no such flow.
+        """
         flow = float(self._law.memory[0])
         if math.isnan(flow):
             raise AttributeError("compensated")
         return flow
 
 
-#: The type of a law's function in C.
+#: The C type of a compiled law's function.
 LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _PythonLaw:
-    """A controller written in Python, with an address at which compiled code calls it."""
+    """A controller written in Python that compiled code can call by an address."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
-        """Make a C function that calls `voltage`, and the `CompiledLaw` with its address."""
+        """Wrap the Python function `voltage` as a C function, and make the `CompiledLaw` that holds its address."""
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)
@@ -87,9 +92,10 @@ class _PythonLaw:
         self.law = CompiledLaw(address, self._memory, self)
 
     def _call_voltage(self, _memory: int, measured: int) -> float:
-        """Compute the voltage [V] from the numbers of a `Measured` at the address `measured`.
+        """Call the Python controller with the `Measured` at the address `measured`, and return its voltage [V].
 
-        If the controller raises an exception, store it in `raised` and return NaN.
+        The leakage flow that it compensates is stored in the memory, NaN if it reports none. If the controller raises
+        an exception, it is stored in `raised`, and NaN is returned.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
@@ -103,33 +109,40 @@ class _PythonLaw:
 
 
 def start_law(controller: Controller) -> CompiledLaw:
-    """Start a controller for one run; return its law, in machine code if it has one, else in Python."""
+    """Start a controller for one run and return its control law.
+
+    The law is machine code if the controller has a method `compiled` that provides it; else it calls Python.
+    """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law
 
 
 def reraise_python_error(law: CompiledLaw) -> None:
-    """Raise the exception that a controller in Python raised when compiled code last called this law, if any."""
+    """Raise the exception of a Python controller that failed when compiled code called `law`; else do nothing.
+
+    A law may call the law of an inner controller, which is searched for the exception too.
+    """
     innermost: Any = law
-    while isinstance(innermost, CompiledLaw):  # a law that calls another keeps it
+    while isinstance(innermost, CompiledLaw):  # a law that calls another has it in `kept`
         innermost = innermost.kept
     if isinstance(innermost, _PythonLaw) and innermost.raised is not None:
         raise innermost.raised
 
 
 class Controller(Protocol):
-    """A sampled controller of the piston's position.
+    """A sampled controller of the piston's position: the interface that a controller of your own must have.
 
-    `rate` [Hz]: a whole multiple or a whole fraction of the rig's sampling rate; `delay`: whole samples from a
-    measurement to its voltage. A run calls `start`, and the function that it returns once a sample; all state is in
-    that function, so that a run can be repeated. The voltage is constant between samples, and limited to the
-    converter's range. Make the controller a frozen dataclass: its fields identify the run.
+    `rate` [Hz]: sampling rate, a whole multiple or a whole fraction of the rig's; `delay`: number of whole samples
+    from a measurement to the voltage computed from it. A run calls `start` once, and then the function that it
+    returned once a sample. All state must be in that function: then a run can be repeated. The voltage is constant
+    between samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify
+    the run.
 
-    If the function has an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample, the
-    recording has it as channel `q_comp`: otherwise control would hide the wear.
+    The function may have an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample.
+    The recording then has it as channel `q_comp`; without it, control would hide the wear.
 
-    A controller may also have a method `compiled` that returns a `CompiledLaw`. Then a run calls no Python, and takes a
-    fraction of the time; `start` is ``return Started(self.compiled())``.
+    A controller may also have a method `compiled` that returns a `CompiledLaw`. A run then calls no Python, and takes
+    a fraction of the time; the body of `start` is ``return Started(self.compiled())``.
 
     Examples
     --------
@@ -155,9 +168,9 @@ class Controller(Protocol):
 
     @property
     def delay(self) -> int:
-        """Samples from a measurement to its voltage."""
+        """Number of samples from a measurement to the voltage computed from it."""
         ...
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run: return the function from a `Measured` to the voltage [V]."""
+        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
         ...

@@ -1,4 +1,4 @@
-"""A controller's model of the drive: the voltage for a flow, by inverting a pump's speed loop or a servo valve."""
+"""A controller's model of the drive: it computes the voltage for a flow, for a pump's motor or a servo valve."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Smallest pressure drop of a valve that a controller assumes, over the supply's: a higher load cannot be moved.
+#: Smallest pressure drop across a valve that a controller assumes, as a fraction of the supply pressure: against a
+#: higher load the piston could not be moved.
 _MIN_VALVE_FRACTION = 0.1
 #: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
 _OVERLAP_GAIN = 4.0
-#: Parameters and state of a drive's inverse: those of `Drive`, or of `ValveDrive`, which is the one with Q_N > 0.
+#: Parameters and state of `drive_voltage`: those of a `Drive`, or of a `ValveDrive`, which has Q_N > 0.
 DRIVE = record_dtype(
     *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),
     *("Q_N", "dp_N", "u_N", "p_s", "dead_volts"),
@@ -31,10 +32,11 @@ DRIVE = record_dtype(
 
 @law
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
-    """Compute the voltage [V] that makes a drive give a flow [m^3/s] against `dp` = p_A - p_B [Pa].
+    """Compute the voltage u [V] at which a drive delivers a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    The equation of `ValveDrive` or of `Drive` is solved for u; s/(s + corner) is a high-pass filter of the speed. `m`:
-    a record `DRIVE`; each call advances its filter by one sample.
+    `m`: a record `DRIVE`. For a servo valve (Q_N > 0) the equation of `ValveDrive` is solved for u, which is then
+    increased to pass the overlap of the edges. For a pump the equation of `Drive` gives the commanded speed
+    u omega_per_volt; its factor s/(s + corner) is a high-pass filter, which each call advances by one sample.
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
@@ -49,17 +51,20 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 @kernel
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
-    """Filter values (n,) by a first-order lag into `out` (n,), with out[0] = `state`; `decay`: exp(-interval/lag)."""
+    """Filter `values` (n,) by a first-order lag, and write the result to `out` (n,), which begins with `state`.
+
+    `decay`: exp(-T/tau), with the sample interval T and the lag's time constant tau.
+    """
     for sample in range(values.size):
         out[sample] = state
         state = values[sample] + decay * (state - values[sample])
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that attributes of `source` are finite numbers in their range.
+    """Check that attributes of `source` are finite numbers in their range; raise InputError otherwise.
 
-    `positive`, `not_negative`: names of the attributes that must be > 0 and >= 0. Raises InputError otherwise; its
-    message names the object by `what`.
+    `positive`: names of the attributes that must be > 0; `not_negative`: names of those that must be >= 0; `what`:
+    name of the object in the error message.
     """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
@@ -68,26 +73,35 @@ def check_numbers(what: str, source: object, positive: Sequence[str], not_negati
 
 
 class _Invertible(ABC):
-    """A model of a drive whose flow can be inverted to a voltage."""
+    """A model of a drive from which the voltage for a flow can be computed."""
 
     @abstractmethod
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` [V]: overlap of a valve."""
+        """Make the record (1,) `DRIVE` that `drive_voltage` takes, for a controller sampled at `rate` [Hz].
+
+        `dead_volts` [V]: largest voltage that is added to pass the overlap of a servo valve's edges.
+        """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build the function (flow [m^3/s], p_A - p_B [Pa]) -> voltage [V], to be called at `rate` [Hz]."""
+        """Build a function of flow [m^3/s] and p_A - p_B [Pa] that computes the voltage [V] for that flow.
+
+        The function filters its input, so it must be called once a sample, at the sampling rate `rate` [Hz].
+        """
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
 
 
 @dataclass(frozen=True)
 class Drive(_Invertible):
-    """A controller's model of pump and drive.
+    """A controller's model of a pump and of the motor, under speed control, that turns it.
 
-    Eqs. (4.3), (4.4) without the winding's inductance: k_p (omega_d - omega) + K_i integral = C_e omega + R_c i, so
-    that omega_d = omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c i/C_e): `shortfall` C_e/k_p, `corner` K_i/k_p [1/s].
-    The current carries the torque of the pressures, i = D dp/C_m: `droop` = R_c D/(C_m C_e) [rad/(s Pa)].
-    `displacement` D [m^3/rad], `omega_per_volt` [rad/(s V)].
+    Without the winding's inductance, the thesis's eqs. (4.3) and (4.4) are k_p (omega_d - omega) + K_i integral of
+    (omega_d - omega) dt = C_e omega + R_c i, with the commanded speed omega_d, the speed omega and the current i = D
+    dp/C_m, whose torque balances the pressure difference dp = p_A - p_B. Solved for the command: omega_d = omega +
+    (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
+
+    `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p;
+    `corner` [1/s]: K_i/k_p; `droop` [rad/(s Pa)]: R_c D/(C_m C_e).
     """
 
     displacement: float
@@ -114,15 +128,16 @@ class Drive(_Invertible):
 
     @property
     def lag(self) -> float:
-        """Time constant [s] with which the speed loop removes its shortfall; infinite without an integral."""
+        """Time constant [s] of the speed loop; infinite if the loop has no integral term."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
     def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
         """Compute the drive's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
-        The class's equation solved for omega: omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), where y is
-        omega_d + droop dp after a first-order lag (`lag`). y starts at standstill under the first dp; for a periodic
-        command, whose period is `settling` samples, it starts in the periodic state.
+        The class's equation, solved for omega, is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), where
+        y is omega_d + droop dp after a first-order lag with the time constant `lag`. With `settling` = 0 the run
+        begins at standstill under the first dp. Otherwise the command is periodic with a period of `settling`
+        samples, and the run begins as if it had been repeated for ever.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -135,15 +150,18 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` for a controller at `rate` [Hz]; `dead_volts` is ignored."""
+        """Make the record (1,) `DRIVE` that `drive_voltage` takes, for a controller sampled at `rate` [Hz].
+
+        `dead_volts` is ignored: only a servo valve has an overlap.
+        """
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
     def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] of a constant flow [m^3/s], once the drive has reached its commanded speed."""
+        """Compute the voltage [V] that maintains a constant `flow` [m^3/s], with the motor at its commanded speed."""
         return flow / self.displacement / self.omega_per_volt
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the flow [m^3/s] at a constant voltage `u` [V], without a load."""
+        """Compute the flow [m^3/s] at a constant voltage `u` [V] without load."""
         return u * self.omega_per_volt * self.displacement
 
 
@@ -151,9 +169,10 @@ class Drive(_Invertible):
 class ValveDrive(_Invertible):
     """A controller's model of a servo valve and its supply.
 
-    Q = Q_N u/u_N sqrt((p_s - sign(Q) dp)/(2 dp_N)): each of the two open edges takes half of the pressure (equal edges;
-    Merritt, Hydraulic Control Systems, 1967, section 5.2), and the spool follows the command without delay. `Q_N`
-    [m^3/s]: flow at `dp_N` [Pa] an edge and `u_N` [V]; `p_s` [Pa]: pressure of the supply above the return.
+    The flow is Q = Q_N (u/u_N) sqrt((p_s - sign(Q) dp)/(2 dp_N)): the two open edges are equal, and half of the
+    pressure drops across each (Merritt, Hydraulic Control Systems, 1967, section 5.2). The spool follows the command
+    without delay. `Q_N` [m^3/s]: flow at the voltage `u_N` [V] and the pressure drop `dp_N` [Pa] across each edge;
+    `p_s` [Pa]: supply pressure above that of the return.
     """
 
     Q_N: float
@@ -174,15 +193,18 @@ class ValveDrive(_Invertible):
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE`; `dead_volts` [V]: width of the edges' overlap, which `drive_voltage` adds."""
+        """Make the record (1,) `DRIVE` that `drive_voltage` takes; `rate` is ignored.
+
+        `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges.
+        """
         return make_record(DRIVE, self, dead_volts=dead_volts)
 
     def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] of a constant flow [m^3/s] without load."""
+        """Compute the voltage [V] that maintains a constant `flow` [m^3/s] without load."""
         return self.inverse(1.0)(flow, 0.0)
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the flow [m^3/s] at a constant voltage `u` [V], without a load."""
+        """Compute the flow [m^3/s] at a constant voltage `u` [V] without load."""
         return u / self.steady_voltage(1.0)
 
 

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of the pressures that drive the leak.
 _PRESSURE_LAG = 0.005
-#: Time constant [s] with which a change of the estimate enters the control law, slow enough for the integral to follow.
+#: Time constant [s] with which a change of the estimate enters the control law: slow, for the inner controller's
+#: integral must follow it.
 _BLEND = 0.5
 #: A leak is compensated once its estimate exceeds this many standard errors, until it is below half of that.
 _SIGNIFICANT_SDS = 4.0
-#: It must also move the piston by this many encoder counts a second: less cannot be measured.
+#: The leak must also move the piston by this many encoder counts a second: less cannot be measured.
 _RESOLVED_COUNTS = 0.5
-#: Blocks that the observer must have used first.
+#: Number of blocks that the observer must have used before a leak is compensated.
 _MIN_BLOCKS = 4
 #: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
 _NEGLIGIBLE_G = 1e-18
@@ -43,7 +44,10 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _tolerant_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample: the inner controller's, plus a voltage for the estimated leakage flow."""
+    """Compute the voltage [V] of a sample: the inner controller's, plus a voltage for the estimated leakage flow.
+
+    `memory`, `sample`: addresses of a record `_MEMORY` and of the numbers of a `Measured`.
+    """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
     if math.isnan(m.mean_A):
@@ -76,12 +80,14 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 
 @dataclass(frozen=True)
 class FaultTolerant:
-    """A controller that compensates the leakage across the piston: u = u_inner + inverse of the drive for G dp.
+    """A controller that compensates the leakage across the piston, in addition to another controller.
 
-    `inner` is any controller; G [m^3/(s Pa)] is estimated by a Kalman filter (`update_observer`) from the controller's
-    signals, less the pump's `G_assumed`. G is 0 until it is significant and measurable: without a leak the voltages are
-    exactly those of `inner`. `known` >= 0 [m^3/(s Pa)] replaces the estimate (an ideal controller that knows the leak).
-    The compensated flow is reported as `compensated` [m^3/s].
+    The voltage is that of the controller `inner`, plus the voltage at which the `drive` delivers the leakage flow G
+    dp. A Kalman filter (`update_observer`, with the model `balance`) estimates the conductance between the chambers
+    from the measurements; G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed leakage of the pump. G stays
+    0 until it is significant and measurable, so without a leak the voltages are exactly those of `inner`. The voltage
+    is limited to +-`u_max` [V] while a leak is compensated. `known` >= 0 [m^3/(s Pa)], if given, replaces the
+    estimate: an ideal controller that knows the leak. The compensated flow [m^3/s] is reported as `compensated`.
     """
 
     inner: Controller
@@ -97,7 +103,11 @@ class FaultTolerant:
 
     @classmethod
     def from_rig(cls, rig: Rig, inner: Controller | None = None, *, known: float | None = None) -> Self:
-        """Build the controller from a rig's parameters around `inner`, by default `PositionPI`."""
+        """Build the controller from a rig's parameters; raise InputError for a rig whose pump angle is not measured.
+
+        `inner`: controller of the position, by default the rig's `PositionPI`; `known` [m^3/(s Pa)]: conductance of
+        the leak, if it is not to be estimated.
+        """
         from sealscope.physics.cylinder import mid_stroke_volumes
 
         cylinder, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
@@ -129,15 +139,15 @@ class FaultTolerant:
 
     @property
     def delay(self) -> int:
-        """Samples from a measurement to its voltage."""
+        """Number of samples from a measurement to the voltage computed from it."""
         return self.inner.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run: return the function from a `Measured` to the voltage [V]."""
+        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the compiled law of a new run, which calls the law of the inner controller."""
+        """Make the control law of a new run as machine code; it calls the law of the inner controller."""
         inner, rate = start_law(self.inner), self.rate
         memory = make_record(
             _MEMORY,

@@ -1,4 +1,4 @@
-"""Flatness-based control of the piston's position: the target determines every state of the machine."""
+"""Flatness-based position control: forces and flows are computed from the target and its derivatives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of the load.
 _LOAD_LAG = 0.1
-#: Largest change of the target's speed within a sample, over `v_max`, that counts as an acceleration and not as a jump.
+#: Largest change of the target's speed within a sample, relative to `v_max`; a larger one is a jump, no acceleration.
 _MAX_SPEED_CHANGE = 0.1
 #: State and parameters of the law.
 _MEMORY = record_dtype(
@@ -32,7 +32,10 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _flatness_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample, the sum of feedback and feed-forward (`Flatness`)."""
+    """Compute the voltage [V] of a sample, the sum of feedback and feed-forward by the equations of `Flatness`.
+
+    `memory`, `sample`: addresses of a record `_MEMORY` and of the numbers of a `Measured`.
+    """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
     v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
@@ -52,16 +55,18 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
 
 @dataclass(frozen=True)
 class Flatness:
-    """Feed-forward of the forces and flows that the target requires, and the feedback of a PI controller.
+    """A position controller that feeds forward the flow the target requires, and corrects errors by PI control.
 
-    The position is a flat output of the machine: with x = target, v and a its derivatives,
-    F = M a + F_f(v) + F_load, dp = F/A, Q = A v + G dp + C dp', u = the drive's inverse of (Q, dp).
-    `feedback` gives A v and the correction of the error. The feed-forward adds the pump's leakage `G` [m^3/(s Pa)], the
-    compliance `C` = V/(2 K) [m^3/Pa] of the oil, and the speed that the drive loses under the torque of dp. F_f(v) =
-    (`F_C` + `F_v` |v|) sign(v), smooth within `v_th` [m/s]; F_load is the average of the pressures' force less
-    (M a + F_f). `M` [kg], `F_C` [N], `F_v` [N s/m] are what the controller assumes of the machine.
+    The position is a flat output of the machine: the target and its derivatives, the speed v and the acceleration a,
+    determine the force on the piston, F = M a + F_f(v) + F_load, the pressure difference dp = F/A, the flow Q = A v +
+    G dp + C dp/dt, and from Q and dp the voltage, by the model `drive`. The PI controller `feedback` provides the
+    voltage for A v and for the correction of the error. The feed-forward adds the pump's leakage G dp, the
+    compression C dp/dt of the oil, and the speed that the drive loses under the torque of dp.
 
-    A jump of the target has no derivative: a target's speed above `v_max` [m/s] is not fed forward.
+    The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a +
+    F_f), averaged over time. The controller assumes `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s
+    Pa)] and `C` = V/(2 K) [m^3/Pa]. A jump of the target has no derivative: a target's speed above `v_max` [m/s] is
+    not fed forward.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
@@ -81,7 +86,7 @@ class Flatness:
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
-        """Build the controller from a rig's parameters."""
+        """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
         # mean pressure of a chamber at standstill: behind a valve halfway from supply to return
@@ -107,15 +112,15 @@ class Flatness:
 
     @property
     def delay(self) -> int:
-        """Samples from a measurement to its voltage."""
+        """Number of samples from a measurement to the voltage computed from it."""
         return self.feedback.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run: return the function from a `Measured` to the voltage [V]."""
+        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the compiled law of a new run."""
+        """Make the control law of a new run as machine code."""
         T = 1.0 / self.rate
         memory = make_record(
             _MEMORY,

@@ -14,24 +14,26 @@ from sealscope.compiled import law, make_record, record_dtype
 BLOCK = 0.5
 #: Blocks with a smaller mean pressure difference [Pa] are not used.
 MIN_DP = 20e3
-#: A pilot-operated valve counts as shut from this multiple of its cracking and opening pressure on.
+#: A pilot-operated valve counts as shut above this multiple of the sum of its cracking and opening pressures.
 SHUT = 2.0
-#: Prior standard deviations: relative for compliance and area; of the conductance [m^3/(s Pa)].
+#: Prior standard deviations: of the compliance and the area (relative), and of the conductance [m^3/(s Pa)].
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
-#: Standard deviations of the model's errors in a block, over the compressed and the swept volume.
+#: Standard deviations of the model's errors in a block, relative to the compressed and to the swept volume.
 _COMPRESSION_ERROR, _SWEPT_ERROR = 0.02, 2e-4
-#: Variance of a pressure's average over that of a sample.
+#: Noise variance of an averaged pressure, relative to that of a single sample.
 _MEAN_NOISE = 0.1
-#: Standard deviation of the conductance's random walk a block: absolute [m^3/(s Pa)], and relative to the estimate.
+#: Standard deviation of the conductance's random walk in a block: absolute [m^3/(s Pa)], and relative to the
+#: estimate.
 _WALK, _RELATIVE_WALK = 1e-15, 0.03
-#: A block with an innovation above this many standard deviations is left out as an outlier; a second one in succession
-#: with the same sign is a leak that opened suddenly.
+#: A block with an innovation above this many standard deviations is left out as an outlier; a second one in
+#: succession with the same sign is a leak that opened suddenly.
 _OUTLIER_SDS = 4.0
 #: Time constant [s] of the average of all four signals.
 _LAG = 0.01
-#: Parameters (`Balance`) and state of the observer. `length` of a block in samples; `turned_forward`, `turned_back`:
-#: rotation within the block [rad]; `means`, `begin`: averages of angle, position and both pressures, now and at the
-#: block's begin; `state`: conductance, relative errors of 1/K and of the area, with their covariance `P`.
+#: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
+#: rotation within the block in either direction [rad]; `means`: averages of angle, position and both pressures at
+#: present, `begin`: those when the block began; `state`: conductance, relative errors of 1/K and of the area, with
+#: their covariance `P`.
 OBSERVER = record_dtype(
     *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "lag_gain"),
     *("count", "sum_dp", "min_dp", "max_dp", "turned_forward", "turned_back", "outlier_G", "n_blocks"),
@@ -44,13 +46,16 @@ OBSERVER = record_dtype(
 
 @law
 def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
-    """Update the observer `m` (`OBSERVER`) with a sample: angle [rad], position [m], pressures [Pa].
+    """Update the estimate of the leakage between the chambers with one sample of the measurements.
+
+    `m`: record `OBSERVER`; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`, `p_B` [Pa]: pressures.
 
     A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
-    seconds, on the side with the higher pressure (the other may be fed by its check valve):
-    D dtheta - A dx - (V(x)/K) dp_side - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt, with opposite signs
-    for side B; dtheta_in is the pump's rotation towards that side, which compresses oil from the other pressure. The
-    filter also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
+    seconds. The balance is that of the chamber with the higher pressure, because a check valve may feed the other
+    one. For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt;
+    for B the signs are opposite. Here dtheta and dx are the rotation and the travel in the block, and dtheta_in is
+    the rotation that pumps oil into that chamber, which compresses it from the other chamber's pressure. The filter
+    also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means
     if m.count == 0.0:
@@ -74,10 +79,11 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 
 @law
 def _update_with_block(m: Any, dp_sum: float) -> None:
-    """Update the Kalman filter with the block that ends now; `dp_sum`: sum of p_A - p_B [Pa] over its samples.
+    """Update the Kalman filter of `update_observer` with the block that ends now.
 
-    The block is left out if the pressure difference is small, changes its sign, or leaves a check valve open. It is
-    also left out if it is an outlier, unless the last block was an outlier of the same sign: a leak may have opened.
+    `m`: record `OBSERVER`; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples. The block is left out if the
+    pressure difference is small, changes its sign, or is too low to shut a check valve. It is also left out if it is
+    an outlier, unless the block before was an outlier of the same sign: then a leak may have opened.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
@@ -129,16 +135,21 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the estimated conductance [m^3/(s Pa)], its standard error, and the number of blocks used."""
+    """Return an observer's leakage conductance [m^3/(s Pa)], its standard error, and the number of blocks used.
+
+    `m`: record `OBSERVER`.
+    """
     return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 
 
 @dataclass(frozen=True)
 class Balance:
-    """The observer's model: displacement `D` [m^3/rad], areas [m^2], volumes at mid-stroke [m^3], `K` [Pa].
+    """The leak observer's model of the machine, from which it computes the volume balance of a chamber.
 
-    `x_step` [m]: an encoder count; `noise` [Pa]: standard deviation of a pressure's sample; `shut` [Pa]: |p_A - p_B|
-    above which the check valve of the side with the higher pressure is shut.
+    `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of
+    the chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
+    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: pressure difference |p_A - p_B| above which
+    the check valve of the chamber with the higher pressure is shut.
     """
 
     D: float
@@ -153,7 +164,10 @@ class Balance:
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the record (1,) `OBSERVER` of an observer before its first sample."""
+    """Make the memory of a leak observer before its first sample, a record (1,) `OBSERVER`.
+
+    `rate` [Hz]: sampling rate of the controller.
+    """
     return make_record(
         OBSERVER,
         balance,

@@ -1,4 +1,4 @@
-"""Stability margins of a control loop: the gain, phase and delay that it tolerates, from rig and controller."""
+"""Stability margins of a rig's control loop: the additional gain, phase and delay that it tolerates."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of a loop at one speed of the piston.
+    """Stability margins of a control loop with the open-loop response L, at one speed of the piston.
 
-    `speed` [m/s]; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase` [rad]: smallest distance
-    of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1; `delay` [s]: smallest
-    additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|; `damped`: True if the
-    rig without controller is stable (in slow strokes its friction falls with speed, and it may not be; then the margins
-    do not prove that the loop is stable).
+    `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
+    [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
+    `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
+    `damped`: True if the rig without controller is stable. It may be unstable in slow strokes, where friction falls
+    with speed; the margins then do not prove that the loop is stable.
     """
 
     speed: float
@@ -52,13 +52,13 @@ class Margins:
 
 
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
-    """Compute the stability margins of the loop of a rig and a controller, opened at the voltage.
+    """Compute the stability margins of the control loop of a rig and a controller, opened at the voltage.
 
-    The rig is linearised over one sample of the controller by finite differences of the solver's steps, y(k+1) = A y(k)
-    + B u(k), for a piston that moves at `speed` [m/s] (0: standstill) under `load` [N] in addition to the rig's own.
-    The controller's transfer functions C_j(z) are those of its impulse responses to each measurement. The loop is
-    L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, j = x, p_A, p_B, theta. Raises InputError for a speed that the
-    drive cannot reach.
+    The rig is linearised over one sample of the controller, y(k+1) = A y(k) + B u(k), by finite differences of the
+    solver's steps. Its piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the
+    rig's own load. The controller's transfer functions C_j(z) are computed from its impulse responses to each
+    measurement j = x, p_A, p_B, theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the
+    row c_j picks measurement j from the state. Raises InputError for a speed that the drive cannot reach.
 
     Examples
     --------
@@ -77,9 +77,10 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
 def open_loop(
     rig: Rig, controller: Controller, f: Array, speed: float = 0.0, load: float = 0.0
 ) -> tuple[NDArray[np.complex128], bool]:
-    """Compute the open loop L (n,) of rig and controller at frequencies `f` (n,) [Hz].
+    """Compute the open-loop response L (n,) of a rig and its controller at frequencies `f` (n,) [Hz].
 
-    The second result is True if the rig itself is stable. `speed` [m/s], `load` [N]: see `margins`.
+    The second result is True if the rig is stable without the controller. `speed` [m/s], `load` [N]: see `margins`,
+    which also gives the formula of L.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -95,7 +96,12 @@ def open_loop(
 
 
 def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array, Array, Array]:
-    """Linearise the rig over a sample at `rate` [Hz] (`margins`): return A (14, 14), B (14,) and the state (14,)."""
+    """Linearise the rig over one sample at the sampling rate `rate` [Hz]: y(k+1) = A y(k) + B u(k).
+
+    Returns A (14, 14), B (14,) [per V] and the state (14,) at which the rig is linearised: at standstill, or with the
+    piston at mid-stroke and moving at `speed` [m/s], under the additional force `load` [N]. Raises InputError for a
+    speed that the drive cannot reach.
+    """
     from sealscope.physics.rig import pack_numbers, rig_numbers
     from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, step_nodes
     from sealscope.physics.solvers.limits import longest_step
@@ -108,7 +114,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
     nodes = step_nodes(implicit, h).size
 
     def advance_state(y: Array, u: float, samples: int = 1) -> Array:
-        """Integrate from the state y (14,) over samples at a constant voltage u [V]; return the new state."""
+        """Integrate the state y (14,) over a number of samples at a constant voltage u [V]; return the new state."""
         n = samples * steps
         state, rows = np.array(y), np.empty((samples, len(OUTPUTS)))
         volts, no_leak, force = np.full((n, nodes), u), np.zeros((n, nodes)), np.full((n, nodes), load)
@@ -121,13 +127,16 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def find_moving_state(u: float) -> tuple[Array, float]:
-            """Simulate the piston under a constant voltage; return its last state, and its speed after settling."""
+            """Simulate the rig at a constant voltage u [V] from standstill; return its last state and its mean speed.
+
+            The speed [m/s] is the mean over the second half of the run, after `_SETTLING` seconds.
+            """
             first_state = advance_state(y, u, samples)
             last_state = advance_state(first_state, u, samples)
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, speed_at_rest = find_moving_state(0.0)  # the load may move a piston whose drive gives way
-        for _ in range(5):  # raise the voltage until the piston has the speed: the drive falls short of its command
+        for _ in range(5):  # adjust the voltage until the piston has the speed: the drive falls short of its command
             state, mean_speed = find_moving_state(min(max(u, -limit), limit))
             speed_gain = mean_speed - speed_at_rest
             # in proportion to the speed, by at most a factor of 5; by 1.5 if the piston does not follow
@@ -146,10 +155,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
 
 def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
-    """Compute the controller's voltage response to a unit impulse of each measured state.
+    """Compute the controller's voltage response to a unit impulse of each measurement at standstill.
 
-    Returns (index of the state, response (n,) [V per unit of the state]), without responses that are zero. `state`
-    (14,): its pressures are those measured before and after the impulse.
+    `state` (14,): the controller measures its pressures except for the impulse. Returns pairs of the measurement's
+    index in the state and the response (n,) [V per SI unit of the measurement]; responses that are zero are left out.
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
@@ -157,7 +166,7 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the voltages (n,) of a new run from an impulse of one sample on."""
+        """Compute the voltages (n,) [V] from an impulse on, which lasts one sample; `impulse`: its measurements."""
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second
             voltage(standstill)
@@ -175,9 +184,10 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
 
 
 def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Compute the z-transform sum_n a_n z^-n of an impulse response a_n that stays at its last value.
+    """Compute the frequency response (m,) of a controller from its impulse response, by the z-transform.
 
-    `response` (n,): its first n values, the last of which it keeps, as an integrator's response does; `z` (m,).
+    The z-transform is sum_k a_k z^-k. `response` (n,): the first values a_k; the rest are equal to the last of them,
+    as for an integrator. `z` (m,): complex numbers at which it is computed.
     """
     last_value = response[-1]
     transient = response - last_value
@@ -193,9 +203,9 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
 
 
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
-    """Compute the `Margins` of a loop L (n,) at the frequencies `f` (n,) [Hz], interpolated linearly.
+    """Compute the stability margins of an open-loop response L (n,) at the frequencies `f` (n,) [Hz].
 
-    `speed`, `damped`: copied to the result.
+    Between the frequencies, L is interpolated linearly. `speed`, `damped`: copied to the result.
     """
     indices = np.arange(f.size)
     unit_gain, real_axis = _crossings(np.abs(L) - 1.0), _crossings(L.imag)
@@ -209,6 +219,6 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
 
 
 def _crossings(values: Array) -> Array:
-    """Find the zero crossings of values (n,), as fractional indices by linear interpolation."""
+    """Find where `values` (n,) cross zero; return fractional indices (m,), interpolated linearly."""
     k = np.flatnonzero(np.diff(values > 0.0))
     return k + values[k] / (values[k] - values[k + 1])

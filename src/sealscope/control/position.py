@@ -28,13 +28,16 @@ _memory_at = record_view(FOLLOWING)
 
 @law
 def following_voltage(m: Any, measured: Any) -> float:
-    """Compute the voltage [V] of a sample by the PI law and the inverse of the drive; `m`: a record `FOLLOWING`."""
+    """Compute the voltage [V] of a sample by the PI law of `PositionPI`, limited to the range of the converter.
+
+    `m`: a record `FOLLOWING`, whose integral and average pressure difference are updated; `measured`: a `Measured`.
+    """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
     velocity = measured.target_speed + m.k_v * error + m.integral
     area = m.area_A if m.dp > 0.0 else m.area_B
     u = drive_voltage(m.drive, velocity * area, m.dp)
-    # at the limit of the voltage the integral may only fall back
+    # at the limit of the voltage the integral may only decrease
     if abs(error) > m.dead_band and (abs(u) < m.u_max or u * error < 0.0):
         m.integral += m.k_i_T * error
     return min(max(u, -m.u_max), m.u_max)  # type: ignore[no-any-return]
@@ -42,24 +45,29 @@ def following_voltage(m: Any, measured: Any) -> float:
 
 @entry
 def _position_law(memory: Any, measured: Any) -> Any:
-    """Compute the voltage [V] of a sample: `following_voltage` as a law that compiled code calls by its address."""
+    """Compute the voltage [V] of a sample by `following_voltage`, for compiled code that calls it by its address.
+
+    `memory`, `measured`: addresses of a record `FOLLOWING` and of the numbers of a `Measured`.
+    """
     return following_voltage(_memory_at(memory), measured_at(measured))
 
 
 @dataclass(frozen=True)
 class PositionPI:
-    """A PI controller of the position with velocity feed-forward; its fields are what it assumes of the machine.
+    """A PI controller of the piston's position with velocity feed-forward; its fields are what it assumes of the rig.
 
-    v_c = v_target + k_v e + k_i integral of e, e = target - x. The voltage is that of the flow v_c A by the inverse of
-    the drive (`Drive`, `ValveDrive`), with the area A of the side with the higher pressure, which carries the load. A
-    pump's drive is inverted without load: omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, the inverse of its
-    speed loop omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4). A servo valve is inverted for the
-    measured pressure difference; `dead_volts` [V]: overlap of its edges, which small voltages are increased to pass.
+    The commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. The
+    voltage is the one at which the `drive` delivers the flow v_c A; A is the piston area of the chamber with the
+    higher pressure, which carries the load. For a pump the load is neglected: the commanded speed of the motor is
+    omega_d = omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, the inverse of its speed loop omega/omega_d = (k_p s +
+    K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve the voltage depends on the measured
+    pressure difference. Small voltages are increased by up to `dead_volts` [V] to pass the overlap of its edges.
 
-    The integral is frozen within `dead_band` [m] of the target, so that it does not oscillate against static friction
-    or between two encoder counts, and while the voltage is at its limit `u_max` [V].
+    The integral is frozen within `dead_band` [m] of the target, where it would oscillate against static friction or
+    between two encoder counts, and while the voltage is at its limit `u_max` [V].
 
-    `rate` [Hz], `delay` in whole samples; `k_v` [1/s], `k_i` [1/s^2]; `area_A`, `area_B` [m^2].
+    `rate` [Hz]: sampling rate; `delay`: whole samples from a measurement to the voltage computed from it; `k_v` [1/s]
+    and `k_i` [1/s^2]: gains; `area_A`, `area_B` [m^2]: piston areas of the two chambers.
     """
 
     area_A: float
@@ -79,7 +87,10 @@ class PositionPI:
 
     @classmethod
     def from_rig(cls, rig: Rig, **gains: float) -> Self:
-        """Build the controller from a rig's parameters, for its pump or servo valve; `gains`: further fields."""
+        """Build the controller from a rig's parameters, for its pump or servo valve.
+
+        `gains`: values of other fields, such as `k_v`, `k_i` or `rate`, which replace the defaults.
+        """
         valve, drive = rig.valve, drive_of(rig)
         gains.setdefault("dead_band", 1.5 * rig.sensors.x.resolution)
         if isinstance(drive, Drive):
@@ -91,15 +102,15 @@ class PositionPI:
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run: return the function from a `Measured` to the voltage [V]."""
+        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
-        """Return the compiled law of a new run."""
+        """Make the control law of a new run as machine code."""
         return CompiledLaw(_position_law.address, self.make_memory().view(np.float64))
 
     def make_memory(self) -> Any:
-        """Make the record (1,) that `following_voltage` takes."""
+        """Make the parameters and the initial state of `following_voltage`, a record (1,) `FOLLOWING`."""
         T = 1.0 / self.rate
         return make_record(
             FOLLOWING,

@@ -1,7 +1,7 @@
 """Controllers by name: built-in ones, installed ones, and a user's as `MODULE:NAME` or `FILE.py:NAME`.
 
-A distribution installs a controller by an entry point of the group `sealscope.controllers`, which names a class or
-function as `controller_named` calls it.
+A distribution installs a controller by an entry point of the group `sealscope.controllers`. It names a class or
+function that `controller_named` can call.
 """
 
 from __future__ import annotations
@@ -40,17 +40,21 @@ GROUP = "sealscope.controllers"
 
 @cache
 def _installed() -> Mapping[str, EntryPoint]:
-    """Return the entry points of installed controllers, by name."""
+    """Find the entry points of the controllers that installed distributions provide, by the controller's name."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
 def is_installed(name: str) -> bool:
-    """Return True if `name` is a built-in or installed controller, False if it can only be a user's own."""
+    """Return True if `name` is a built-in controller or one that an installed distribution provides."""
     return name in CONTROLLERS or name in _installed()
 
 
 def check_controller_name(name: str) -> None:
-    """Check that a controller may have this name, without importing it; raise InputError otherwise."""
+    """Check that `name` is a built-in or installed controller, or has the form of a user's controller.
+
+    A user's controller is written ``MODULE:NAME`` or ``FILE.py:NAME``. It is not imported, so it may not exist.
+    Raises InputError for any other name.
+    """
     place, colon, attribute = name.rpartition(":")
     if not is_installed(name) and not (colon and place and attribute):
         names = (*CONTROLLERS, *_installed())
@@ -63,9 +67,10 @@ def check_controller_name(name: str) -> None:
 def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller called `name` for a rig.
 
-    `name`: that of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function.
-    Its method `from_rig` is called with the rig, or the class or function itself if it has none. Raises InputError for
-    an unknown name, and for a controller without `rate`, `delay` and `start`.
+    `name`: the name of a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or
+    function. Its method `from_rig` is called with the rig, or the class or function itself if it has no such method.
+    Raises InputError for an unknown name, for code that fails, and for a controller without `rate`, `delay` or
+    `start`.
 
     Examples
     --------
@@ -93,9 +98,9 @@ def controller_named(name: str, rig: Rig) -> Controller:
 
 
 def find_controller_source(name: str) -> Path | None:
-    """Find the source file of a user's or an installed controller without importing it; None for a built-in one.
+    """Find the source file of a user's or an installed controller without importing it.
 
-    Raises InputError if there is no such file.
+    Returns None for a built-in controller. Raises InputError if the file does not exist.
     """
     if name in CONTROLLERS:
         return None
@@ -107,7 +112,10 @@ def find_controller_source(name: str) -> Path | None:
 
 
 def _find_module_file(module: str) -> Path | None:
-    """Find the file of a module without importing the packages that contain it; None if there is none."""
+    """Find the file of a module without importing the packages that contain it; return None if there is no such file.
+
+    `module`: dotted name, such as "my_package.control".
+    """
     parts, folders = module.split("."), None  # `folders`: those of the package that contains the module
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
@@ -120,7 +128,7 @@ def _find_module_file(module: str) -> Path | None:
 
 
 def _load_module(place: str) -> Any:
-    """Import a module by its name, or from a Python file; raise InputError for a file that does not exist.
+    """Import a module by its name, or from the path of a Python file; raise InputError if the file does not exist.
 
     A file is imported once, under a name that contains the hash of its text.
     """

@@ -1,7 +1,7 @@
-"""Diagnosis of a recording: inspect the data, observe what changed, explain it, decide, state one verdict.
+"""Diagnose a recording: inspect the data, observe what changed, explain the changes, decide, and state one verdict.
 
-`inspection` inspects, each detector that the channels allow observes (`detectors.observation`), `decision` explains and
-decides, and `Diagnosis` states the result.
+`inspection` checks the data, each detector that the channels allow reports its observations
+(`detectors.observation`), `decision` explains them and decides, and `Diagnosis` states the result.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ FALSE_ALARM_PROBABILITY: float = VERDICT.false_alarm.probability
 
 
 def check_probability(probability: float) -> None:
-    """Check that a threshold can be set for a false-alarm probability; raise InputError otherwise."""
+    """Check that a false-alarm probability is a number from 1e-4 to 0.2; raise InputError otherwise.
+
+    The limits are `rarest` and `largest` of `verdict/priors.toml`.
+    """
     min_probability, max_probability = VERDICT.false_alarm.rarest, VERDICT.false_alarm.largest
     if not (isinstance(probability, float | int) and min_probability <= probability <= max_probability):
         rule = f"false-alarm probability must be {min_probability:g} to {max_probability:g}"
@@ -47,13 +50,26 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """A recording to judge and its baseline, prepared for one detector or all of them.
+    """A recording to judge and its healthy baseline, prepared for one detector or all of them.
 
-    Gaps in `recording` are bridged and no sample is missing. `baseline`: leak-free recordings of the machine; `rig`:
-    sizes that the detectors assume; `distrust`: reason why the pressures cannot be judged, in which case no detector
-    runs, or None; `refusal`: reason why none of the given baselines is comparable, or None; `share`: fraction of the
-    original samples that `recording` contains; `judged_until`: fraction of the original recording up to the last sample
-    of `recording`.
+    Attributes
+    ----------
+    recording : Recording
+        The samples to judge. Gaps are bridged and no sample is missing.
+    baseline : sequence of Recording or SummarisedRecording
+        Leak-free recordings of the same machine, possibly none.
+    false_alarm_probability : float
+        Probability of the verdict "leak" for a leak-free recording.
+    rig : Rig, str or path-like
+        Sizes of the machine that the detectors assume.
+    distrust : str or None
+        Reason why the pressures cannot be trusted, in which case no detector runs.
+    refusal : str or None
+        Reason why a baseline was given but no recording of it can be compared.
+    share : float
+        Fraction of the original samples that `recording` contains.
+    judged_until : float
+        Fraction of the original samples up to the last time of `recording`.
     """
 
     recording: Recording
@@ -68,7 +84,10 @@ class Examination:
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)
 
     def with_channels(self, channels: Iterable[str]) -> Examination:
-        """Return the examination with only these channels; baselines stored as summaries are dropped."""
+        """Return a copy of this examination in which all recordings have only the given channels.
+
+        Healthy recordings stored as summaries are dropped, as channels cannot be removed from a summary.
+        """
         names = set(channels)
         recording, *baseline = (
             entry.only(name for name in entry.channels if name in names)
@@ -78,7 +97,10 @@ class Examination:
         return replace(self, recording=recording, baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Return the report of one detector, computed once; raise KeyError if it is not registered."""
+        """Return the report of the detector called `name`, which runs at the first call only.
+
+        Raises KeyError if no detector of this name is registered.
+        """
         if name not in self._reports:
             rig = load_rig(self.rig)
             self._reports[name] = run_detector(name, self.recording, self.baseline, rig, self.distrust)
@@ -86,28 +108,34 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """Observed changes of duty, noise, hum and pressure levels, which may explain an alarm without a leak."""
+        """Changes of duty, noise, mains hum and mean pressures, which may explain an alarm without a leak."""
         return observe_rivals(self.recording, self.baseline, self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Null distribution of each observable, from the healthy recordings."""
+        """Distribution of each detector's statistics in the healthy recordings, without a leak.
+
+        If the volume balance found that valves cut the pump off while the machine rests, the healthy recordings are
+        evaluated under the same hypothesis.
+        """
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide by one detector alone.
+        """Decide whether the machine leaks from the report of one detector alone.
 
-        The alarm of the RMS change is not weighed against other explanations.
+        Other causes of a change are weighed against a leak, except for the detector `rms change`, whose alarm is
+        taken as it is.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
     def decide_by_all(self) -> Evidence:
-        """Decide by all registered detectors, in the order of `rank`.
+        """Decide whether the machine leaks from the reports of all registered detectors.
 
-        Detectors that measure the leak (`ORDER`) are asked until one of them decides. If one fails, no other detector
-        may state that there is no leak.
+        The detectors that measure the size of a leak (`ORDER`) are asked one after the other until one of them
+        reaches a decision; all other detectors are always asked. If a measuring detector fails, the verdict cannot be
+        "no leak".
         """
         names = sorted(detectors(), key=rank)
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
@@ -119,10 +147,10 @@ class Examination:
         return combine(list(decisions.values()), self.refusal or next(iter(failures), None))
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
-        """Decide whether there is a leak from one detector's report.
+        """Decide whether the machine leaks from the report of the detector called `name`.
 
-        `reports`: further observations that may explain its alarm; `weigh_rivals`: let these compete with a leak as
-        explanations.
+        `reports` are further observations that may explain an alarm of this detector. With `weigh_rivals`, these
+        other explanations compete with a leak.
         """
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, self.false_alarm_probability, weigh_rivals)
@@ -132,7 +160,7 @@ class Examination:
 
 
 @checked_call
-@np.errstate(all="ignore")  # what overflows is a finding, not a warning
+@np.errstate(all="ignore")  # an overflow becomes a finding, not a warning
 def diagnose(
     recording: Recording,
     baseline: Recording | Sequence[Healthy] = (),
@@ -144,35 +172,39 @@ def diagnose(
 ) -> Diagnosis:
     """Decide whether oil bypasses the piston in a recording.
 
-    The balance of volumes judges; where the channels allow none, the response of the pressures does, then plug-ins,
-    last the change of RMS. The results of plug-ins and the change of RMS are stated in addition to the verdict.
+    The verdict is that of the first method which the channels allow and which reaches a decision: the balance of
+    volumes, the response of the pressures, plug-ins, and last the change of RMS. The results of plug-ins and of the
+    change of RMS are always stated in addition.
 
     Parameters
     ----------
     recording : Recording
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
-        Leak-free recordings of the same machine; those that cannot be compared are left out with a finding. Without
-        baseline, the recording is tested for a leak that begins within it.
+        Leak-free recordings of the same machine. Those that cannot be compared are left out, which a finding reports.
+        Without a baseline, the recording is tested for a leak that begins within it.
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
-        What may be assumed of the machine: a Rig, the name of a packaged one or the path of a TOML file; by default
-        the thesis's, stated for a recording that was simulated with it, else a mere assumption.
+        Sizes of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By default the rig of the
+        thesis is used. It counts as stated for a recording that was simulated with the same sizes. For any other
+        recording it is a mere assumption, and flows in L/min are stated only if a flow meter was recorded.
     limit : str, optional
-        Leak from which the machine is to be repaired: a flow (``"5 mL/min"``) or a creep (``"8 mm/min"``, the default).
+        Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
+        (``"8 mm/min"``, the default).
     file : str or path-like, optional
-        Name of the recording in the diagnosis; by default that of the file it was read from.
+        Name of the recording in the diagnosis; by default the name of the file it was read from.
 
     Returns
     -------
     Diagnosis
-        Verdict, onset and L/min with intervals, score and threshold, evidence of each detector, findings on the data.
+        Verdict, onset and leak in L/min with their intervals, score and threshold, the evidence of each detector, and
+        findings on the data.
 
     Raises
     ------
     InputError
-        An argument breaks one of these rules, or `rig` cannot be read.
+        An argument is of a wrong type or out of its range, or `rig` cannot be read.
 
     Examples
     --------
@@ -212,7 +244,10 @@ def diagnose(
 
 
 def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -> list[Healthy]:
-    """List the recordings of a baseline; raise InputError if one of them, or the judged recording, is no Recording."""
+    """Return the baseline as a list; raise InputError unless it and the judged recording are of valid types.
+
+    A single Recording counts as a baseline of one recording.
+    """
     is_single = isinstance(baseline, Recording | str | os.PathLike)
     if not is_single and not isinstance(baseline, Iterable):
         raise InputError(f"baseline must be a Recording or a sequence of Recordings, got {type(baseline).__name__}")

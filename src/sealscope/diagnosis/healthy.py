@@ -1,4 +1,4 @@
-"""Healthy recordings, as samples or as the summaries that detectors computed of them at commissioning."""
+"""Healthy recordings, as samples or as the summaries that detectors computed when the machine was commissioned."""
 
 from __future__ import annotations
 
@@ -8,18 +8,34 @@ from typing import Any
 
 from sealscope.recordings.recording import Array, Recording
 
-#: What a detector's `learn` computed of a healthy recording: plain values that only that detector reads.
+#: A detector's summary of a healthy recording, from its method `learn`: plain values that only this detector reads.
 Summary = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class SummarisedRecording:
-    """A healthy recording reduced to the summaries of the detectors, without its samples.
+    """A healthy recording reduced to the detectors' summaries, without its samples.
 
-    `file`: its name; `digest`: hash of its chamber pressures in hexadecimal digits, equal for copies; `units` by
-    channel; `rate` [Hz]; `seconds`: duration; `start_s`: time of its first sample [s since 1970], None if unknown;
-    `summaries`: by name of the detector; `about`: pressure, oil temperature, noise and problems, for display;
-    `statistics`: surprisals of its changes by name, finite numbers (`observation.healthy_surprisals`).
+    Attributes
+    ----------
+    file : str
+        Name of the recording.
+    digest : str
+        SHA-256 of its chamber pressures in hexadecimal digits, equal for copies of a recording.
+    units : mapping of str to str
+        Unit of each channel.
+    rate : float
+        Sampling rate [Hz].
+    seconds : float
+        Duration [s].
+    start_s : float or None
+        Time of its first sample [s since 1970], None if unknown.
+    summaries : mapping of str to Summary
+        Summary by each detector, by the detector's name.
+    about : mapping
+        Pressure, oil temperature, noise and problems of the recording, for display.
+    statistics : mapping of str to float or array
+        Surprisals -log(chance) of the changes within the recording, by name (`observation.healthy_surprisals`).
     """
 
     file: str
@@ -38,7 +54,10 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect a detector's summaries of healthy recordings, stored or computed now; skip those without one."""
+    """Collect one detector's summaries of healthy recordings, either stored or computed now.
+
+    Recordings of which the detector has no summary are skipped.
+    """
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

@@ -1,4 +1,4 @@
-"""Inspect recordings before any detector runs: which part can be analysed, and what can be trusted and compared.
+"""Inspect recordings before any detector runs: which samples can be analysed, and what can be trusted and compared.
 
 The judged recording and its leak-free baselines pass the same checks. Baselines that fail them, or that are copies of
 another recording, are left out for all detectors.
@@ -25,12 +25,21 @@ from sealscope.recordings.recording import Recording, compute_once
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """A recording corrected and checked for the detectors.
+    """A recording that was corrected and checked before the detectors use it.
 
-    `part`: its samples on an even clock, from the first to the last at which all chamber pressures and the command are
-    present (`recordings.corrections`); `findings`: defects found in all samples; `distrust`: reason why the chamber
-    pressures cannot be trusted, or None; `share`: fraction of the samples in the part; `judged_until`: fraction of the
-    recording up to the part's last sample.
+    Attributes
+    ----------
+    part : Recording
+        Its samples at equal time steps, from the first to the last at which all chamber pressures and the command are
+        present (`recordings.corrections`).
+    findings : tuple of Finding
+        Defects found in the whole recording.
+    distrust : str or None
+        Reason why the chamber pressures cannot be trusted; None if they can.
+    share : float
+        Fraction of the recording's samples that `part` contains.
+    judged_until : float
+        Fraction of the recording's samples up to the last time of `part`.
     """
 
     part: Recording
@@ -41,7 +50,7 @@ class Inspection:
 
     @property
     def defect(self) -> str | None:
-        """Reason why the recording cannot serve as a baseline, or None."""
+        """Reason why the recording cannot serve as a baseline; None if it can."""
         if missing := describe_missing_chambers(self.part):
             return missing
         if len(self.part) < SHORTEST:
@@ -50,32 +59,32 @@ class Inspection:
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Units of the part by channel."""
+        """Unit of each channel of `part`."""
         return self.part.units
 
     @property
     def file(self) -> str | None:
-        """Name of the recording's file, None if it was not read from one."""
+        """Name of the file that the recording was read from; None if there is none."""
         file = self.part.provenance.get("file")
         return None if file is None else str(file)
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the chamber pressures, equal for copies of a recording."""
+        """SHA-256 of the chamber pressures in hexadecimal digits, equal for copies of a recording."""
         return sha256(b"".join(self.part[name].tobytes() for name in chambers_of(self.part))).hexdigest()
 
 
 def inspect_recording(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
-    """Correct and check a recording, with the result cached.
+    """Correct and check a recording; the result is cached with the recording.
 
-    `channels`: channels to check for findings, all if None.
+    `channels` are the channels to check for findings, by default all.
     """
     names = tuple(name for name in recording.channels if channels is None or name in channels)
     return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
 
 
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
-    """Correct the samples, and decide by the findings whether the pressures can be trusted."""
+    """Correct the samples of a recording, check the channels `names`, and judge if the pressures can be trusted."""
     chambers, (part, corrections, stuck, share) = chambers_of(recording), correct_samples(recording)
     findings = (*inspect(recording.only(names)), *corrections)
     on_chambers = [finding for finding in findings if finding.channel in chambers]
@@ -92,10 +101,16 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
 
 
 class Baselines(NamedTuple):
-    """Leak-free recordings that a recording can be compared with.
+    """Leak-free recordings that can be compared with the judged one, and reasons for those that cannot.
 
-    `parts`: samples of each that can be analysed, or its summary; `findings`: baselines left out, with the reasons;
-    `refusal`: most frequent reason if all given baselines were left out, None if one remains or none was given.
+    Attributes
+    ----------
+    parts : tuple of Recording or SummarisedRecording
+        The comparable recordings: samples that can be analysed, or stored summaries.
+    findings : tuple of Finding
+        Baselines that were left out, with the reasons.
+    refusal : str or None
+        If all given baselines were left out, the most frequent reason; None if one remains or none was given.
     """
 
     parts: tuple[Healthy, ...]
@@ -106,9 +121,9 @@ class Baselines(NamedTuple):
 def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    Left out are baselines that cannot be trusted, those that lack a chamber of the recording or have it in another
-    unit, and the recording itself. Of several copies only the one with the most channels is used. Differences of speed,
-    load and temperature are no reason, as they are left to the detectors.
+    A baseline is left out if it cannot be trusted, if it lacks a chamber of the judged recording or has it in another
+    unit, or if it is the judged recording itself. Of several copies only the one with the most channels is used.
+    Differences of speed, load and temperature are accepted, as the detectors allow for them.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # of the recordings that can be compared
@@ -137,7 +152,10 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
-    """Find the reason, with its severity, why a baseline cannot be compared with the judged recording."""
+    """Find the reason why a baseline cannot be compared with the judged recording; None if it can.
+
+    Returns the severity of the finding and the reason as text.
+    """
     if isinstance(entry, Inspection) and entry.defect is not None:
         return "warning", entry.defect
     if entry.digest == judged.digest:

@@ -1,4 +1,4 @@
-"""Exact statistics of counts: a proportion with its interval, tests of a count, and a correction for several tests."""
+"""Exact statistics of counts: a proportion with its interval, tests of a count, and correction for several tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from sealscope.evaluation.checks import as_probability
 
 @dataclass(frozen=True)
 class IntervalEstimate:
-    """A `value` from `n` observations with its confidence interval (`low`, `high`); infinite if there is no bound."""
+    """A `value` estimated from `n` observations, with its confidence interval from `low` to `high`.
+
+    An end of the interval is infinite if the observations do not bound it.
+    """
 
     n: int
     value: float
@@ -22,24 +25,27 @@ class IntervalEstimate:
 
 @dataclass(frozen=True)
 class Proportion(IntervalEstimate):
-    """The proportion `count` of `n` with its interval; if n is 0, the value is nan and the interval 0 to 1."""
+    """A proportion: `count` observations out of `n`, with its confidence interval.
+
+    If n is 0, the value is nan and the interval is 0 to 1.
+    """
 
     count: int
 
 
 def _check_count(k: int, n: int) -> None:
-    """Raise InputError unless 0 <= k <= n and n >= 1."""
+    """Check that a count satisfies 0 <= k <= n and n >= 1; raise InputError otherwise."""
     if n < 1 or not 0 <= k <= n:
         raise InputError(f"a count must be 0 to n with n >= 1, got {k} of {n}")
 
 
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the exact interval (low, high) of a binomial probability from `k` successes in `n` trials.
+    """Compute the exact confidence interval (low, high) of a probability from `k` successes in `n` trials.
 
-    The coverage is at least `confidence`: ``low = B(alpha/2; k, n-k+1), high = B(1-alpha/2; k+1, n-k)``, with B the
-    quantile of the beta distribution and alpha = 1 - confidence; low is 0 if k = 0, and high is 1 if k = n. Raises
-    InputError for an impossible count or confidence. Source: Clopper and Pearson, Biometrika 26 (1934) 404-413, doi
-    10.1093/biomet/26.4.404.
+    The interval contains the true probability with at least the probability `confidence`. With B the quantile of the
+    beta distribution and alpha = 1 - confidence, ``low = B(alpha/2; k, n-k+1)`` and ``high = B(1-alpha/2; k+1,
+    n-k)``; low is 0 if k = 0, and high is 1 if k = n. Raises InputError for an impossible count or confidence.
+    Source: Clopper and Pearson, Biometrika 26 (1934) 404-413, doi 10.1093/biomet/26.4.404.
     """
     from scipy.special import betaincinv
 
@@ -51,7 +57,10 @@ def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, fl
 
 
 def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
-    """Compute the proportion `k` of `n` with its Clopper-Pearson interval; n = 0 gives nan and 0 to 1."""
+    """Compute the proportion `k` of `n` with its Clopper-Pearson interval.
+
+    If n is 0, the value is nan and the interval is 0 to 1. Raises InputError for an impossible count or confidence.
+    """
     k, n = int(k), int(n)
     as_probability(confidence, "confidence")
     if n == 0 and k == 0:
@@ -61,9 +70,11 @@ def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
 
 
 def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
-    """Compute the one-sided exact lower bound of a binomial probability, ``B(1 - confidence; k, n-k+1)``.
+    """Compute the exact one-sided lower confidence bound of a probability from `k` successes in `n` trials.
 
-    For example, 29 of 29 prove 90 % at 95 % confidence.
+    The bound is ``B(1 - confidence; k, n-k+1)`` with B the quantile of the beta distribution, and 0 for k = 0. For
+    example, 29 successes in 29 trials prove a probability of 90 % at 95 % confidence. Raises InputError for an
+    impossible count or confidence.
     """
     from scipy.special import betaincinv
 
@@ -72,11 +83,11 @@ def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
 
 
 def upper_tail(k: int, n: int, p: float = 0.5) -> float:
-    """Compute the probability of `k` or more successes in `n` trials of probability `p`.
+    """Compute the probability of `k` or more successes in `n` trials that each succeed with probability `p`.
 
-    ``I_p(k, n-k+1)``, 1 for k = 0.
-
-    Source: Abramowitz and Stegun, Handbook of Mathematical Functions (1964), eq. 26.5.24.
+    It is the regularised incomplete beta function ``I_p(k, n-k+1)``, and 1 for k = 0. Raises InputError for an
+    impossible count or probability. Source: Abramowitz and Stegun, Handbook of Mathematical Functions (1964), eq.
+    26.5.24.
     """
     from scipy.special import betainc
 
@@ -89,18 +100,19 @@ def upper_tail(k: int, n: int, p: float = 0.5) -> float:
 def sign_test(k: int, n: int) -> float:
     """Compute the two-sided exact p-value of `k` positive changes out of `n`, if both signs are equally likely.
 
-    ``min(1, 2 P(X >= max(k, n-k)))``. The caller leaves changes of exactly zero out of `n`. Source: Arbuthnot, Phil.
-    Trans. 27 (1710) 186-190; Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.4.
+    The p-value is ``min(1, 2 P(X >= max(k, n-k)))``. Changes of exactly zero must not be counted in `n`. Raises
+    InputError for an impossible count. Source: Arbuthnot, Phil. Trans. 27 (1710) 186-190; Conover, Practical
+    Nonparametric Statistics, 3rd ed. (1999), section 3.4.
     """
     _check_count(k, n)
     return min(1.0, 2.0 * upper_tail(max(k, n - k), n))
 
 
 def holm(p: Sequence[float]) -> tuple[float, ...]:
-    """Correct p-values for multiple testing by Holm's method; the order is kept.
+    """Correct several p-values for multiple testing by Holm's method; return them in the same order.
 
-    The i-th smallest of m (i from 0) becomes ``max over j <= i of min(1, (m - j) p_(j))``. Raises InputError for a
-    value outside 0..1. Source: Holm, Scand. J. Statist. 6 (1979) 65-70.
+    The i-th smallest of m p-values (i from 0) becomes ``max over j <= i of min(1, (m - j) p_(j))``. Raises InputError
+    for a value outside 0 to 1. Source: Holm, Scand. J. Statist. 6 (1979) 65-70.
     """
     for value in p:
         if not 0.0 <= value <= 1.0:

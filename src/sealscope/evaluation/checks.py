@@ -1,4 +1,4 @@
-"""Convert and check the inputs of an evaluation; `what` names the input in an error."""
+"""Convert and check the inputs of an evaluation; the argument `what` names the input in error messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ Array = npt.NDArray[np.float64]
 
 
 def as_numbers(values: npt.ArrayLike, what: str) -> Array:
-    """Convert `values` to a flat array of finite numbers; raise InputError if it is empty or one is not finite."""
+    """Convert `values` to an array (n,) of finite numbers.
+
+    Raises InputError if they are not numbers in one flat list, if there are none, or if one is not finite. `what`
+    names the values in the message.
+    """
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -27,7 +31,11 @@ def as_numbers(values: npt.ArrayLike, what: str) -> Array:
 
 
 def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
-    """Convert `values` to leak sizes; raise InputError for a size <= 0, as leak-free records count as false alarms."""
+    """Convert `values` to an array (n,) of leak sizes; raise InputError for a size that is not positive.
+
+    Records without a leak have no size; they are counted for false alarms instead. `what` names the values in the
+    message.
+    """
     array = as_numbers(values, what)
     wrong = np.flatnonzero(array <= 0.0)
     if wrong.size:
@@ -36,7 +44,10 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Convert `values` (True/False or 1/0) to n booleans; raise InputError for other values or another length."""
+    """Convert `values`, True/False or 1/0, to an array of `n` booleans.
+
+    Raises InputError for other values or another number of them. `what` names the values in the message.
+    """
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:
         raise InputError(f"{what} must be as many as the records, got {array.size} for {n}")
@@ -51,7 +62,10 @@ MIN_PROBABILITY = 1e-15
 
 
 def as_probability(value: float, what: str) -> float:
-    """Convert `value` to a probability; raise InputError unless it is below 1 and at least `MIN_PROBABILITY`."""
+    """Return `value` as a float if it is a probability from 1e-15 to below 1; raise InputError otherwise.
+
+    The lower limit is `MIN_PROBABILITY`. `what` names the value in the message.
+    """
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     if value < MIN_PROBABILITY:

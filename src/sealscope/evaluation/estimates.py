@@ -1,4 +1,4 @@
-"""Evaluate the errors of estimates such as an onset or a flow: means and quantiles with confidence intervals."""
+"""Evaluate the errors of estimates, such as an onset or a flow: means and quantiles with confidence intervals."""
 
 from __future__ import annotations
 
@@ -15,11 +15,22 @@ from sealscope.evaluation.checks import Array, as_numbers, as_probability
 
 @dataclass(frozen=True)
 class EstimateErrors:
-    """Errors (estimate minus truth) over the `n` records with an estimate; `without`: number of the others.
+    """Errors (estimate minus truth) of an estimated quantity over many records, each with a confidence interval.
 
-    `bias`: mean error; `rmse`: root mean square error; `median`: median of the signed error; `median_size`,
-    `ninety_size`: 50 % and 90 % quantile of the absolute error; `coverage`: fraction of the stated intervals that
-    contain the truth.
+    Attributes
+    ----------
+    n, without : int
+        Number of records with and without an estimate.
+    bias : IntervalEstimate
+        Mean error.
+    rmse : IntervalEstimate
+        Root mean square error.
+    median : IntervalEstimate
+        Median of the signed error.
+    median_size, ninety_size : IntervalEstimate
+        50 % and 90 % quantile of the absolute error.
+    coverage : Proportion
+        Fraction of the stated intervals that contain the truth.
     """
 
     n: int
@@ -33,10 +44,11 @@ class EstimateErrors:
 
 
 def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, int]:
-    """Compute the ranks (r, s) of the order statistics between which the `order` quantile lies with `confidence`.
+    """Compute the ranks (r, s) of the sorted sample values between which a quantile lies with `confidence`.
 
-    r is the largest rank with ``P(X <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, X binomial
-    (n, order); r = 0 and s = n + 1 mean that there is no bound. Raises InputError for an impossible order or
+    `n` is the number of values, and `order` the order of the quantile, such as 0.9. r is the largest rank with ``P(X
+    <= r - 1) <= alpha/2`` and s the smallest with ``P(X >= s) <= alpha/2``, where X is binomial (n, order) and alpha
+    = 1 - confidence. r = 0 and s = n + 1 mean that there is no bound. Raises InputError for an impossible order or
     confidence. Source: Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.2.
     """
     from scipy.special import betainc
@@ -49,11 +61,12 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
 
 
 def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Estimate the `order` quantile of a sample as ``x_(ceil(n order))``, with an interval by order statistics.
+    """Estimate a quantile of the distribution that a sample `values` (n,) comes from, with a confidence interval.
 
-    The interval is valid for any distribution, and infinite if the sample is too small to bound the quantile. `values`
-    (n,) may contain inf for values beyond all others. Raises InputError for an empty sample or nan. Source: as
-    `order_ranks`.
+    `order` is the order of the quantile, such as 0.9. The estimate is the sorted value ``x_(ceil(n order))``, and the
+    ends of the interval are sorted values, too (`order_ranks`). The interval is valid for any distribution, and
+    infinite if the sample is too small to bound the quantile. `values` may contain inf for values beyond all others.
+    Raises InputError for an empty sample or nan.
     """
     array = np.sort(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0 or np.isnan(array).any():
@@ -66,7 +79,11 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
 
 
 def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
-    """Estimate the mean with Student's interval ``mean -+ t s/sqrt(n)``; infinite for one value, nan for none."""
+    """Estimate the mean of the distribution that a sample `values` comes from, with Student's confidence interval.
+
+    The interval is ``mean -+ t s/sqrt(n)``. It is infinite for a single value; without values all results are nan.
+    Raises InputError for a value that is not finite.
+    """
     from scipy.special import stdtrit
 
     as_probability(confidence, "confidence")
@@ -84,7 +101,10 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
 def _interval_coverage(
     low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float
 ) -> Proportion:
-    """Compute the proportion of the intervals `low` to `high` that contain the truth; nan or None: no interval."""
+    """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value `truth` (n,).
+
+    Records whose `low` or `high` is nan have no interval; None stands for no intervals at all.
+    """
     low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))
     covered = (low <= truth) & (truth <= high) & has_interval
@@ -92,7 +112,7 @@ def _interval_coverage(
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), all nan for None; raise InputError for another shape."""
+    """Convert `values` to an array (n,), filled with nan if `values` is None; raise InputError for another shape."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")
@@ -108,9 +128,10 @@ def estimate_errors(
 ) -> EstimateErrors:
     """Compute the errors of estimates, such as leaks [L/min] or onsets [s], with confidence intervals.
 
-    All inputs are (n,) in one unit, with nan for a missing estimate or interval; `low`, `high`: stated intervals. The
-    interval of the rmse is the square root of Student's interval of the mean square error, limited to 0; those of the
-    quantiles are by order statistics. Raises InputError if no record has an estimate.
+    `estimates` and `truth` (n,) have the same unit, and so have `low` and `high` (n,), the ends of the stated
+    intervals. A missing estimate or interval is nan. The confidence interval of the rmse is the square root of
+    Student's interval of the mean square error, cut off at 0; those of the quantiles are valid for any distribution.
+    Raises InputError if no record has an estimate.
     """
     true_values = as_numbers(truth, "true values")
     n_records = true_values.size

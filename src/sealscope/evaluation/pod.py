@@ -1,7 +1,7 @@
-"""Probability of detection over the size of the leak.
+"""Probability of detection (POD) as a function of the size of the leak.
 
-Proportions at each size, and a logistic curve fitted to hits and misses with its a50, a90 and a90/95, as in
-MIL-HDBK-1823A.
+It is given by proportions at each size, and by a logistic curve fitted to hits and misses. The curve yields a50, a90
+and a90/95 as in MIL-HDBK-1823A.
 """
 
 from __future__ import annotations
@@ -23,7 +23,11 @@ _MAX_SPANS = 1e4
 
 @dataclass(frozen=True)
 class SizeDetection:
-    """Detection at one `size`: `proportion` with a two-sided interval, and its one-sided `lower` bound."""
+    """Detection of leaks of one `size`.
+
+    `proportion` is the proportion of detected leaks with a two-sided interval, `lower` its one-sided lower confidence
+    bound.
+    """
 
     size: float
     proportion: Proportion
@@ -31,9 +35,10 @@ class SizeDetection:
 
 
 def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
-    """Compute the proportion of detected leaks at each size, in rising order, with Clopper-Pearson's bounds.
+    """Compute the proportion of detected leaks of each size, in the order of rising size, with confidence bounds.
 
-    `leaks`: sizes (n,) in any unit; `hits`: whether each was detected, (n,). Raises InputError for sizes <= 0.
+    `leaks` (n,) are the sizes in any unit, and `hits` (n,) tell whether each leak was detected. The bounds are those
+    of Clopper and Pearson. Raises InputError for a size that is not positive.
     """
     sizes = as_sizes(leaks)
     is_hit = as_flags(hits, sizes.size, "hits")
@@ -46,10 +51,12 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 
 
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
-    """Find the smallest tested size from which on every size has a lower bound >= `detection`.
+    """Find the smallest tested size from which on all tested sizes are proven to be detected.
 
-    Infinite if there is none. For example, 29 hits of 29 prove 90 % at 95 % confidence: a90/95 without a model. The
-    confidence applies to each size separately. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    `detection` is the probability of detection to be proven. A size is proven if the lower confidence bound of its
+    proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 % confidence: this is a90/95
+    without a model. The confidence applies to each size separately. Returns infinity if no size is proven. Source:
+    Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -61,21 +68,26 @@ def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
 
 
 def _log_odds(p: float) -> float:
-    """Compute the log odds of a probability."""
+    """Compute the log odds ``ln(p/(1 - p))`` of a probability."""
     return math.log(p / (1.0 - p))
 
 
 def _information(design: Array, n: Array, eta: Array) -> Array:
-    """Compute the Fisher information (2, 2) of the coefficients from `design` (m, 2), `n` trials, log odds `eta`."""
+    """Compute the Fisher information (2, 2) of intercept and slope of the logistic curve.
+
+    `design` (m, 2) has the columns 1 and logarithm of size, `n` (m,) are the numbers of trials, and `eta` (m,) the
+    log odds of detection.
+    """
     odds = np.exp(-np.abs(eta))  # does not overflow; p (1 - p) is even in eta
     weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
     return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
 
 
 def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: bool) -> float:
-    """Compute the log-likelihood of `k` hits in `n` trials at log odds `eta`: ``sum of k eta - n ln(1 + exp eta)``.
+    """Compute the log-likelihood of `k` hits in `n` trials at m sizes with the log odds `eta` of a hit, all (m,).
 
-    `firth`: add half the log determinant of the information.
+    It is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information is
+    added as a penalty.
     """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
@@ -85,12 +97,15 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: boo
 
 
 def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Array:
-    """Find the coefficients (intercept, slope) of the largest log-likelihood, penalised if `firth`."""
+    """Find intercept and slope of the logistic curve by maximum likelihood, or with `firth` by penalised likelihood.
+
+    `design` (m, 2) has the columns 1 and logarithm of size; `n` trials and `k` hits (m,) are counted for each size.
+    """
     from scipy.optimize import minimize
     from scipy.special import expit
 
     def loss(beta: Array) -> tuple[float, Array]:
-        """Compute the negative log-likelihood and its gradient."""
+        """Compute the negative log-likelihood of the coefficients `beta`, and its gradient."""
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
@@ -104,7 +119,10 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Test whether hits and misses overlap in at most one size, which leaves the likelihood without a maximum."""
+    """Test whether hits and misses overlap in at most one size, so that the likelihood has no finite maximum.
+
+    `n` and `k` (m,) are trials and hits at rising sizes.
+    """
     hit_fraction = k / n
     n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))
     steps = np.diff(hit_fraction)
@@ -113,11 +131,21 @@ def _is_separated(n: Array, k: Array) -> bool:
 
 @dataclass(frozen=True)
 class HitMiss:
-    """A fitted logistic curve, ``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
+    """A logistic curve fitted to hits and misses: ``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
 
-    `covariance`: (2, 2) of intercept and slope; `estimator`: Firth's penalised likelihood if hits and misses are
-    separated by size, else maximum likelihood; `log_likelihood`: maximum, with the penalty if there is one; `null`: the
-    same with slope 0; `size`, `tested`, `hits`: (m,) sizes, numbers of leaks and of hits.
+    Attributes
+    ----------
+    intercept, slope : float
+        Coefficients of the curve.
+    covariance : array, (2, 2)
+        Covariance of intercept and slope.
+    estimator : {"maximum likelihood", "firth"}
+        Method of the fit: Firth's penalised likelihood if hits and misses are separated by size, else maximum
+        likelihood.
+    log_likelihood, null : float
+        Log-likelihood of the fit and of the best curve with slope 0, including the penalty if there is one.
+    size, tested, hits : array, (m,)
+        Tested sizes, and at each the number of leaks and of hits.
     """
 
     intercept: float
@@ -137,7 +165,10 @@ class HitMiss:
         return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
-        """Compute the pointwise two-sided interval (low, high) of the detection at each size (Wald, on log odds)."""
+        """Compute a two-sided confidence interval (low, high) of the probability of detection at each size.
+
+        The interval is Wald's on log odds, and holds at each size separately.
+        """
         from scipy.special import expit, ndtri
 
         x, v = _log_sizes(size), self.covariance  # of intercept and slope
@@ -147,9 +178,10 @@ class HitMiss:
         return np.asarray(expit(eta - margin), dtype=np.float64), np.asarray(expit(eta + margin), dtype=np.float64)
 
     def size_at(self, detection: float) -> float:
-        """Compute the size detected with probability `detection`: ``ln(size) = (ln(p/(1-p)) - intercept)/slope``.
+        """Compute the size that is detected with the probability `detection`, such as a90 for 0.9.
 
-        Infinite if detection does not rise with the size.
+        It follows from ``ln(size) = (ln(p/(1-p)) - intercept)/slope`` with p the probability, and is infinite if the
+        detection does not rise with the size.
         """
         as_probability(detection, "the probability of detection")
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
@@ -157,9 +189,10 @@ class HitMiss:
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
         """Compute the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
 
-        The bound is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square with
-        one degree of freedom), infinite if there is none. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
-        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
+        The bound is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square
+        with one degree of freedom), infinite if there is none. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and
+        Iles, Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are
+        wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
@@ -172,7 +205,7 @@ class HitMiss:
             return math.inf
 
         def excess_drop(log_size: float) -> float:
-            """Compute the drop of the profile log-likelihood below the maximum at a size, minus `allowed_drop`."""
+            """Compute how far the profile log-likelihood at a size is below the maximum, minus the allowed drop."""
             return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
         # bracket the root with growing steps from the estimate upwards
@@ -188,28 +221,31 @@ class HitMiss:
 
     @property
     def a50(self) -> float:
-        """The size detected with probability 50 %."""
+        """The size that is detected with a probability of 50 %."""
         return self.size_at(0.5)
 
     @property
     def a90(self) -> float:
-        """The size detected with probability 90 %."""
+        """The size that is detected with a probability of 90 %."""
         return self.size_at(0.9)
 
     @property
     def a90_95(self) -> float:
-        """The upper 95 % confidence bound of the size detected with probability 90 % (likelihood ratio)."""
+        """The upper 95 % confidence bound of the size that is detected with a probability of 90 %."""
         return self.size_bound()
 
     def _profile_log_likelihood(self, log_odds: float, log_size: float) -> float:
-        """Compute the largest log-likelihood of all curves that have `log_odds` at `log_size`."""
+        """Compute the largest log-likelihood of all logistic curves that pass through `log_odds` at `log_size`."""
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            """Compute the negative log-likelihood of a slope; 1e300 if it is infinite, which the search cannot use."""
+            """Compute the negative log-likelihood of the curve with a slope; 1e300 if it is infinite.
+
+            The search cannot use an infinite value.
+            """
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
@@ -219,23 +255,24 @@ class HitMiss:
 
 
 def _log_sizes(values: npt.ArrayLike) -> Array:
-    """Compute the natural logarithms of sizes; raise InputError for a size <= 0."""
+    """Compute the natural logarithms of sizes (n,); raise InputError for a size that is not positive."""
     return np.asarray(np.log(as_sizes(np.atleast_1d(np.asarray(values, dtype=np.float64)), "sizes")), dtype=np.float64)
 
 
 def _exp_size(log_size: float) -> float:
-    """Compute the size from its natural logarithm; infinite if it overflows."""
+    """Compute a size from its natural logarithm; infinite if it is too large for a float."""
     return math.exp(log_size) if log_size < 709.0 else math.inf  # exp overflows above 709.78
 
 
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
-    """Fit a logistic curve to hits and misses over the logarithm of the size, by maximum likelihood.
+    """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks`: sizes (n,) > 0 in any unit; `hits`: whether each was detected, (n,). If hits and misses are separated by
-    size, the likelihood has no finite maximum and Firth's penalised likelihood is used (`HitMiss.estimator`), also for
-    the bound. The curve goes to 0 for small leaks, as it does not include the false-alarm rate. Raises InputError for a
-    single size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38,
-    doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    `leaks` (n,) are positive sizes in any unit, and `hits` (n,) tell whether each leak was detected. The fit is by
+    maximum likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's
+    penalised likelihood is used (`HitMiss.estimator`), also for the bound. The curve goes to 0 for small leaks, as it
+    does not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
+    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
+    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
     x = np.log(as_sizes(leaks))
     is_hit = as_flags(hits, x.size, "hits")

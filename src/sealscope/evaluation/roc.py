@@ -1,4 +1,4 @@
-"""Compute the receiver operating characteristic of a score with a band, and the area under it with an interval."""
+"""Compute the receiver operating characteristic (ROC) of a score with a confidence band, and the area under it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,16 @@ from sealscope.evaluation.checks import Array, as_numbers, as_probability
 
 @dataclass(frozen=True)
 class Roc:
-    """The ROC by falling threshold, from (0, 0) to (1, 1), with a simultaneous band.
+    """The ROC curve, from (0, 0) to (1, 1) in the order of falling thresholds, with a confidence band.
 
-    `threshold`, `false_alarm`, `detection`: (k,), with an alarm if score >= threshold; (`low`, `high`): (k,), band of
-    the detection at each false-alarm probability.
+    Attributes
+    ----------
+    threshold : array, (k,)
+        Thresholds; an alarm is raised if the score is at least the threshold.
+    false_alarm, detection : array, (k,)
+        Fractions of the leak-free and of the leaky scores that raise an alarm.
+    low, high : array, (k,)
+        Simultaneous confidence band of the detection at each false-alarm probability.
     """
 
     threshold: Array
@@ -30,9 +36,10 @@ class Roc:
 
 @dataclass(frozen=True)
 class Area:
-    """Area under the ROC: `value` = P(leaky score > leak-free score) + P(equal)/2.
+    """Area under the ROC curve, with its standard error and its confidence interval from `low` to `high`.
 
-    `standard_error`: 0 if the scores are completely separated; (`low`, `high`): interval by `method`.
+    `value` is P(leaky score > leak-free score) + P(equal)/2. `standard_error` is 0 if the scores are completely
+    separated. `method` is the method of the interval.
     """
 
     value: float
@@ -43,30 +50,31 @@ class Area:
 
 
 def _as_scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, Array]:
-    """Convert both kinds of scores to arrays of finite numbers."""
+    """Convert the scores of leak-free and of leaky records to arrays; raise InputError unless they are finite."""
     return as_numbers(leak_free, "leak-free scores"), as_numbers(leaky, "scores with a leak")
 
 
 def _count_exceeding(scores: Array, thresholds: Array) -> Array:
-    """Count the scores at or above each threshold."""
+    """Count for each threshold (k,) the scores that are at least as large."""
     return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
 
 
 def kolmogorov_margin(n: int, confidence: float) -> float:
-    """Compute the half width of a confidence band around the empirical distribution of n samples.
+    """Compute the half width of a confidence band around the empirical distribution of `n` samples.
 
-    ``sqrt(ln(2/alpha) / (2n))``, for any n and any distribution. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi
-    10.1214/aop/1176990746.
+    The half width is ``sqrt(ln(2/alpha) / (2n))`` with alpha = 1 - confidence; it is valid for any n and any
+    distribution. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi 10.1214/aop/1176990746.
     """
     return math.sqrt(math.log(2.0 / (1.0 - as_probability(confidence, "confidence"))) / (2.0 * n))
 
 
 def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Roc:
-    """Compute the ROC of a score that is high for leaks; ties give slanted steps.
+    """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
-    The band contains the whole true curve with `confidence`: it is the envelope of the points moved by the margins d
-    (false alarms) and e (detection) of `kolmogorov_margin`, each at sqrt(confidence). Raises InputError unless there
-    are scores of both kinds. Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
+    Equal scores of both kinds give slanted steps. The band contains the whole true curve with the probability
+    `confidence`. It is the envelope of the points moved by the margins of `kolmogorov_margin`, d for false alarms and
+    e for detection, each at sqrt(confidence). Raises InputError unless there are scores of both kinds. Source:
+    Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)
     as_probability(confidence, "confidence")
@@ -81,10 +89,10 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
-    """Compute for each score the fraction of the other group's scores on its correct side.
+    """Compute for each score the fraction of the other group's scores from which it differs in the right direction.
 
-    Leaky scores should be the higher ones; ties count half. Returns the fractions of the leak-free scores (n,) and of
-    the leaky scores (m,).
+    The right direction is that leaky scores are the higher ones; equal scores count half. Returns the fractions for
+    the leak-free scores (n,) and for the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
@@ -93,18 +101,19 @@ def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
 
 
 def _newcombe_interval(value: float, leak_free: int, leaky: int, z: float) -> tuple[float, float]:
-    """Compute the confidence limits of an area A = `value`: the solutions t of ``|t - A| = z SE(t)``.
+    """Compute Newcombe's confidence interval (low, high) of an area A = `value` under the ROC curve.
 
-    `leak_free`, `leaky`: numbers of scores; `z`: normal quantile. SE is Hanley and McNeil's with both numbers replaced
-    by their mean. The interval has a width even if A is 0 or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi
-    10.1002/sim.2324, method 5.
+    Its ends are the solutions t of ``|t - A| = z SE(t)``. `leak_free` and `leaky` are the numbers of scores, and `z`
+    is a normal quantile. SE is Hanley and McNeil's standard error with both numbers replaced by their mean. The
+    interval has a width even if A is 0 or 1. Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324,
+    method 5.
     """
     from scipy.optimize import brentq
 
     mean_number = (leak_free + leaky) / 2.0
 
     def excess(t: float) -> float:
-        """Compute (t - A)^2 - (z SE(t))^2, which is 0 at a limit."""
+        """Compute (t - A)^2 - (z SE(t))^2, which is 0 at the ends of the interval."""
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (leak_free * leaky)
 
@@ -114,12 +123,13 @@ def _newcombe_interval(value: float, leak_free: int, leaky: int, z: float) -> tu
 
 
 def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Area:
-    """Compute the area under the ROC, ``sum of (b > a) + (b = a)/2`` over all pairs / (n m).
+    """Compute the area under the ROC curve with a confidence interval.
 
-    `leak_free`: scores a (n,), `leaky`: scores b (m,), high for leaks. The interval is DeLong's normal approximation,
-    limited to 0 and 1. If the scores are completely separated, it has no width and Newcombe's is used (`method`).
-    Raises InputError for fewer than 2 records of a kind. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44
-    (1988) 837-845, doi 10.2307/2531595, eq. (5)-(8).
+    `leak_free` are scores a (n,) and `leaky` scores b (m,), which are high for leaks. The area is ``sum of (b > a) +
+    (b = a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1. If
+    the scores are completely separated, that has no width, and Newcombe's interval is used (`method`). Raises
+    InputError for fewer than 2 records of a kind. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988)
+    837-845, doi 10.2307/2531595, eq. (5)-(8).
     """
     from scipy.special import ndtri
 

@@ -1,7 +1,7 @@
-"""Roots and minima of functions of one number, for commands that must start fast.
+"""Find roots and minima of functions of one number, for commands that must start fast.
 
-`scipy.optimize` finds the same, but its import loads 200 modules: a fifth of the time of a diagnosis. Called wherever a
-probability is turned into a threshold or a bound.
+`scipy.optimize` finds the same, but its import loads 200 modules, which takes a fifth of the time of a diagnosis.
+Used wherever a probability is converted to a threshold or a bound.
 
 Sources: T. R. Chandrupatla, Adv. Eng. Softw. 28 (1997) 145 (roots); J. Kiefer, Proc. Amer. Math. Soc. 4 (1953) 502
 (golden section).
@@ -59,9 +59,9 @@ def find_near_root(
 ) -> float | None:
     """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
 
-    The argument should have a scale of about one. If `start` is within a few per cent of the zero, this takes a third
-    of the evaluations of `find_root`. None also if the iteration leaves the range `low` to `high`, or meets a slope <=
-    0. `slope`: approximate slope of the function at `start`.
+    `slope` is the approximate slope of the function at `start`, and the argument should have a scale of about one. If
+    `start` is within a few per cent of the zero, this takes a third of the evaluations of `find_root`. The result is
+    also None if the iteration leaves the range from `low` to `high`, or meets a slope that is not positive.
     """
     x, f_x = start, function(start)
     for _ in range(_MAX_SECANTS):
@@ -78,9 +78,10 @@ def find_near_root(
 
 
 def find_minimum(function: Callable[[float], float], low: float, high: float, tolerance: float) -> tuple[float, float]:
-    """Find the only minimum of a function between `low` and `high`; return its position and value.
+    """Find the minimum of a function with a single minimum between `low` and `high`, by golden section search.
 
-    Uses golden sections; `tolerance`: largest error of the position.
+    `tolerance` is the largest error of the position. Returns the position of the minimum and the function's value
+    there.
     """
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     f_left, f_right = function(left), function(right)

@@ -1,4 +1,4 @@
-"""Compute rates of events per hour and confusion matrices of faults, with exact intervals."""
+"""Compute rates of events per hour and confusion matrices of faults, with exact confidence intervals."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ CANNOT_TELL = "cannot tell"
 
 
 def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the exact interval (low, high) of a Poisson mean after `count` events.
+    """Compute the exact confidence interval (low, high) of a Poisson mean after `count` events.
 
-    ``low = G(alpha/2; k), high = G(1 - alpha/2; k + 1)``, with G the quantile of the gamma distribution of shape k; low
-    is 0 if there was no event. Raises InputError for an impossible count or confidence. Source: Garwood, Biometrika 28
-    (1936) 437-442, doi 10.1093/biomet/28.3-4.437.
+    With G the quantile of the gamma distribution of shape k and alpha = 1 - confidence, ``low = G(alpha/2; k)`` and
+    ``high = G(1 - alpha/2; k + 1)``, where k is the count; low is 0 if there was no event. Raises InputError for an
+    impossible count or confidence. Source: Garwood, Biometrika 28 (1936) 437-442, doi 10.1093/biomet/28.3-4.437.
     """
     from scipy.special import gammainccinv, gammaincinv
 
@@ -33,7 +33,10 @@ def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float
 
 
 def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
-    """Compute the rate of events per operating hour with its exact interval; raise InputError unless `hours` > 0."""
+    """Compute the rate of events per operating hour with its exact confidence interval.
+
+    Raises InputError unless `hours` is positive and `count` a whole number that is not negative.
+    """
     if not (math.isfinite(hours) and hours > 0.0):
         raise InputError(f"operating hours must be > 0, got {hours}")
     low, high = poisson_interval(count, confidence)
@@ -42,10 +45,18 @@ def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> Inter
 
 @dataclass(frozen=True)
 class Confusion:
-    """A confusion matrix: `counts[i, j]` records with the fault `rows[i]` have the verdict `columns[j]`.
+    """A confusion matrix of true faults (rows) and verdicts (columns), the last column being "cannot tell".
 
-    The last column is `cannot tell`. `shares[i][j]`: fraction of the row's records with that verdict; `accuracy`:
-    fraction of correct verdicts among all records, with `cannot tell` counted as incorrect.
+    Attributes
+    ----------
+    rows, columns : tuple of str
+        Names of the true faults and of the verdicts.
+    counts : array, (rows, columns)
+        Number of records with this fault and this verdict.
+    shares : tuple of tuple of Proportion
+        Fraction of the records of each row with this verdict.
+    accuracy : Proportion
+        Fraction of correct verdicts among all records, "cannot tell" counted as incorrect.
     """
 
     rows: tuple[str, ...]
@@ -58,10 +69,11 @@ class Confusion:
 def confusion_matrix(
     truth: Sequence[str], verdicts: Sequence[str], faults: Sequence[str], confidence: float = 0.95
 ) -> Confusion:
-    """Count verdicts by true fault, with Clopper-Pearson's intervals for each row.
+    """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
-    `truth`, `verdicts`: true fault and verdict of each record; `faults`: all names, including that for no fault, in the
-    order of rows and columns. Raises InputError for a name that is not in `faults`, or a true fault `cannot tell`.
+    `truth` and `verdicts` are the true fault and the verdict of each record. `faults` are the names of all faults,
+    including that for no fault, in the order of rows and columns. Raises InputError for a name that is not in
+    `faults`, or if "cannot tell" is among the faults.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

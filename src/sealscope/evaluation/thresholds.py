@@ -1,6 +1,6 @@
-"""Set a threshold from leak-free scores, with the distribution of its true false-alarm probability.
+"""Set the threshold of an alarm from leak-free scores, and state how uncertain the false-alarm probability then is.
 
-The threshold is an order statistic, so that the result is exact for any distribution of the scores.
+The threshold is one of the scores, so that the results are exact for any distribution of the scores.
 """
 
 from __future__ import annotations
@@ -21,11 +21,23 @@ Promise = Literal["average", "bound"]
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold, the `rank`-th largest of `n` leak-free scores; an alarm is raised if score > `value`.
+    """A threshold set from leak-free scores; an alarm is raised if the score exceeds `value`.
 
-    The true false-alarm probability is distributed as Beta(`rank`, n + 1 - rank), and smaller with ties. `expected`:
-    its mean; (`low`, `high`): its interval at `confidence`; `false_alarm_probability`, `promise`: the requested
-    probability and how it is kept.
+    Attributes
+    ----------
+    value : float
+        The threshold.
+    false_alarm_probability : float
+        The requested false-alarm probability.
+    promise : {"average", "bound"}
+        Whether this probability is kept on average over sets of leak-free records, or as a bound with `confidence`.
+    rank, n : int
+        The threshold is the `rank`-th largest of `n` leak-free scores.
+    expected, low, high : float
+        Mean of the true false-alarm probability, and its interval at `confidence`. The true probability is
+        distributed as Beta(rank, n + 1 - rank), and is smaller if scores are equal.
+    confidence : float
+        Confidence of the interval, and of the promise "bound".
     """
 
     value: float
@@ -40,11 +52,12 @@ class Threshold:
 
 
 def records_needed(false_alarm: float, confidence: float | None = None) -> int:
-    """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability.
+    """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability p.
 
-    On average, without `confidence`: ``ceil(1/p) - 1``. As a bound with `confidence`: the smallest n with
-    ``1 - (1 - p)^n >= confidence``, such as 299 for 1 % at 95 %. Raises InputError for an impossible probability or
-    confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
+    Without `confidence`, p is kept on average, which takes ``ceil(1/p) - 1`` records. With `confidence`, p is kept as
+    a bound, which takes the smallest n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises
+    InputError for an impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi
+    10.1214/aoms/1177731788.
     """
     as_probability(false_alarm, "the false-alarm probability")
     if confidence is None:
@@ -54,9 +67,9 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
 
 
 def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Compute the largest rank, counted from the highest score, that keeps `promise`; 0 if none does.
+    """Compute the largest rank, counted from the highest of `n` leak-free scores, whose score may be the threshold.
 
-    `n`: number of leak-free scores; `promise`, `confidence`: as in `quantile_threshold`.
+    `promise` and `confidence` are those of `quantile_threshold`. Returns 0 if there are too few scores.
     """
     from scipy.special import betainc
 
@@ -69,12 +82,13 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
 def quantile_threshold(
     scores: npt.ArrayLike, false_alarm: float, confidence: float = 0.95, promise: Promise = "average"
 ) -> Threshold:
-    """Compute the lowest threshold that keeps a false-alarm probability, from the scores of leak-free records.
+    """Compute the lowest threshold that keeps a false-alarm probability p, from scores of leak-free records.
 
-    `scores`: (n,), high for a leak. `promise` "average": rank ``floor(p (n + 1))``, so that the next record's score
-    exceeds the threshold with probability <= p (split conformal); "bound": the largest rank whose true probability is
-    <= p with probability >= `confidence` (tolerance limit). Exact for independent records of any continuous
-    distribution. Raises InputError with the number needed if there are too few records. Source: Wilks (1941), doi
+    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold has the rank
+    ``floor(p (n + 1))``, so that the next record's score exceeds it with a probability of at most p (split
+    conformal). With "bound", it has the largest rank whose true false-alarm probability is at most p with the
+    probability `confidence` (tolerance limit). Both are exact for independent records of any continuous distribution.
+    Raises InputError with the number needed if there are too few records. Source: Wilks (1941), doi
     10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
     """
     from scipy.special import betaincinv

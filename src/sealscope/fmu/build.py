@@ -1,4 +1,4 @@
-"""Build a functional mock-up unit: an archive of the compiled laws, an interface in C, and a description."""
+"""Build a functional mock-up unit (FMU): an archive of compiled equations, an interface in C and a description."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ Version = Literal[2, 3]
 #: Methods of a soft sensor: the volume balance, from both chamber pressures, the pump's angle and the piston's
 #: position.
 Sensor = Literal["volume"]
-#: Default rms error [Pa] of a pressure by which a unit's step is chosen, and the commands of the runs that choose it.
+#: Default rms error [Pa] of a pressure for which the step of an FMU is chosen, and the commands of the runs that
+#: choose it.
 ERROR = 1.0
 STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
-#: Longest time [s] of the C compiler.
+#: Longest time [s] that the C compiler may take.
 _COMPILE_TIMEOUT = 300.0
 _README = """\
 The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another
@@ -45,7 +46,11 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 
 
 class Platform(NamedTuple):
-    """A system that units run on: LLVM's `triple`, the compiler's `target`, folder by FMI version, library suffix."""
+    """An operating system and processor on which an FMU can run.
+
+    `triple`: its name for LLVM; `target`: its name for the C compiler; `folders`: by FMI version, its folder in the
+    archive; `suffix`: that of a shared library's file.
+    """
 
     triple: str
     target: str
@@ -59,7 +64,7 @@ PLATFORMS: Mapping[str, Platform] = convert_type(
 
 
 def this_platform() -> str:
-    """Return the name of this system in `PLATFORMS`; raise InputError if it is not there."""
+    """Return the name of the present system in `PLATFORMS`, such as "linux"; raise InputError if it has none."""
     import platform
 
     is_arm = platform.machine().lower() in ("arm64", "aarch64")
@@ -71,14 +76,17 @@ def this_platform() -> str:
 
 
 class Compiler(NamedTuple):
-    """A C compiler: its command, and True if it also compiles for other systems."""
+    """A C compiler.
+
+    `command`: program and first arguments; `cross_compiles`: True if it also compiles for other systems.
+    """
 
     command: list[str]
     cross_compiles: bool
 
 
 def find_compiler() -> Compiler:
-    """Find a C compiler, zig's or else the system's; raise InputError if there is none."""
+    """Find a C compiler: that of the package ziglang, else the system's; raise InputError if there is none."""
     from importlib.util import find_spec
 
     if find_spec("ziglang") is not None:
@@ -90,7 +98,7 @@ def find_compiler() -> Compiler:
 
 
 def fmi_headers() -> Path:
-    """Find the folder of FMI's C headers in the package FMPy; raise InputError if it is not installed."""
+    """Find the folder of FMI's C headers in the package FMPy; raise InputError if FMPy is not installed."""
     from importlib.util import find_spec
 
     package = find_spec("fmpy")
@@ -100,9 +108,10 @@ def fmi_headers() -> Path:
 
 
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
-    """Choose the solver's step [s] for an rms error of pressures of at most `error` [Pa]; return step and error.
+    """Choose the solver's step [s] with which the rms error of the pressures is at most `error` [Pa].
 
-    It is the shortest step that `integrate_run` chooses in runs of 4 s from mid-stroke under each of `STEP_COMMANDS`.
+    `integrate_run` chooses a step in a run of 4 s from mid-stroke under each of `STEP_COMMANDS`. Returns the shortest
+    of these steps [s], and the largest error [Pa] that these runs estimate.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -113,11 +122,12 @@ def choose_step(rig: Rig, error: float) -> tuple[float, float]:
 
 
 class MockUp(NamedTuple):
-    """The code and data of a functional mock-up unit, to be compiled and archived.
+    """The code and data of a functional mock-up unit (FMU), to be compiled and archived.
 
-    `summary`: its description; `modules`: LLVM code by function; `variable_list`: its variables; `values`: initial
-    values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: sizes of its arrays; `step`
-    [s]: longest step of the solver; `failures`: messages for the codes that the functions return.
+    `summary`: one line that describes it; `modules`: LLVM code by function; `variable_list`: its variables; `values`:
+    initial values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: number of inputs,
+    outputs and states; `step` [s]: longest step of the solver; `failures`: messages by the code that a function
+    returns.
     """
 
     summary: str
@@ -132,12 +142,15 @@ class MockUp(NamedTuple):
 
     @property
     def token(self) -> str:
-        """A hash of the unit, by which the description and the library identify each other."""
+        """Hash (32 hex digits) of the FMU's code and variables, by which its library recognises its description."""
         texts = [self.summary, str(self.variable_list), *self.modules.values()]
         return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
-        """Write the unit's archive, with a library for each platform; raise InputError if the compiler fails."""
+        """Write the FMU's archive, with a shared library for each platform; raise InputError if the compiler fails.
+
+        `version`: FMI version; `platforms`: names in `PLATFORMS`.
+        """
         name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
         identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # must be valid in C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
@@ -153,7 +166,7 @@ class MockUp(NamedTuple):
                     archive.write(source, f"sources/{source.relative_to(source_folder).as_posix()}")
 
     def _write_sources(self, folder: Path, version: Version) -> list[Path]:
-        """Write the sources of the unit to a folder; return their paths."""
+        """Write the FMU's sources (C, LLVM code and headers) to a folder; return the paths of the files."""
         interface = files("sealscope.fmu") / "c"
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
         present = [int(k in value_indices) for k in range(len(self.values))]  # 1: a parameter is a variable of the unit
@@ -168,7 +181,10 @@ class MockUp(NamedTuple):
         return [folder / name for name in texts]
 
     def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Compile the unit's shared library for a platform, from the sources in `folder`; return its bytes."""
+        """Compile the FMU's shared library for one platform from the sources in `folder`; return the library's bytes.
+
+        `system`: name in `PLATFORMS`. Raises InputError if the compiler fails.
+        """
         platform, compiler = PLATFORMS[system], find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
@@ -195,10 +211,11 @@ def write_fmu(
     error: float = ERROR,
     step: float | None = None,
 ) -> tuple[Variable, ...]:
-    """Write a rig as a functional mock-up unit for co-simulation.
+    """Write a functional mock-up unit (FMU) that simulates a rig in co-simulation.
 
-    The unit contains the compiled laws of `simulate`, and needs no Python. Its inputs are the command, a leak, external
-    leakage and a load; every parameter that the rig's laws take can be tuned; its outputs are states, flows and powers.
+    The FMU contains the compiled equations of `simulate`, and needs no Python. Its inputs are the command, a leak,
+    external leakage and a load; every parameter of the rig's equations can be tuned; its outputs are states, flows
+    and powers.
 
     Parameters
     ----------
@@ -209,17 +226,17 @@ def write_fmu(
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
-        Systems that it runs on: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm"; by default
-        this one. Others need the compiler that ``pip install 'sealscope[fmu]'`` installs.
+        Systems on which the FMU can run: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm";
+        by default the present one. Others need the compiler that ``pip install 'sealscope[fmu]'`` installs.
     error : float, optional
-        Largest rms error of a pressure [Pa], by which the solver's step is chosen.
+        Largest rms error of a pressure [Pa]; the solver's step is chosen to keep it.
     step : float, optional
-        Longest step of the solver [s], in place of one chosen by `error`.
+        Longest step of the solver [s], instead of one chosen for `error`.
 
     Returns
     -------
     tuple of Variable
-        The unit's variables: name, unit, causality, initial value.
+        The FMU's variables: name, unit, causality, initial value.
 
     Raises
     ------
@@ -267,10 +284,11 @@ def write_sensor_fmu(
     fmi: Version = 2,
     platforms: Sequence[str] | None = None,
 ) -> tuple[Variable, ...]:
-    """Write a soft sensor of leakage as a functional mock-up unit for co-simulation.
+    """Write a functional mock-up unit (FMU) that estimates the leakage from measurements, a soft sensor.
 
-    Its inputs are readings; its outputs are the leakage in m^3/s with its 95 % interval, and its rise over that of the
-    first blocks. The unit contains the compiled live volume balance, and needs no Python.
+    Its inputs are measured pressures, angle and position. Its outputs are the leakage [m^3/s] and its rise above the
+    leakage during the first blocks of the run, each with a 95 % interval. The FMU contains the compiled volume
+    balance that also judges live recordings, and needs no Python.
 
     Parameters
     ----------
@@ -281,16 +299,16 @@ def write_sensor_fmu(
     rig : Rig, str or path-like, optional
         The assumed machine: a rig, the name of a packaged one, or the path of a TOML file.
     rate : float, optional
-        Sampling rate [Hz], at least 16; it does not depend on the communication steps.
+        Sampling rate of the inputs [Hz], at least 16; it does not depend on the communication steps.
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
-        Systems that it runs on, as in `write_fmu`.
+        Systems on which the FMU can run, as in `write_fmu`.
 
     Returns
     -------
     tuple of Variable
-        The unit's variables: name, unit, causality, initial value.
+        The FMU's variables: name, unit, causality, initial value.
 
     Raises
     ------
@@ -329,7 +347,7 @@ def write_sensor_fmu(
 
 
 def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
-    """Load the rig of a unit; raise InputError if it has a servo valve."""
+    """Load the rig for an FMU; raise InputError if it is not pump-controlled."""
     machine = load_rig(rig)
     if not machine.circuit.pump_feeds_chambers:
         raise InputError(f"a unit must be of a pump-controlled rig (valve.spool = absent), got {machine.name}")
@@ -337,7 +355,7 @@ def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
 
 
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
-    """Choose the platforms of a unit, by default this one; check them, the file's name and the FMI version.
+    """Check the file name, FMI version and platforms of an FMU, and return the platforms, by default the present one.
 
     Raises InputError if one of these is invalid, or the compiler cannot build for a platform.
     """

@@ -1,4 +1,4 @@
-"""The description of a unit: modelDescription.xml of FMI 2.0 and 3.0."""
+"""The description of a functional mock-up unit (FMU): modelDescription.xml of FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Return the jinja2 environment that loads a unit's templates: its XML description and its C configuration."""
+    """Return the jinja2 environment that loads the templates of an FMU: of its XML description and its C header."""
     import jinja2
 
     return jinja2.Environment(
@@ -30,9 +30,10 @@ def templates() -> jinja2.Environment:
 
 
 def base_units(unit: str) -> dict[str, str] | None:
-    """Convert a unit to FMI's exponents of the SI base units and factor; None if an exponent is not whole.
+    """Express a physical unit in SI base units, as FMI describes it.
 
-    Raises InputError for an unknown unit.
+    Returns the exponents by base unit, and "factor" if it is not 1, all as text: "mm" gives {"m": "1", "factor":
+    "0.001"}. Returns None if an exponent is not whole. Raises InputError for an unknown unit.
     """
     parsed = parse_unit(unit)
     if any(power.denominator != 1 for _, power in parsed.powers):
@@ -43,9 +44,10 @@ def base_units(unit: str) -> dict[str, str] | None:
 
 
 def format_description(fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable]) -> str:
-    """Format modelDescription.xml of FMI 2.0 or 3.0.
+    """Format the text of modelDescription.xml, the description of an FMU.
 
-    `identifier`: prefix of the C functions; `token`: hash by which the library recognises its description.
+    `fmi`: version of FMI, 2 or 3; `identifier`: prefix of the C functions; `token`: hash by which the FMU's library
+    recognises this description; `summary`: one line that describes the FMU.
     """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]

@@ -1,7 +1,8 @@
-"""The code of a rig's unit: the laws of `simulate` that the rig needs, compiled to functions for C.
+"""The code of a functional mock-up unit (FMU) of a rig: the equations of `simulate`, compiled to functions for C.
 
-Their arguments are pointers to numbers: `values` in the order of `variables.VALUES`, `inputs` of `variables.INPUTS`,
-the state `y` of `physics.state.STATES`, `results` of `variables.RESULTS`. They return 0, or a code of `FAILURES`.
+The functions' arguments are pointers to arrays of doubles: `values`, the parameters, in the order of
+`variables.VALUES`; `inputs` in the order of `variables.INPUTS`; the state `y` in that of `physics.state.STATES`; and
+`results`, the outputs, in that of `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from sealscope.simulation.experiment import choose_method
 from sealscope.units import P_ATM
 
 _NOT_FINITE = 1
-#: Codes that a function of a unit returns if it fails, with their messages.
+#: Codes that a function of an FMU returns if it fails, with their messages.
 FAILURES = MappingProxyType(
     {
         _NOT_FINITE: "the state is not finite: take a smaller step, or smaller gains",
@@ -58,7 +59,7 @@ _G_EXT_A, _G_EXT_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_
 _U, _G, _C, _F, _ADDED_G_EXT_A, _ADDED_G_EXT_B = range(len(INPUTS))
 _VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
 _electric, _hydraulic, _mechanical = law(electric_power), law(hydraulic_power), law(mechanical_power)
-#: The arguments of each function of a unit, as C passes them.
+#: The C types of the arguments of each function of an FMU.
 ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "start": ("double*", "double*", "double", "double*"),
@@ -70,25 +71,26 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @law
 def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
-    """Compute the input a + b t at the nodes of an explicit step of h [s] that begins at t [s]."""
+    """Compute an input a + b t at the nodes of an explicit Runge-Kutta step of h [s] that begins at t [s]."""
     n = RK4_NODES
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Compute the input a + b t at the nodes of an implicit-explicit step of h [s] that begins at t [s]."""
+    """Compute an input a + b t at the nodes of an implicit-explicit step of h [s] that begins at t [s]."""
     n = IMEX_NODES
     first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
 
 
 class RigChoice(NamedTuple):
-    """The laws of a rig that are compiled into its unit; all parameters remain variables of the unit.
+    """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
 
-    `laws`: choices and optional laws of the rig, in the order of `physics.rig.CHOICES`; `exponent`, `literal_metering`:
-    reading of the throttles' equations (`throttle_flow_coefficients`); `implicit`: implicit-explicit method, not
-    Runge-Kutta; `euler`: integral of the speed loop by eq. (4.2).
+    `laws`: the rig's choices between equations and its optional ones, in the order of `physics.rig.CHOICES`;
+    `exponent`, `literal_metering`: how the equations of the throttles are read (`throttle_flow_coefficients`);
+    `implicit`: True for the implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's
+    integral is computed by eq. (4.2) of the thesis.
     """
 
     laws: tuple[bool | tuple[bool, ...], ...]
@@ -99,7 +101,10 @@ class RigChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:
-        """Choose the laws of a rig, always with load and external leakage, which are inputs of every unit."""
+        """Choose the equations and the solver for a rig.
+
+        Load and external leakage are always included, because they are inputs of every FMU.
+        """
         laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
         implicit, euler = choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler"
         return cls(laws, *throttle_readings(rig), implicit=implicit, euler=euler)
@@ -108,14 +113,16 @@ class RigChoice(NamedTuple):
 def _build_parameters_law(
     laws: tuple[bool | tuple[bool, ...], ...], exponent: float, literal_metering: bool
 ) -> Callable[..., Any]:
-    """Build the law that computes the model's parameters, `RigNumbers`, from a unit's values and external leakage.
+    """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
 
-    Its arguments: values (n,), and the conductances [m^3/(s Pa)] of leakage out of A and B to add to those of the rig.
+    Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
+    external leakage out of the chambers A and B, which are added to those of the rig. `laws`, `exponent`,
+    `literal_metering`: as in `RigChoice`.
     """
 
     @law
     def model_parameters(v: Any, G_ext_A: float, G_ext_B: float) -> Any:
-        """Compute the model's parameters from a unit's values v and additional external leakage [m^3/(s Pa)]."""
+        """Compute the model's parameters from the FMU's values v (n,) and added external leakage [m^3/(s Pa)]."""
         derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
         parameters = to_fixed_tuple(v, _N_PARAMETERS)
         parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + G_ext_A)
@@ -126,11 +133,12 @@ def _build_parameters_law(
 
 
 def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
-    """Build the functions of a unit, to be compiled.
+    """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
 
-    ``start(values, inputs, x_0, y)`` sets the state to standstill at x_0 [m] under the load of the inputs;
-    ``advance(values, inputs, slopes, y, span, steps)`` integrates it over `span` [s] with inputs that change linearly
-    by their `slopes` [1/s]; ``report(values, inputs, y, results)`` writes the outputs.
+    ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at x_0 [m] under the load of the inputs.
+    ``advance(values, inputs, slopes, y, span, steps)`` integrates it over `span` [s], while the inputs change
+    linearly by their `slopes` (per second). ``report(values, inputs, y, results)`` writes the outputs to `results`.
+    All arguments but x_0, span and steps are pointers (see the module).
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])
@@ -138,18 +146,21 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute the model's parameters from the unit's values and its inputs of external leakage."""
+        """Compute the model's parameters from the FMU's values v (n,) and the external leakage among its inputs."""
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Set the state `y` to standstill at x_0 [m] under the load of the inputs; return 0, or a code of failure."""
+        """Set the state `y` to standstill at x_0 [m] under the load of the inputs.
+
+        Returns 0, or a code of `FAILURES`.
+        """
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = model_parameters(v, input_values)
         state[:] = 0.0
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the outputs, and after them the electric, hydraulic and mechanical power [W]."""
+        """Write the outputs to `results`, and after them the electric, hydraulic and mechanical power [W]."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -163,7 +174,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z by h [s] from t [s], with inputs a + b t and parameters p."""
+            """Advance the state z by a step h [s] from the time t [s], with inputs a + b t and model parameters p."""
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -172,13 +183,16 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z by h [s] from t [s], with inputs a + b t and parameters p."""
+            """Advance the state z by a step h [s] from the time t [s], with inputs a + b t and model parameters p."""
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Integrate the state `y` over `span` [s] by equal steps; fail if it is not finite or below vacuum."""
+        """Integrate the state `y` over `span` [s] by equal steps, while the inputs change by `slopes` (per second).
+
+        Returns 0, or a code of `FAILURES` if the state is not finite or a pressure is below vacuum.
+        """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
         a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)
         p, z, h = model_parameters(v, a), state_of(state), span / steps
@@ -198,12 +212,16 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
 @lru_cache(maxsize=8)
 def rig_code(choice: RigChoice) -> Mapping[str, str]:
-    """Compile the functions of a rig's unit to LLVM code (`unit_code`)."""
+    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name."""
     return unit_code(build_functions(choice))
 
 
 def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
-    """Compile each function of a unit to LLVM code, by its name; its symbol in the code is ``sealscope_NAME``."""
+    """Compile functions of an FMU to LLVM code; return the text of each by its name.
+
+    `functions`: Python functions by name, with the arguments `ARGUMENTS`. In the code, the symbol of a function is
+    ``sealscope_NAME``.
+    """
     modules = {}
     for name, function in functions.items():
         text, symbol = plain_code(function, *ARGUMENTS[name])
@@ -212,9 +230,10 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
 
 
 def object_code(module: str, triple: str | None = None) -> bytes:
-    """Compile LLVM code to position-independent machine code for any processor of a target, by default this system's.
+    """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
 
-    `triple`: LLVM's name of the target, such as "x86_64-pc-windows-gnu".
+    `module`: text of the code; `triple`: LLVM's name of the platform, such as "x86_64-pc-windows-gnu", by default
+    that of this system.
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()

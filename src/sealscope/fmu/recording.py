@@ -1,4 +1,4 @@
-"""Record a unit of another program: FMPy runs it, and the instruments of a rig read its outputs."""
+"""Record a functional mock-up unit (FMU): FMPy runs it, and the simulated instruments of a rig read its outputs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAX_COMMUNICATION_STEP = 5e-4
 _INPUT_NAMES = ("u", "G", "C", "F")
 _MEASURED_NAMES = tuple(name for name in CHANNEL_UNITS if name not in ("u", "omega"))  # omega is read off the encoder
-#: Channels without an instrument in a rig: they are recorded as the unit outputs them.
+#: Channels without an instrument in a rig: the FMU's outputs are recorded without noise or quantisation.
 _WITHOUT_INSTRUMENT = ("q_comp", "q_pump", "T_oil")
 
 
@@ -45,9 +45,9 @@ def record_fmu(
 ) -> Recording:
     """Run a functional mock-up unit under an experiment's command, and record it with the instruments of its rig.
 
-    The unit replaces the machine: only the instruments of the experiment's rig are used. Channels without an instrument
-    (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit outputs them. A unit is a program, and runs with all
-    rights of this one.
+    The unit replaces the machine: only the instruments of the experiment's rig are used. Channels without an
+    instrument (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit outputs them. A unit is a program, and
+    runs with all rights of this one.
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def record_fmu(
         A unit of FMI 1 to 3 for co-simulation or model exchange, with an input ``u`` and outputs named like channels
         (``p_A``, ``p_B``, ``x``, ``theta``, ...); channels that it does not have are not recorded.
     experiment : Experiment
-        Command, duration, rate, seed and instruments; faults of sensors; a leak as a conductance (``"G = 6e-13 from 20
-        s"``) if the unit has the input ``G`` or ``C``; a load if it has ``F``.
+        Command, duration, rate, seed and instruments; faults of sensors; a leak as a conductance (``"G = 6e-13 from
+        20 s"``) if the unit has the input ``G`` or ``C``; a load if it has ``F``.
     map : mapping of str to str, optional
         Names of channels and inputs in the unit: ``{"p_A": "cylinder.pA"}``.
     progress : callable, optional
@@ -120,9 +120,9 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Raise InputError if a unit cannot run the experiment.
+    """Check that an FMU can run the experiment; raise InputError otherwise.
 
-    A unit can have neither a position target, nor a fault or drift of the machine, nor a leak stated as a flow.
+    An FMU takes neither a target of the position, nor a fault or drift of the machine, nor a leak stated as a flow.
     """
     if experiment.target is not None:
         raise InputError(f"a unit must have a command, not a target, got {experiment.command}")
@@ -137,7 +137,7 @@ def _check_experiment(experiment: Experiment) -> None:
 
 
 def _read_description(path: Path) -> Any:
-    """Read a unit's description by FMPy; raise InputError if FMPy is not installed or cannot read it."""
+    """Read the description of an FMU with FMPy; raise InputError if FMPy is not installed or cannot read it."""
     try:
         import fmpy
     except ImportError:
@@ -150,8 +150,9 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Map each channel and input to a variable of the FMU: the one in `names`, else that of the same name, if any.
+    """Find the variable of the FMU for each channel and input: the one given in `names`, else one of the same name.
 
+    `variables`: variables of the FMU by name. Channels and inputs without a variable are left out of the result.
     Raises InputError if `names` has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
@@ -168,9 +169,11 @@ def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str,
 def _build_input_table(
     path: Path, experiment: Experiment, names: Mapping[str, str], variables: Mapping[str, Any], t: Array
 ) -> Array:
-    """Build FMPy's table of inputs, a row for each communication point `t` [s]; raise InputError for a missing input.
+    """Build the table of inputs that FMPy takes, with a row for each communication point `t` [s].
 
-    FMPy keeps an input constant over a step, so a row has its value in the middle of the step (second order).
+    FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
+    accuracy. `names`: variable of the FMU by channel or input; `variables`: description of each variable. Raises
+    InputError if the experiment needs an input that the FMU does not have, or a load over position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
     u, G, C = (values[:, 0] for values in RunInputs(experiment, experiment.leaks).at_nodes(t, np.array([half_step])))
@@ -196,11 +199,15 @@ def _build_input_table(
 def _run_unit(
     path: Path, t: Array, input_table: Array, outputs: list[str], duration: float, progress: Progress | None
 ) -> Any:
-    """Run the unit with a table of inputs; return its outputs at the communication points `t` [s]."""
+    """Run the FMU with a table of inputs; return its outputs at the communication points `t` [s], by variable name.
+
+    `outputs`: names of the variables to record; `duration` [s]: length of the recording, to which the progress
+    refers. Raises SimulationFailed if the FMU fails or ends early.
+    """
     import fmpy
 
     def report_step(time: float, _recorder: Any) -> bool:
-        """Report the progress after a step; return True to go on."""
+        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue."""
         if progress is not None:
             progress("running the unit", min(1.0, time / duration))
         return True

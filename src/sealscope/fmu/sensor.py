@@ -1,22 +1,24 @@
-"""The code of a soft sensor: the live volume balance, sample by sample, as functions that C can call.
+"""The code of a soft sensor, a functional mock-up unit (FMU) that estimates leakage: functions that C can call.
 
-Its laws are those of the live balance (`diagnosis.inference`): each sample adds the increments of the terms to the open
-rows of the weak form, the rows of a block are weighted and summed, and the block's conductance is estimated from the
-sums. Only the samples within `HALF_DIFFERENCE` of the present one are stored.
+The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`). Each sample adds the
+increments of the balance's terms to the unfinished rows of the weak form. The rows of a block are weighted and
+summed, and the block's leakage conductance is estimated from the sums. Only the samples within `HALF_DIFFERENCE` of
+the present one are stored.
 
-The mean conductance of the last n blocks (at most `WINDOW`) has the interval
+The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
 
     G +- hypot(t_(n-1) sqrt(v/n), 1.96 o),    v = max(s^2, mean of sd^2)
 
 with the standard deviation s of the blocks' estimates, their standard errors sd, Student's t, and the systematic
-standard error o due to the other coefficients and the size of the machine. Its rise over the mean of the first N =
-`WINDOW` blocks, d blocks before, adds their variance and the random walk of a healthy machine, whose variance a block
-is w times that of a block's noise:
+standard error o due to the other coefficients and to the size of the machine. The rise is the mean of the last n
+blocks minus that of the first N = `WINDOW` blocks, the baseline, which lies d blocks earlier. Its variance is
 
     variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
 
-(in the variance v_0 of N blocks such a walk adds w (N + 1)/6 to the noise). The flow is G times the mean of
-abs(p_A - p_B) as recorded; the live balance also subtracts the sensors' noise from it, a few per cent.
+with the variance v_0 of the baseline's blocks. The last term is the random walk of a healthy machine: in each block
+its variance is w = `WALK` times the variance sigma^2 of a block's noise. The divisor is there because this walk adds
+w (N + 1)/6 times sigma^2 to v_0. The flow is G times the mean of abs(p_A - p_B) as recorded; the live balance also
+subtracts the sensors' noise from this mean, a few per cent.
 """
 
 from __future__ import annotations
@@ -74,9 +76,11 @@ DISPLACEMENT = "pump.q_b"
 _DISPLACEMENT_INDEX = VALUES.index(DISPLACEMENT)
 #: Number of blocks of a mean, and of the baseline.
 WINDOW = 20
-#: Variance of a healthy machine's random walk a block, over that of a block's noise; the warming oil causes it.
+#: Variance of a healthy machine's random walk in a block, relative to that of a block's noise; the oil's warming
+#: causes the walk.
 WALK = 3.0
-#: Columns of a row in the order of `_compute_increments`: the regressors, and the response, the pump's flow.
+#: Columns of a row in the order of `_compute_increments`: the regressors, then the response, which is the pump's
+#: flow.
 COLUMNS = (
     *(f"motion {way}, {side} carries" for way in ("out", "in") for side in "AB"),
     *(name for s in "AB" for name in (f"compliance {s}", f"compliance {s} over the stroke", f"free air {s}",
@@ -86,9 +90,9 @@ COLUMNS = (
 _N_COLUMNS, _MOTION, _COMPLIANCE = len(COLUMNS), 0, (COLUMNS.index("compliance A"), COLUMNS.index("compliance B"))
 _LAG, _BIAS, _LEAK, _RESPONSE = (COLUMNS.index(name) for name in ("lag", "bias", "leak", "response"))
 _ALL_COLUMNS = tuple(range(_N_COLUMNS))
-#: Columns of `history`, the results of the last blocks: conductance G by the present coefficients [m^3/(s Pa)], the
-#: conductance g that is comparable between blocks, its variance, the systematic variance of G, and the mean of
-#: abs(p_A - p_B) [Pa].
+#: Columns of `history`, the results of the last blocks: conductance G estimated with the present coefficients [m^3/(s
+#: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, and the mean
+#: of abs(p_A - p_B) [Pa].
 _G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
 #: Indices of the outputs.
 (
@@ -99,9 +103,10 @@ _G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
 _SUM, _NUMBER = 0, 1
 #: Columns of `waiting_sizes`: number of rows, and mean abs(p_A - p_B) [Pa], of a block.
 _BLOCK_ROWS, _BLOCK_PRESSURE = 0, 1
-#: Scalars of a soft sensor's memory: time to the next sample [s]; samples; direction of the angle's counts, 1 or -1;
-#: blocks weighted; open blocks and their rows; waiting blocks; usual precision; successive blocks of larger motion;
-#: blocks estimated; sums of g, g^2 and its variance over the baseline.
+#: Scalars of a soft sensor's memory: time to the next sample [s]; number of samples; sign of the angle, 1 or -1;
+#: number of blocks weighted, of open blocks and of their rows, and of blocks that wait for the first fit; median
+#: precision of a block; number of successive blocks of larger motion, and of blocks estimated; sums over the baseline
+#: of g, of g^2 and of its variance.
 _SCALARS = (
     "clock", "sample_count", "angle_sign", "n_weighted", "n_open", "n_rows", "n_waiting", "usual_precision", "n_moving",
     "n_estimated", "base_sum", "base_square_sum", "base_variance_sum",
@@ -109,7 +114,7 @@ _SCALARS = (
 
 
 def variables(rig: Rig) -> Iterator[Variable]:
-    """Yield the variables of a soft sensor."""
+    """Yield the variables of a soft sensor's FMU: measurements, the pump's displacement and the estimated leakage."""
     yield from input_variables({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in INPUTS})
     yield from filter(None, [rig_variable(rig, DISPLACEMENT, "fixed")])
     yield from output_variables(SENSOR_RESULTS)
@@ -118,8 +123,9 @@ def variables(rig: Rig) -> Iterator[Variable]:
 class SensorChoice(NamedTuple):
     """The settings that are compiled into a soft sensor.
 
-    `rate`: samples per second [Hz]; `size_error`: relative uncertainty of the machine's size; `column_order`: indices
-    into `COLUMNS`, the `n_fast` coefficients fitted to each block first, the response last (`weigh_rows`).
+    `rate` [Hz]: sampling rate; `size_error`: relative standard error of the leakage that an uncertain size of the
+    machine causes; `column_order`: indices into `COLUMNS` in the order that `weigh_rows` needs: first the `n_fast`
+    terms whose coefficients are fitted to each block, then the other terms, last the response.
     """
 
     rate: float
@@ -129,7 +135,10 @@ class SensorChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Return the settings for a rig; raise InputError if its balance has other terms than `COLUMNS`."""
+        """Choose the settings for a rig and a sampling rate [Hz].
+
+        Raises InputError if the volume balance of the rig has other terms than `COLUMNS`.
+        """
         (balance,) = live_equations(rig, INPUTS)
         columns = ColumnRoles(balance)
         if columns.names != COLUMNS[:-1]:
@@ -139,7 +148,11 @@ class SensorChoice(NamedTuple):
 
 
 class _Lengths(NamedTuple):
-    """Number of samples in a stride, of strides in a block, and of samples in half a central difference."""
+    """Lengths of the sensor's computations: samples in a stride, strides in a block, samples in half a difference.
+
+    A new row of the weak form begins every stride; the direction of motion is found from a central difference of the
+    position over 2 `half_difference` samples.
+    """
 
     stride_samples: int
     block_strides: int
@@ -147,19 +160,25 @@ class _Lengths(NamedTuple):
 
     @classmethod
     def from_rate(cls, rate: float) -> _Lengths:
-        """Round the lengths to the samples at a rate [Hz]."""
+        """Compute the lengths for a sampling rate [Hz], rounded to whole samples and strides."""
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory: `_SCALARS`, and these arrays.
+    """Build the layout of a soft sensor's memory, a record of doubles: the scalars `_SCALARS`, and the arrays below.
 
-    Samples: `ring`, the last samples, one column each; `increments` of all terms over one sample interval.
-    Rows of the weak form: `unfinished`, the `SPAN` rows to which the present interval adds; `rows`, finished ones of
-    the open blocks, and `ends`, the index past the last row of each; `gram` matrices of these; `pressure_sums` of the
-    last blocks (`_SUM`, `_NUMBER`); `slow_sums`, sums for the slow coefficients over earlier blocks (`weigh_rows`).
-    Blocks before the first fit: `waiting_grams`, `waiting_sizes` (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions`.
-    Results: `history` of the last blocks (`_G` ... `_PRESSURE`). `workspace`: a `Workspace`; `model`: `Coefficients`.
+    Samples: `ring` has the last samples, a column each; `increments` those of all terms over one sample interval.
+
+    Rows of the weak form: `unfinished` has the `SPAN` rows to which the present interval adds; `rows` the finished
+    rows of the open blocks, that is the blocks not yet weighted; `ends` the index past the last row of each open
+    block; `gram` their Gram matrices. `pressure_sums` has the sums of the last blocks (`_SUM`, `_NUMBER`);
+    `slow_sums` the sums over earlier blocks for the coefficients that are not fitted to each block (`weigh_rows`).
+
+    Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes (`_BLOCK_ROWS`,
+    `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
+
+    Results: `history` has those of the last blocks (`_G` ... `_PRESSURE`); `model` is a `Coefficients`; `workspace`
+    is a `Workspace`.
     """
     lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
     max_rows = SUPPORT * lengths.block_strides
@@ -184,7 +203,11 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 
 
 def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
-    """Build the functions of a soft sensor: ``start``, ``advance`` and ``report``, as for a rig (`fmu.machine`)."""
+    """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
+
+    Their arguments are those of `fmu.machine.build_functions`; the state `y` is a memory of the layout
+    `memory_layout`.
+    """
     from scipy.special import stdtrit
 
     layout, interval = memory_layout(choice), 1.0 / choice.rate
@@ -195,12 +218,18 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t, 95 %
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Clear the sensor's memory `y`; return 0, or a code of `FAILURES` if the pump has no displacement."""
+        """Set the sensor's memory `y` to 0 at the start of a run.
+
+        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0.
+        """
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Add the samples of the next `span` [s], in which the inputs change linearly by their slopes [1/s]."""
+        """Add the samples of the next `span` [s], in which the inputs change linearly by their `slopes` (per second).
+
+        `y`: the sensor's memory; `steps` is ignored. Returns 0.
+        """
         m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
         first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
         t = m.clock
@@ -218,7 +247,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
         return _SUCCESS
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the sensor's outputs to `results`."""
+        """Write the sensor's outputs from its memory `y` to `results`; return 0."""
         _write_results(memory(y), size_error, quantiles, carray(results, n_results))
         return _SUCCESS
 
@@ -226,7 +255,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 
 def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the law that adds a sample of the channels `INPUTS` to the memory."""
+    """Build the compiled function that adds a sample of the channels `INPUTS` to a soft sensor's memory."""
     (n_stride, block_strides, half), rate = _Lengths.from_rate(choice.rate), choice.rate
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
@@ -235,12 +264,15 @@ def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
 
     @law
     def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
-        """Add a sample to memory m; finish a row at the end of each stride, a block at the end of its last row."""
+        """Add a sample to the sensor's memory m, and estimate the leakage of a block when its last row is complete.
+
+        `displacement` [m^3/rad]; `p_A`, `p_B` [Pa]; `theta` [rad]: angle of the pump; `x` [m]: position.
+        """
         n_samples, width = int(m.sample_count), m.ring.shape[1]
         newest = n_samples % width
         m.ring[_P_A, newest], m.ring[_P_B, newest], m.ring[_THETA, newest], m.ring[_X, newest] = p_A, p_B, theta, x
         m.sample_count += 1.0
-        k = n_samples - half - 1  # the newest interval with half a difference of samples behind it
+        k = n_samples - half - 1  # the newest interval that has `half` samples after it
         if k < 0:
             return
         _compute_increments(m.ring, k, half, rate, displacement, m.increments)
@@ -269,7 +301,10 @@ def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
 
 @law
 def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
-    """Add abs(p_A - p_B) of sample interval k to the sums in memory m of its block of `n_block` samples, if not NaN."""
+    """Add abs(p_A - p_B) [Pa] of sample interval k to the sums of its block in the sensor's memory m.
+
+    `n_block`: samples in a block; `rate` [Hz]: sampling rate. An interval with a missing measurement is left out.
+    """
     slot = (k // n_block) % (SUPPORT + 1)
     if k % n_block == 0:
         m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
@@ -282,15 +317,17 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 
 @large_law
 def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
-    """Compute the increments of all terms over the interval from sample k to k + 1 into `out`, as `COLUMNS` lists them.
+    """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1.
 
-    `ring`: the last samples; `half`: samples in half a central difference; `rate` [Hz]; `displacement` [m^3/rad].
+    They are written to `out` (n,) in the order of `COLUMNS`. `ring`: the last samples, where sample k has the column
+    k modulo its width; `half`: samples in half a central difference; `rate` [Hz]; `displacement` of the pump
+    [m^3/rad].
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width
     dx, x = ring[_X, next_slot] - ring[_X, slot], 0.5 * (ring[_X, next_slot] + ring[_X, slot])
-    # each end of the interval assigns half of its motion to a direction and to the side with the higher pressure, which
-    # carries the load
+    # each end of the interval assigns half of its motion to a direction and to the side with the higher pressure,
+    # which carries the load
     out[_MOTION : _MOTION + 4] = 0.0
     for i in range(k, k + 2):
         is_inward = 0 if ring[_X, (i + half) % width] >= ring[_X, max(i - half, 0) % width] else 1
@@ -305,7 +342,7 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
     earlier, later = max(k - 1, 0), k + 1
     velocity_change = ring[_X, (later + 1) % width] - ring[_X, later % width]
     velocity_change -= ring[_X, (earlier + 1) % width] - ring[_X, earlier % width]
-    out[_LAG] = rate * velocity_change / (later - earlier)  # of the position behind the angle, or ahead of it
+    out[_LAG] = rate * velocity_change / (later - earlier)  # the position may lag the angle, or lead it
     out[_BIAS] = 1.0 / rate
     out[_LEAK] = 0.5 * (ring[_P_A, slot] + ring[_P_A, next_slot] - ring[_P_B, slot] - ring[_P_B, next_slot]) / rate
     out[_RESPONSE] = displacement * (ring[_THETA, next_slot] - ring[_THETA, slot])
@@ -313,7 +350,10 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Set memory m's `angle_sign` to make the pump's flow rise with p_A - p_B over the first `n_rows` rows."""
+    """Find the sign of the angle with which the pump's flow rises with p_A - p_B, and store it in `m.angle_sign`.
+
+    It is found from the first `n_rows` rows of the sensor's memory m.
+    """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
         mean += m.rows[r, _LEAK] / n_rows
@@ -324,10 +364,11 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 
 @large_law
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
-    """Append the conductance of the block in `m.model` to the history, except an imprecise one at standstill.
+    """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-    `m`: memory; `size_error`: relative uncertainty of the machine's size; `n_rows`, `pressure` [Pa]: number of rows and
-    mean abs(p_A - p_B) of the block; `is_learned`: update the other coefficients with the block.
+    An estimate at standstill is left out if it is imprecise. `m`: the sensor's memory; `size_error`: relative
+    standard error due to the size of the machine; `n_rows`, `pressure` [Pa]: number of rows and mean abs(p_A - p_B)
+    of the block; `is_learned`: True if the other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -348,7 +389,11 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 
 @large_law
 def _fit_to_waiting(m: Any, size_error: float) -> None:
-    """Fit the coefficients to the waiting blocks of memory m, set the usual precision, and append their results."""
+    """Fit the coefficients of the balance to the first `LEARNED` blocks together, and append their estimates.
+
+    `m`: the sensor's memory, whose waiting blocks these are; the median of their precisions becomes the usual
+    precision. `size_error`: relative standard error due to the size of the machine.
+    """
     model = m.model
     for k in range(LEARNED):
         load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
@@ -367,9 +412,9 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard the fit and the estimates in memory m.
+    """Discard all fitted coefficients and estimates in the sensor's memory m.
 
-    Those from a standstill cannot be compared with later ones.
+    This is done when the machine begins to move: estimates from a standstill cannot be compared with later ones.
     """
     model = m.model
     model.sums[:, :] = 0.0
@@ -380,9 +425,11 @@ def _forget_standstill(m: Any) -> None:
 
 @large_law
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
-    """Estimate block b from `gram[b]` in memory m; the first `LEARNED` blocks wait until all can be fitted together.
+    """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    After `N_WAKING` successive blocks of far larger motion, start again. Other arguments: as `_append_conductance`.
+    The first `LEARNED` blocks wait until all of them can be fitted together. After `N_WAKING` successive blocks with
+    far larger motion than before, all is discarded and begins again. The other arguments are those of
+    `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:
@@ -407,15 +454,16 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
 
 def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the law that weights the rows of the open blocks and estimates their leakage."""
+    """Build the compiled function that weights the rows of the newest blocks and estimates their leakage."""
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
-        """Weight the rows of memory m's open blocks, the newest of which is `block`, and estimate each of these blocks.
+        """Weight the rows of the open blocks, that is the blocks not yet weighted, and estimate the leakage of each.
 
-        The first `SUPPORT` blocks are weighted together, later ones as they end. `ends`: index past each block's last
-        row; that of the newest is set here.
+        The first `SUPPORT` blocks are weighted together, later ones one by one as they end. `m`: the sensor's memory;
+        `rows`: rows of the open blocks; `ends`: index past the last row of each, where that of the newest is set
+        here; `block`: number of the newest block.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -450,7 +498,7 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of a column of the history over the last n blocks, up to block `newest`."""
+    """Compute the mean of a column of `history` (blocks, 5) over n blocks, the last of which is block `newest`."""
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n
@@ -459,9 +507,10 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 
 @large_law
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
-    """Compute the variance of the mean comparable conductance of the last n blocks, up to block `newest`.
+    """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
 
     This is the larger of the sample variance between the blocks and the mean of their variances, divided by n.
+    `history` (blocks, 5): results of the last blocks.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
@@ -471,9 +520,11 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 
 @law
 def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
-    """Write the outputs (`SENSOR_RESULTS`) from memory m by the formulas of the module's docstring.
+    """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
-    `size_error`: relative error of the machine's size; `quantiles`: Student's t for 1, 2, ... degrees of freedom.
+    `m`: the sensor's memory; `size_error`: relative standard error due to the size of the machine; `quantiles`:
+    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`, 0 while there are
+    too few blocks.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1
@@ -504,5 +555,5 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
 
 @lru_cache(maxsize=8)
 def sensor_code(choice: SensorChoice) -> Mapping[str, str]:
-    """Compile the functions of a soft sensor to LLVM code (`unit_code`)."""
+    """Compile the functions of a soft sensor to LLVM code; return the text of each function by its name."""
     return unit_code(build_functions(choice))

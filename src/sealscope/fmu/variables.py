@@ -1,4 +1,4 @@
-"""The variables of a unit: inputs, tunable parameters and outputs, with their units and descriptions."""
+"""The variables of a functional mock-up unit (FMU): inputs, parameters and outputs, with units and descriptions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
 from sealscope.physics.state import OUTPUTS
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
-#: Parameters of a unit in the order of its code: those that the laws take, and those from which numbers are derived.
+#: Parameters of an FMU in the order of its code: first those that the model's equations take, then those from which
+#: other numbers are derived.
 VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
 #: Inputs, outputs and a soft sensor's outputs in the order of the code: (unit, description).
@@ -28,12 +29,16 @@ SENSOR_RESULTS: Mapping[str, tuple[str, str]] = _TABLES["sensor"]
 DIRECT: Mapping[str, list[str]] = _TABLES["direct"]
 #: First value reference of each kind of variable.
 REFERENCES: Mapping[str, int] = _TABLES["references"]
-#: Outputs of the servo valve, which no unit has.
+#: Outputs of the servo valve, which no FMU has.
 _VALVE_OUTPUTS = ("x_s", "v_s")
 
 
 class Variable(NamedTuple):
-    """A variable of a unit, in the terms of FMI; `start` in SI units, None for an output."""
+    """A variable of a functional mock-up unit (FMU), described in the terms of the FMI standard.
+
+    `reference`: the number by which a program addresses it; `unit`: its SI unit; `start`: its initial value, None for
+    an output.
+    """
 
     reference: int
     name: str
@@ -45,20 +50,29 @@ class Variable(NamedTuple):
 
 
 def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield input variables; `rows`: (unit, description) by name."""
+    """Yield the input variables of an FMU, with the initial value 0.
+
+    `rows`: unit and description of each, by name.
+    """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         yield Variable(REFERENCES["input"] + k, name, "input", "continuous", unit, description, 0.0)
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield output variables, except the servo valve's; `rows`: (unit, description) by name."""
+    """Yield the output variables of an FMU, without those of a servo valve.
+
+    `rows`: unit and description of each, by name.
+    """
     for k, (name, (unit, description)) in enumerate(rows.items()):
         if name not in _VALVE_OUTPUTS:
             yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, None)
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Make the variable of a rig's parameter `name`; return None for a part that the rig does not have."""
+    """Make the FMU variable of a rig's parameter `name`; return None if the rig lacks the part that it describes.
+
+    `name`: dotted name, such as "pump.q_b".
+    """
     value, field = float(attrgetter(name)(rig)), dict(iter_fields(Rig))[name]
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)
     is_absent = value == absent_of(field)
@@ -68,7 +82,7 @@ def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) 
 
 
 def variables(rig: Rig, step: float) -> Iterator[Variable]:
-    """Yield the variables of a rig's unit; `step` [s]: longest step of its solver."""
+    """Yield all variables of the FMU that simulates a rig; `step` [s]: longest step of its solver."""
     yield from input_variables(INPUTS)
     yield from filter(None, (rig_variable(rig, name, "tunable") for name in VALUES))
     reference, description = REFERENCES["start_position"], "piston position at the start, from mid-stroke"

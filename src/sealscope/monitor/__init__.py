@@ -1,1 +1,1 @@
-"""Actuators watched live: a stream that keeps its state, the service around it, its memory, its alarms and its page."""
+"""Continuous watch of actuators: the service, its sources of samples, its database, its alarms and its web page."""

@@ -1,8 +1,9 @@
-"""Every actuator's detector and alarm, and the database behind them; a block is stored atomically.
+"""The detectors and alarms of all actuators of a monitor, stored in its database with each block of samples.
 
-Each transaction stores blocks' identities, estimates, alarms and pending samples. Every 16 blocks or 400 kB of an
-actuator, and with each mark, a checkpoint of its whole state replaces the pending samples. A restart loads the last
-checkpoint and judges the pending samples again, with the settings that they were judged by.
+One transaction stores the identities of blocks, their estimates, alarms and samples. The samples are stored as
+pending until the next checkpoint, which stores the whole state of an actuator: after 16 blocks or 400 kB, and with
+each mark of a person. A restart loads the last checkpoint and judges the pending samples again, with the settings by
+which they were judged before.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _MAX_COMMENT_LENGTH = 2000
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Counter of the blocks that raised an error.
 DROPPED = "blocks that raised an error"
-#: Fields of a verdict on a recording that a summary contains.
+#: Fields of the verdict on a recording that the summary of an actuator contains.
 _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
 #: Length of the last samples that are kept during an alarm [s].
 _ALARM_SAMPLES_S = 120.0
@@ -53,8 +54,8 @@ _MIN_OIL_KELVIN, _MAX_OIL_KELVIN = 173.15, 573.15
 class AlarmEvent(NamedTuple):
     """A change of an alarm.
 
-    `alarm`: the alarm after the change; `kind`: the event that `AlarmJudge.update` returns; `t`: time of the change
-    [s].
+    `alarm`: the alarm after the change; `kind`: name of the event, such as "raised" or "returned"
+    (`AlarmJudge.update`); `t` [s]: time of the change.
     """
 
     alarm: Alarm
@@ -64,12 +65,14 @@ class AlarmEvent(NamedTuple):
 
 @dataclass
 class _Actuator:
-    """The state of an actuator in memory.
+    """The state of one watched actuator in memory.
 
-    `pending`, `bytes`: blocks since the checkpoint, and their bytes; `n_stored`: blocks so far; `judged_s`: end of the
-    last block that was judged [s]; `last`: the last estimate, with flows averaged over cycles; `shown`: the summary
-    stored last; `verdict`: on the last recording, None if whole recordings are not judged; `alarm_samples`: the last
-    samples during an alarm, which may become a healthy recording in the machine's file.
+    `watch`: its detector; `judge`: its alarm; `pending`, `bytes`: number of blocks since the last checkpoint, and of
+    their bytes; `n_stored`: number of all blocks so far; `last`: the last estimate, with flows averaged over the
+    machine's cycles; `shown`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if
+    unknown; `judged_s` [s]: end of the last block that was judged; `verdict`: verdict on the last recording, None if
+    whole recordings are not judged; `alarm_samples`: the last samples during an alarm, which may become a healthy
+    recording in the machine's file.
     """
 
     settings: ActuatorSettings
@@ -88,11 +91,12 @@ class _Actuator:
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[AlarmEvent]]:
-        """Judge new samples; return an estimate for each of their blocks, and the changes of the alarm.
+        """Judge new samples of the actuator; return an estimate for each block of them, and the changes of the alarm.
 
-        `follows`: False if the samples do not continue those before; `verdict`: on the samples as a whole recording. A
-        verdict that decides updates the alarm; otherwise the blocks do. The result depends only on the state of the
-        actuator and the samples.
+        `follows`: False if there is a gap between these samples and those before; `settings`: thresholds of the
+        alarm; `verdict`: verdict on the samples as a whole recording, None for none. If this verdict decides
+        (`RecordingVerdict.decides`), it updates the alarm; otherwise each block does. The result depends only on the
+        arguments and the state of the actuator.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
@@ -122,11 +126,11 @@ class _Actuator:
         return estimates, events
 
     def _baseline_version(self) -> int:
-        """Return the version of the healthy baseline, 0 while it is learned."""
+        """Return the version of the healthy baseline, 0 while the first one is being learned."""
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
     def _update_oil_temperature(self, samples: Recording) -> None:
-        """Set the oil temperature to the mean of the plausible samples, if there are any."""
+        """Set `oil_celsius` to the mean of the plausible oil temperatures in `samples`, if there are any."""
         if "T_oil" in samples and samples.units["T_oil"] == "K":
             kelvin = samples["T_oil"]
             kelvin = kelvin[(kelvin > _MIN_OIL_KELVIN) & (kelvin < _MAX_OIL_KELVIN)]
@@ -134,9 +138,10 @@ class _Actuator:
                 self.oil_celsius = float(kelvin.mean()) - 273.15
 
     def _update_alarm_samples(self, samples: Recording, *, follows: bool) -> None:
-        """Keep the last `_ALARM_SAMPLES_S` seconds of samples while an alarm is open.
+        """Append new samples to `alarm_samples` while an alarm is open; keep the last `_ALARM_SAMPLES_S` seconds.
 
-        Samples before a gap, or with other channels, units or rate, are discarded.
+        Older samples are discarded after a gap (`follows` is False), or if the channels, units or sampling rate
+        change.
         """
         first = self.alarm_samples[0] if self.alarm_samples else samples
         same_format = (first.units, first.rate) == (samples.units, samples.rate)
@@ -149,11 +154,14 @@ class _Actuator:
                 del self.alarm_samples[0]
 
     def state(self) -> dict[str, Any]:
-        """Return the state for a checkpoint as plain values."""
+        """Convert the parts of the state that a checkpoint stores to plain values."""
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore watch, last estimate, oil temperature and verdict from a checkpoint, but not the AlarmJudge."""
+        """Restore the watch, the last estimate, the oil temperature and the verdict from a checkpoint's plain values.
+
+        The alarm (`judge`) is not restored here.
+        """
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
         self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
@@ -161,9 +169,10 @@ class _Actuator:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
 
     def _machine_state(self) -> MachineState:
-        """Determine the NE 107 state of the machine.
+        """Determine the state of the machine by NAMUR NE 107.
 
-        An active alarm decides first, then the verdict on the last recording, then the last block and the baseline.
+        It follows from the alarm if that is active, else from the verdict on the last recording, else from the last
+        block and the healthy baseline.
         """
         alarm, baseline, ended_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
@@ -179,7 +188,7 @@ class _Actuator:
         return state_of("watched", since_s=max(baseline.known_s, ended_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Build the summary for page, metrics and messages from plain values."""
+        """Build the summary of the actuator for the page, the metrics and messages, as plain values by name."""
         baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
@@ -207,7 +216,7 @@ class _Actuator:
 
 
 def _parse_settings(stored: str) -> WatchSettings | None:
-    """Parse the settings of a checkpoint; None if an earlier Sealscope stored them in another form."""
+    """Parse the settings stored with a checkpoint; return None if another version wrote them in another form."""
     try:
         return WatchSettings.model_validate_json(stored)
     except ValidationError:
@@ -215,17 +224,24 @@ def _parse_settings(stored: str) -> WatchSettings | None:
 
 
 def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
-    """Return True if two watches learn with the same settings and rig; the pump's displacement may differ."""
+    """Return True if two watches learn their baseline with the same settings and rig.
+
+    `stored`: watch from the database; `fresh`: watch by the present settings. The rigs may differ if that of `fresh`
+    is the same machine measured again (`is_remeasured`).
+    """
     (rig, *conditions), (stored_rig, *stored_conditions) = fresh.learned_with, stored.learned_with
     return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
 
 
 class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
-    """The database has one of the blocks already."""
+    """Raised if the database has one of the blocks already."""
 
 
 class WatchedActuators:
-    """The actuators of a monitor, restored from its database, which keeps estimates of `keep_days` of operation."""
+    """The watched actuators of a monitor, restored from its database.
+
+    `settings`: of each actuator; `store`: the database; `keep_days`: days of operation whose estimates are stored.
+    """
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         self.store, self.settings = store, {setting.name: setting for setting in settings}
@@ -238,7 +254,10 @@ class WatchedActuators:
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from the database; its watch starts anew if the rig or the learning time changed."""
+        """Restore an actuator from the database, or create it if it is new.
+
+        Its watch starts anew if the rig or the learning time changed since the checkpoint.
+        """
         name = settings.name
         machine = load_watched(settings.rig)
         fresh = watch(
@@ -257,10 +276,10 @@ class WatchedActuators:
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint; return True if a new checkpoint must be saved.
+        """Restore an actuator from its checkpoint, and judge the samples since then again.
 
-        The samples since the checkpoint are judged again. The watch starts anew if the state has another version, or
-        was learned with another rig or learning time.
+        The watch starts anew if the state has another version, or was learned with another rig or learning time.
+        Returns True if a new checkpoint must be saved, because of this or because the settings changed.
         """
         settings, fresh, state, name = actuator.settings, actuator.watch, stored.state, actuator.settings.name
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
@@ -296,9 +315,10 @@ class WatchedActuators:
             return dict(self._counters)
 
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge blocks, and store samples, estimates, alarms and identities in one transaction.
+        """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Passes on errors of the database; the call can then be repeated.
+        Blocks of actuators that are not in the settings are only counted. Errors of the database are raised; the call
+        can then be repeated.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]
@@ -308,9 +328,9 @@ class WatchedActuators:
             self.count("blocks of an actuator that is not in the settings", len(blocks) - len(known_blocks))
 
     def _store_once(self, blocks: Sequence[SourceBlock]) -> None:
-        """Judge the blocks that are not stored yet, and store them.
+        """Judge and store those blocks that are not in the database yet.
 
-        Repeated blocks are rare: the database is asked for them only after it has refused one.
+        Repeated blocks are rare, so the database is searched for them only after it has refused one.
         """
         if not blocks:
             return
@@ -353,13 +373,13 @@ class WatchedActuators:
             self.store.write_rows(connection, rows)
 
     def _actuator(self, name: str) -> _Actuator:
-        """Return an actuator, restored from the database if it is not in memory."""
+        """Return the actuator called `name`; restore it from the database if it is not in memory."""
         if name not in self._actuators:
             self._actuators[name] = self._restore(self.settings[name])
         return self._actuators[name]
 
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
-        """Judge the samples of an actuator's block, and add the results to the rows."""
+        """Judge the samples of an actuator's block, and add the results to the rows that will be stored."""
         settings, follows, verdict = actuator.settings, block.follows, block.verdict
         name = settings.name
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
@@ -375,9 +395,9 @@ class WatchedActuators:
             self._add_summary(actuator, rows)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add an actuator's state to the rows, and limits below which old rows are deleted.
+        """Add a checkpoint of an actuator's state to the rows that will be stored.
 
-        The limits are running numbers, one of blocks and one of estimates.
+        Also add the numbers of the last block and the last estimate that are too old and will be deleted.
         """
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())
@@ -389,18 +409,20 @@ class WatchedActuators:
 
     @staticmethod
     def _add_summary(actuator: _Actuator, rows: StoredRows) -> None:
-        """Add the summary of an actuator to the rows if it has changed."""
+        """Add the summary of an actuator to the rows that will be stored, if it has changed."""
         summary = actuator.summary()
         if summary != actuator.shown:
             actuator.shown = summary
             rows.add_summary(actuator.settings.name, summary)
 
     def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
-        """Apply a person's mark to an actuator's alarm, and store it in one transaction.
+        """Apply the mark that a person gives an actuator's alarm, store it in one transaction, and return the alarm.
 
-        `mark`: one of `MARKS`. ``invalid`` withdraws the leak for the reason `text`; ``repaired`` withdraws it and
-        learns a new baseline; ``shelved`` silences the alarm for `hours`. The mark is also written to the file of a
-        commissioned machine (`record_mark`), and an event states the result. Raises InputError without an open alarm.
+        `name`: the actuator; `mark`: one of `MARKS`; `by_whom`: name of the person; `text`: comment or reason. The
+        mark ``invalid`` withdraws the leak for the reason `text`; ``repaired`` withdraws it and starts to learn a new
+        baseline; ``shelved`` silences the alarm for `hours` of operation. The mark is also written to the file of a
+        commissioned machine (`record_mark`), and an event states the result. Raises InputError if there is no open
+        alarm or an argument is invalid.
         """
         if len(text) > _MAX_COMMENT_LENGTH or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_MAX_COMMENT_LENGTH} characters, a name 80")
@@ -439,13 +461,13 @@ class WatchedActuators:
 
     @property
     def false_alarms_per_1000_h(self) -> float:
-        """Upper limit of the false alarms of all actuators together [per 1000 h], if all run and are healthy."""
+        """Upper limit of the false alarms of all actuators together in 1000 h, if all of them run and are healthy."""
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the last stored summary of each actuator in the settings.
+        """Read the last stored summary of each actuator in the settings, by name.
 
-        The state of the machine is "no data" if no block has come for `no_data_s` and no leak is announced.
+        The state in a summary is replaced by "no data" if no block has come for `no_data_s` and the state is no leak.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}
@@ -459,5 +481,5 @@ class WatchedActuators:
         return summaries
 
     def _notify_change(self) -> None:
-        """Increase `change_number`, which the page's listeners compare to notice a change."""
+        """Increase `change_number`, by which open pages notice that something has changed."""
         self.change_number = next(self._changes)

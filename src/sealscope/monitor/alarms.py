@@ -1,8 +1,9 @@
-"""Alarms: raised from estimates by thresholds in L/min, debounce and hysteresis, and marked by persons.
+"""Alarms: raised when the estimated leakage exceeds a threshold [L/min], with debounce and hysteresis.
 
-An alarm is new until a person acknowledges it. A person finds it valid or, with a reason, invalid. It closes when its
-cause has ended and a person has seen it, or by a repair; an invalid alarm ends at once. (A new alarm whose cause has
-ended is "returned to normal, unacknowledged" in ISA-18.2, Management of Alarm Systems for the Process Industries.)
+An alarm is new until a person acknowledges it. A person marks it as valid or, with a reason, as invalid. It closes
+when its cause has ended and a person has seen it, or when a person marks a repair; an invalid alarm ends at once. (A
+new alarm whose cause has ended is "returned to normal, unacknowledged" in ISA-18.2, Management of Alarm Systems for
+the Process Industries.)
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from sealscope.storage.plain_state import save_attributes
 
 Level = Literal["warning", "error"]
 AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
-#: Message number of each level in a control or a plant's catalogue of messages, and its condition of NE 107.
+#: Message number of each level in the message catalogue of a control or a plant, and its condition by NAMUR NE 107.
 DIAGNOSTIC_NUMBERS: dict[Level, int] = {"warning": 4101, "error": 4102}
 _CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limit"}
 #: Bits of the status word.
@@ -35,12 +36,13 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 class Alarm:
     """An alarm of an actuator; times are on the clock of the samples [s], intervals have 95 % confidence.
 
-    `id`: actuator and a running number; `raised_s`, `updated_s`: times of the start and of the last change; `onset_s`:
-    start of the leak; `cause`, `evidence`, `next_check`: path of the leaking oil, the reason for it, and the inspection
-    that comes next; `baseline`: version of the healthy baseline; `returned_s`: time at which the cause ended, None
-    while it lasts; `mark`, `reason`: the last mark of a person ("valid", "invalid" or "repaired"), and why it is
-    invalid; `shelved_until_s`: time before which the alarm is not announced; `by_chance_per_1000_h`: upper limit of
-    the false alarms of this strength that a healthy actuator raises per 1000 operating hours.
+    `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which it was raised and last
+    changed; `onset_s`: time at which the leak began; `leak_lpm` [L/min]: flow of the leak; `cause`: path of the
+    leaking oil; `evidence`: reason for this; `next_check`: recommended inspection; `baseline`: version of the healthy
+    baseline; `returned_s`: time at which the cause ended, None while it lasts; `mark`: last mark of a person
+    ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is
+    not announced; `by_chance_per_1000_h`: upper limit of the false alarms of this strength that a healthy actuator
+    raises in 1000 operating hours.
     """
 
     id: str
@@ -80,17 +82,17 @@ class Alarm:
 
     @property
     def condition(self) -> str:
-        """The NE 107 condition of the machine while the alarm is active, else "watched"."""
+        """Condition of the machine while the alarm is active ("leak" or "leak over the limit"), else "watched"."""
         return _CONDITIONS[self.level] if self.active else "watched"
 
     @property
     def status_word(self) -> int:
-        """Status bits of the actuator (1 active warning, 2 active error, 4 new alarm)."""
+        """Status of the actuator as a sum of bits: 1 active warning, 2 active error, 4 new alarm, not shelved."""
         level = 0 if not self.active else ERROR_BIT if self.level == "error" else WARNING_BIT
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as plain values, with the machine state and diagnostic number derived from them."""
+        """Convert the alarm to plain values, with its diagnostic number and the state of the machine by NE 107."""
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         derived_values = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
         return {**vars(self), **derived_values, "machine_state": machine_state.as_dict()}
@@ -98,11 +100,11 @@ class Alarm:
 
 @dataclass
 class AlarmJudge:
-    """The alarm of one actuator, updated with each block; at most one is open at a time.
+    """Raises, updates and ends the alarm of one actuator from its estimates; at most one alarm is open at a time.
 
-    `alarm`: the open alarm; `raised`: number of alarms so far; `above`, `error`, `below`: successive blocks above the
-    warning threshold, above the error threshold, and below the return threshold; `over_s`: time at which the last alarm
-    ended [s].
+    `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
+    numbers of successive blocks above the warning threshold, above the error threshold, and below the threshold at
+    which the alarm ends; `over_s` [s]: time at which the last alarm ended.
     """
 
     actuator: str
@@ -116,13 +118,16 @@ class AlarmJudge:
     def update(
         self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with a block; return (alarm, event), or None if there is no alarm to update.
+        """Update the alarm with the estimate of one block of samples; return the alarm and the name of the event.
 
-        None means that the block is not judged, or that no alarm was active and none is raised. The event is "raised",
-        "error", "warning", "returned" or "". `leak`: the leak that the watch knows, None if there is none; `baseline`:
-        version of the healthy baseline. After a restart of the detector the leak is None during an alarm; the alarm
-        then stays, for the leak may last. A leak without L/min is a warning. A leak that comes back before anybody has
-        acknowledged its alarm raises the same alarm again.
+        The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or ""
+        for none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.
+        `leak`: the leak that the watch of the actuator has found, None if there is none; `baseline`: version of the
+        healthy baseline.
+
+        A leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
+        raises the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then
+        stays, because the leak may last.
         """
         if not estimate.judged:
             return None
@@ -174,9 +179,9 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise an alarm with the fields `findings`, and return it.
+        """Raise an alarm and return it; an open alarm whose cause had ended is raised again under its id.
 
-        An open alarm whose cause had ended is raised again under its id.
+        `findings`: fields of the alarm besides id, actuator, state and shelving.
         """
         self.raised += self.alarm is None
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
@@ -187,11 +192,12 @@ class AlarmJudge:
     def update_from_verdict(
         self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with the verdict on a whole recording; return (alarm, event) as `update` does.
+        """Update the alarm with the verdict on a whole recording; return the alarm and the event, like `update`.
 
-        `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy baseline.
-        A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the recording
-        before leaks as well. `no leak`, or a leak below the warning threshold, ends the alarm.
+        A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the verdict on
+        the recording before is a leak as well. The verdict `no leak`, or a leak below the warning threshold, ends the
+        alarm. `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy
+        baseline.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -227,9 +233,9 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Store the alarm as the open one unless it is over, and return it.
+        """Store a changed alarm as the open one, or store that there is none if it is over; return the alarm.
 
-        If it is not active, its last change is stored as the time at which it ended.
+        If its cause has ended or it is over, the time of its last change is stored as its end.
         """
         if not alarm.active:
             self.over_s = alarm.updated_s
@@ -237,10 +243,11 @@ class AlarmJudge:
         return alarm
 
     def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
-        """Apply a person's mark, one of `MARKS`, at time `t` [s], and return the alarm.
+        """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
-        `until`: time until which the alarm is shelved [s]; `reason`: why it is invalid. Raises InputError if there is
-        no open alarm, if it has this mark already, or if ``invalid`` comes without a reason.
+        `mark`: one of `MARKS`; `until` [s]: time until which a shelved alarm is not announced; `reason`: why the
+        alarm is invalid. Raises InputError for an unknown mark, if there is no open alarm, if it has this mark
+        already, or if the mark ``invalid`` has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -265,20 +272,21 @@ class AlarmJudge:
         return self._set_alarm(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Return the attributes as plain values, from which `restore` makes an AlarmJudge."""
+        """Convert the attributes to plain values, from which `restore` can rebuild this AlarmJudge."""
         return save_attributes(self, vars(self))
 
 
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Sort actuators by severity of their state, then new alarms first, then strongest evidence first.
+    """Sort actuators by urgency: severity of their state, then new alarms first, then strongest evidence first.
 
-    Each row is a summary with its open alarm. Evidence is the rate at which healthy actuators raise such an alarm,
-    lowest first, so that all actuators share one budget of false alarms. Ties go to the larger lower end of the leak's
-    interval, then the larger leak, then the name. `alarms`: the open ones.
+    Evidence is stronger the more seldom a healthy actuator raises such an alarm by chance. Ties are decided by the
+    larger lower end of the leak's interval, then by the larger leak, then by the name. `summaries`: summary of each
+    actuator by name; `alarms`: the open alarms. Returns the summaries as rows, each with the name and the open alarm,
+    None for none.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Return the sorting key of an actuator."""
+        """Compute the sorting key of an actuator's row; the most urgent one has the smallest key."""
         low_lpm = (row["leak_interval_lpm"] or (0.0,))[0]
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         evidence = math.inf if by_chance is None else by_chance

@@ -10,7 +10,11 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Number of blocks waiting to be stored, their bytes, and how often a source waited for a full queue."""
+    """Load of the queue of blocks that wait to be stored.
+
+    `n_blocks`, `n_bytes`: number of waiting blocks and of their bytes; `n_waits`: how often a source of blocks had to
+    wait because the queue was full.
+    """
 
     n_blocks: int = 0
     n_bytes: int = 0
@@ -20,7 +24,7 @@ class QueueLoad(NamedTuple):
 class BoundedQueue(Generic[_Item]):
     """A queue between threads, limited to `max_items` items and `max_bytes` bytes.
 
-    The size of an item is the one stated to `put`. An empty queue accepts an item of any size.
+    The caller of `put` states the size of each item. An empty queue accepts an item of any size.
     """
 
     def __init__(self, max_items: int, max_bytes: int) -> None:
@@ -30,14 +34,14 @@ class BoundedQueue(Generic[_Item]):
         self._changed = threading.Condition()
 
     def size(self) -> tuple[int, int]:
-        """Return the number of queued items, and their bytes."""
+        """Return the number of queued items, and the sum of their sizes [bytes]."""
         with self._changed:
             return len(self._items), self._bytes
 
     def put(self, item: _Item, size: int, timeout: float = 0.0, *, always: bool = False) -> bool:
-        """Append an item of `size` bytes; return False if the queue stays full for `timeout` [s].
+        """Append an item of `size` bytes; return True, or False if the queue stays full for `timeout` [s].
 
-        `always`: ignore the bounds, for items that the caller bounds.
+        `always`: True to append it even if the queue is full.
         """
 
         def has_room() -> bool:

@@ -1,4 +1,4 @@
-"""A connection to an MQTT broker, its will, and its end."""
+"""A connection to an MQTT broker, with a last will that the broker publishes if the connection is lost."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ def check_mqtt() -> None:
 class MqttLink:
     """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `client`: the client of paho. `will`: returns topic and payload of the last will, which the broker publishes when
-    the connection is lost; called before each connection. `close` publishes the same. `retain`: True if the broker
-    retains the will.
+    `broker`: settings of the connection; `will`: function that returns topic and payload of the last will, which the
+    broker publishes when the connection is lost; it is called before each connection, and `close` publishes the same
+    message. `retain`: True if the broker is to retain this message. The attribute `client` is the client of the
+    library paho.
     """
 
     def __init__(
@@ -66,21 +67,24 @@ class MqttLink:
             client.will_set(*self._last_will, qos=1, retain=self._retain)
 
     def open(self, **options: Any) -> None:
-        """Connect, with `options` of paho's `connect_async`, in a thread that reconnects after each lost connection."""
+        """Start a thread that connects to the broker, and reconnects whenever the connection is lost.
+
+        `options`: arguments of paho's `connect_async`.
+        """
         self.client.connect_async(self._broker.host, self._broker.port, KEEP_ALIVE_S, **options)
         self.client.loop_start()
         self.is_open = True
 
     def check_thread(self) -> None:
-        """Close the connection and raise RuntimeError if the thread has ended, for example after a malformed packet."""
+        """Close the connection and raise RuntimeError if its thread has ended, such as after a malformed packet."""
         if getattr(self.client, "_thread", self) is None:  # private, as paho has no public attribute for it
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")
 
     def publish(self, topic: str, payload: bytes | str, **options: Any) -> bool:
-        """Publish a message; return True if it was sent in time.
+        """Publish a message; return True if it was sent within `_PUBLISH_TIMEOUT_S`.
 
-        `options`: those of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
+        `options`: arguments of paho's `publish`; with `qos` 1 the broker must also acknowledge the message in time.
         """
         message = self.client.publish(topic, payload, **options)
         try:

@@ -1,4 +1,4 @@
-"""The service: sources submit blocks, each is stored before it is acknowledged, and outputs send the alarms."""
+"""The service of a monitor: sources submit blocks of samples, which it stores, and outputs send the alarms."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _Storable = TypeVar("_Storable", SourceBlock, RefusedMessage)
 
 
 class Service:
-    """A running monitor.
+    """A running monitor: it takes blocks of samples from its sources, stores them, and sends the events of alarms.
 
-    `once`: end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`: streams of
-    incoming blocks and outgoing events; `sources`: additional sources, such as a simulated rig.
+    `once`: True to end when standard input has ended and all files of the folders are stored; `stdin`, `stdout`:
+    streams of incoming blocks and of outgoing events; `sources`: additional sources, such as a simulated rig.
     """
 
     def __init__(
@@ -95,7 +95,10 @@ class Service:
             raise
 
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
-        """Queue a block or a refused message for storage, and count refusals; wait while the queue is full."""
+        """Queue a block or a refused message for storage; wait while the queue is full.
+
+        Refused messages are also counted and logged. The page draws the samples at once.
+        """
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
             self._refused += 1
@@ -116,7 +119,7 @@ class Service:
                 _log.warning("a source waits: %d blocks are to be stored, %.1f MB", load.n_blocks, load.n_bytes / 1e6)
 
     def queue_load(self) -> QueueLoad:
-        """Count the blocks that are not stored yet, in the queue and in the present transaction."""
+        """Count the blocks and bytes that are not stored yet, in the queue and in the present transaction."""
         unstored = [*self._unstored]
         n_blocks, n_bytes = self._queue.size()
         n_bytes += sum(block.bytes for block in unstored if block is not None)
@@ -154,7 +157,7 @@ class Service:
             self.close()
 
     def _all_sources(self) -> list[tuple[str, Source]]:
-        """Return the sources with their names; raise InputError if a secret cannot be read."""
+        """Build all sources in the settings, with their names; raise InputError if a secret cannot be read."""
         sources = [(f"source {number}", source) for number, source in enumerate(self._extra_sources, 1)]
         if self.settings.lines:
             sources.append((_LINES, line_source(self._stdin)))
@@ -167,7 +170,7 @@ class Service:
         return sources
 
     def _start_outputs(self) -> list[threading.Thread]:
-        """Start the threads that send events and states, and return them."""
+        """Start the threads that send events and states to the outputs in the settings, and return them."""
         repeat = self.supervisor.repeat
         threads = [repeat("standard output", self._write_events, _LOOK_S, last=self._write_events)]
         if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
@@ -195,18 +198,18 @@ class Service:
         self._unstored = []
 
     def stop(self) -> None:
-        """Make `run` end after the present transaction."""
+        """Tell `run` to end after the present transaction."""
         self.stopping.set()
 
     def close(self) -> None:
-        """Release the database to another monitor; `run` does so at its end."""
+        """Release the lock of the database, which another monitor can then open; `run` calls this at its end."""
         self._resources.close()
 
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
-        """Store blocks by `write` in one transaction and acknowledge them; raise in an outage of the database.
+        """Store blocks in one transaction by the function `write`, and acknowledge them to their sources.
 
-        After any other error the blocks are stored one by one. The one that fails is dropped: it would fail again, and
-        the others must not wait for it.
+        In an outage of the database its error is raised. After any other error the blocks are stored one by one, and
+        a block that fails is dropped: it would fail again, and the others must not wait for it.
         """
         if not blocks:
             return
@@ -233,15 +236,18 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events to standard output; reading them ends an outage of the database."""
+        """Write new events to standard output.
+
+        If they can be read, an outage of the database is over, unless it still refuses to store blocks.
+        """
         self._lines.deliver()
         if not self._is_database_blocked:  # else reading works, but writing does not
             self._database.end_outage()
 
 
 def _is_logged(number: int) -> bool:
-    """Return True if a repeated problem is logged: its first occurrences, then powers of two.
+    """Return True if occurrence `number`, from 1, of a repeated problem is to be logged.
 
-    `number`: number of the occurrence, from 1.
+    The first `_FIRST_LINES` occurrences are logged, then those whose number is a power of two.
     """
     return number <= _FIRST_LINES or number.bit_count() == 1

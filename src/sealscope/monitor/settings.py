@@ -1,4 +1,4 @@
-"""The monitor's settings: a TOML file, checked whole before anything is opened."""
+"""The settings of a monitor, read from a TOML file and checked completely before anything is opened."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _Words = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
-    """Resolve a path relative to the folder of the settings file, if there is one; rig names and URLs stay."""
+    """Resolve a path in the settings relative to the folder of their file.
+
+    Names of packaged rigs and URLs are returned unchanged, as are all paths if the settings come from no file.
+    """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
 
@@ -39,11 +42,14 @@ class _Part(BaseModel):
 
 
 class WatchSettings(_Part):
-    """Settings of a watched actuator.
+    """Settings by which an actuator is watched.
 
-    `debounce_blocks`: successive blocks beyond a threshold after which the alarm changes; `return_share`: fraction of a
-    threshold below which the leak counts as ended; `no_data_s`: time without a block after which the state of the
-    actuator is "no data" [s]; `not_comparable_s`: time without a judged block after which it is "not comparable" [s].
+    `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: upper limit of the false alarms in
+    1000 h; `learn_hours`: time in which the healthy baseline is learned; `warning_lpm`, `error_lpm` [L/min]: leaks at
+    which an alarm is a warning or an error; `debounce_blocks`: number of successive blocks beyond a threshold after
+    which the alarm changes; `return_share`: fraction of a threshold below which the leak counts as ended; `no_data_s`
+    [s]: time without a block after which the state of the actuator is "no data"; `not_comparable_s` [s]: time without
+    a judged block after which it is "not comparable".
     """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
@@ -63,9 +69,10 @@ class WatchSettings(_Part):
 
 
 class SimulateSettings(_Part):
-    """A simulated rig that replaces an actuator's samples; fields as the options of ``sealscope simulate``.
+    """A simulated rig that provides the samples of an actuator instead of a real machine.
 
-    `speed`: as a multiple of real time.
+    The fields are those options of ``sealscope simulate`` that have the same names; `speed`: multiple of real time at
+    which it runs.
     """
 
     command: _Words = "3 sin(4t)"
@@ -79,10 +86,12 @@ class SimulateSettings(_Part):
 
 
 class ActuatorSettings(WatchSettings):
-    """An actuator: its name, the source of its samples, and settings that differ from the defaults.
+    """The settings of one actuator: its name, the source of its samples, and how it is watched.
 
-    `map`: channel -> column of the files or metric of Sparkplug; `sparkplug`: "group/node" or "group/node/device";
-    `rate`: sampling rate [Hz]; `nodes`: channel -> OPC UA node; `units`: channel -> unit of values that state none.
+    `folder`, `pattern`: folder of its recordings and pattern of their names; `map`: by channel, the column of the
+    files or the Sparkplug metric; `topic`: MQTT topic of its messages; `sparkplug`: "group/node" or
+    "group/node/device"; `rate` [Hz]: sampling rate; `nodes`: by channel, the OPC UA node; `units`: by channel, the
+    unit of values that state none; `simulate`: a simulated rig as the source.
     """
 
     name: _Text
@@ -99,10 +108,11 @@ class ActuatorSettings(WatchSettings):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
-        """Fill rate, map, units and limit from the machine's file if the table does not state them.
+        """Complete the table of an actuator with the rate, columns, units and limit in its machine's file.
 
-        The key `machine` is another name of `rig`, and must name a commissioned machine's file. The units are those in
-        the headings of its logs; they are used for Sparkplug and OPC UA, whose values need not state any.
+        Entries that the table states stay. The key `machine` is another name of `rig`; it must name a file written by
+        `sealscope commission`. The units are those in the column headings of the machine's logs; they are needed for
+        Sparkplug and OPC UA, whose values need not state any.
         """
         if not isinstance(values, dict):
             return values
@@ -126,7 +136,11 @@ class ActuatorSettings(WatchSettings):
 
 
 class PageSettings(_Part):
-    """The page; `proxies`: addresses whose forwarded client addresses are trusted."""
+    """The settings of the web page.
+
+    `host`, `port`: address at which it is served; `token_file`: file with the token that a visitor must state, None
+    for none; `proxies`: addresses of proxies whose statement of the visitor's address is trusted.
+    """
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)
@@ -135,9 +149,9 @@ class PageSettings(_Part):
 
 
 class BrokerSettings(_Part):
-    """The MQTT broker.
+    """The settings of the connection to an MQTT broker.
 
-    `alarms_topic`: topic under which alarms and states are published, None for none; `host_id`: identity of
+    `alarms_topic`: topic under which alarms and states are published, None to publish none; `host_id`: identity of
     the monitor as a primary host of Sparkplug, None if it is not one.
     """
 
@@ -153,7 +167,11 @@ class BrokerSettings(_Part):
 
 
 class OpcUaSettings(_Part):
-    """The OPC UA server; `security`: security string of asyncua, None for none; `block_s`: length of a block [s]."""
+    """The settings of the connection to an OPC UA server.
+
+    `security`: security string in the form of the library asyncua, None for no security; `block_s` [s]: length of the
+    blocks into which values are gathered; `timeout_s` [s]: longest time for an answer.
+    """
 
     url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
     user: str | None = None
@@ -164,7 +182,10 @@ class OpcUaSettings(_Part):
 
 
 class SparkplugSettings(_Part):
-    """The Sparkplug B edge node that publishes the alarms, and changed values every `every_s` [s]."""
+    """The settings of the Sparkplug B edge node by which the monitor publishes alarms and values.
+
+    `every_s` [s]: interval at which changed values are published; alarms are published at once.
+    """
 
     group: _Level = "Sealscope"
     node: _Level = "monitor"
@@ -172,7 +193,10 @@ class SparkplugSettings(_Part):
 
 
 class WebhookSettings(_Part):
-    """The web address that receives the events by POST."""
+    """The settings of a web address that receives the events of alarms by POST requests.
+
+    `token_file`: file with the token that is sent, None for none; `timeout_s` [s]: longest time of a request.
+    """
 
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
     token_file: _File | None = None
@@ -180,7 +204,13 @@ class WebhookSettings(_Part):
 
 
 class MonitorSettings(_Part):
-    """All settings of a monitor."""
+    """All settings of a monitor.
+
+    `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
+    a change after which a file is read; `keep_days`: days of operation whose estimates are stored;
+    `fleet_false_alarms_per_1000_h`: upper limit of the false alarms of all actuators together, which they share;
+    `defaults`: settings of actuators that do not state them.
+    """
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
     lines: bool = False
@@ -198,7 +228,7 @@ class MonitorSettings(_Part):
     @model_validator(mode="before")
     @classmethod
     def _apply_defaults(cls, values: Any) -> Any:
-        """Merge the defaults into each actuator, and divide the fleet's rate of false alarms among them."""
+        """Fill the defaults into the table of each actuator, and divide the fleet's false-alarm rate among them."""
         if not isinstance(values, dict):
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
@@ -214,7 +244,11 @@ class MonitorSettings(_Part):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> MonitorSettings:
-        """Check the rules between tables: unique names and topics, needed tables, units and nodes of channels."""
+        """Check the rules that concern several tables; raise ValueError or InputError if one is broken.
+
+        Names and topics must be unique, the tables that actuators need must exist, channels must have valid units and
+        nodes, and a page open to other machines needs a token.
+        """
         actuators, mqtt, page = self.actuator, self.mqtt, self.page
         topics = [actuator.topic for actuator in actuators if actuator.topic is not None]
         paths = [actuator.sparkplug for actuator in actuators if actuator.sparkplug is not None]
@@ -242,7 +276,10 @@ class MonitorSettings(_Part):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check nodes and units of an actuator's channels; raise ValueError or InputError if one breaks a rule."""
+    """Check the OPC UA nodes and the units of an actuator's channels; raise ValueError or InputError otherwise.
+
+    `has_opcua`: True if the settings have the table [opcua].
+    """
     if actuator.nodes and (not has_opcua or actuator.rate is None):
         raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
     for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):
@@ -259,21 +296,21 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
 
 
 def _column_unit(channel: str, column: str) -> str | None:
-    """Return the unit in a column's heading, None if it has none of the channel's dimension."""
+    """Find the unit in the heading of a channel's column; return None if it has no unit of the right dimension."""
     label = Label.parse(column)
     unit = label.unit or split_unit(label.name)[1]
     return unit if unit and channel in CHANNELS and same_dimension(unit, CHANNEL_UNITS[channel]) else None
 
 
 def topic_level(name: str) -> str:
-    """Convert a name to one level of an MQTT topic: +, #, / and NUL become underscores."""
+    """Convert a name to one level of an MQTT topic by replacing +, #, / and NUL by underscores."""
     return "".join("_" if letter in "+#/\0" else letter for letter in name)
 
 
 def read_settings(path: Path) -> MonitorSettings:
-    """Read a file of settings; its paths are relative to its folder.
+    """Read the settings of a monitor from a TOML file; paths in it are relative to its folder.
 
-    Raises InputError of one line if it cannot be read or breaks a rule.
+    Raises InputError, with a message of one line, if the file cannot be read or breaks a rule.
     """
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
@@ -281,14 +318,14 @@ def read_settings(path: Path) -> MonitorSettings:
 
 
 def template() -> str:
-    """Return the text of a commented settings file."""
+    """Read the text of a settings file with comments, from which a user can begin."""
     return (files("sealscope.monitor") / "template.toml").read_text("utf-8")
 
 
 def read_secret(path: Path | None, name: str) -> str | None:
-    """Read a secret from a file's first line; return None if `path` is None. Raise InputError if it is missing.
+    """Read a secret, such as a password, from the first line of a file; return None if `path` is None.
 
-    `name`: name of the setting, for the error.
+    `name`: name of the setting, for the error message. Raises InputError if the file cannot be read or is empty.
     """
     if path is None:
         return None

@@ -1,6 +1,6 @@
-"""Sparkplug B payloads (named values with types and times, as protobuf messages) and topics.
+"""Payloads and topics of Sparkplug B; a payload is a protobuf message of named values with types and times.
 
-Field numbers: Eclipse Sparkplug 3.0, chapter 6. Data sets, templates, files and metadata are ignored.
+The field numbers are those of Eclipse Sparkplug 3.0, chapter 6. Data sets, templates, files and metadata are ignored.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ NAMESPACE = "spBv1.0"
 BIRTH_SEQUENCE, REBIRTH = "bdSeq", "Node Control/Rebirth"
 #: Data types of the values that are written.
 INT64, UINT32, UINT64, DOUBLE, BOOLEAN, STRING = 4, 7, 8, 10, 11, 12
-#: Signed integer data types -> their bits; they are transmitted in two's complement.
+#: Number of bits of the signed integer data types; they are transmitted in two's complement.
 _SIGNED = {1: 8, 2: 16, 3: 32, 4: 64}
-#: Data types of arrays of numbers -> their NumPy data types.
+#: NumPy data types of the data types that are arrays of numbers.
 _ARRAYS = {22: "<i1", 23: "<i2", 24: "<i4", 25: "<i8", 26: "<u1", 27: "<u2", 28: "<u4", 29: "<u8", 30: "<f4", 31: "<f8"}
 _FIELD_OF_TYPE = {
     **dict.fromkeys((1, 2, 3, 5, 6, 7), "int_value"),
@@ -39,11 +39,12 @@ _UNIT = "engUnit"
 
 @dataclass(frozen=True)
 class SparkplugMetric:
-    """A named value.
+    """A metric of Sparkplug B, a named value.
 
-    `name`: None if an alias replaces it; `value`: a number, text or bool, an array (n,) of numbers, None for null;
-    `datatype`: number of the type, 0 if only the birth states it; `timestamp`: [ms since 1970]; `unit`: property
-    `engUnit`, None if missing.
+    `name`: None if the message has an alias (a number) instead; `value`: a number, text or bool, an array (n,) of
+    numbers, or None for null; `datatype`: number of its Sparkplug type, 0 if only the birth message of its sender
+    states the type; `alias`: number that stands for the name, None for none; `timestamp` [ms since 1970]: its time,
+    None if not stated; `unit`: its property `engUnit`, None if not stated.
     """
 
     name: str | None
@@ -54,7 +55,11 @@ class SparkplugMetric:
     unit: str | None = None
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
-        """Convert the transmitted value to a data type; an array of an unsupported type becomes None."""
+        """Convert the value, as it was transmitted, to a Sparkplug data type, and return the metric with both.
+
+        The bytes of an array become numbers (n,), or None if the type is not supported; integers are converted from
+        two's complement. Raises ValueError if an array has a fraction of a number.
+        """
         value = self.value
         if isinstance(value, bytes):
             dtype = _ARRAYS.get(datatype)
@@ -69,14 +74,18 @@ class SparkplugMetric:
 
 @dataclass(frozen=True)
 class SparkplugPayload:
-    """A message: time of sending [ms since 1970], metrics, and sequence number (0 to 255)."""
+    """A message of Sparkplug B.
+
+    `timestamp` [ms since 1970]: time of sending, None if not stated; `metrics`: its named values; `seq`: sequence
+    number, 0 to 255, None if not stated.
+    """
 
     timestamp: int | None
     metrics: tuple[SparkplugMetric, ...]
     seq: int | None = None
 
     def find_metric(self, name: str) -> SparkplugMetric | None:
-        """Return the first metric of this name, None if there is none."""
+        """Find the first metric called `name`; return None if there is none."""
         return next((metric for metric in self.metrics if metric.name == name), None)
 
 
@@ -84,7 +93,8 @@ class SparkplugPayload:
 def payload_class() -> Any:
     """Build the protobuf class of payloads from `sparkplug.toml`; raise MissingExtra if protobuf is not installed.
 
-    A field of the file has number, name and type, and roles: ``R`` repeated, ``V`` one of the alternatives of a value.
+    In that file each field of a message has a number, a name and a type, and may have roles: ``R`` if it is repeated,
+    ``V`` if it is one of the alternatives of a value.
     """
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -155,12 +165,12 @@ def decode_payload(data: bytes) -> SparkplugPayload:
 
 
 def _get_fields(message: Any, *names: str) -> list[Any]:
-    """Return fields of a protobuf message, None for missing ones."""
+    """Return the values of fields of a protobuf message, with None for a missing field."""
     return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 
 def _decode_metric(entry: Any) -> SparkplugMetric:
-    """Convert a metric from protobuf; raise ValueError if a text in it is damaged."""
+    """Convert a metric from its protobuf message; raise ValueError if a text in it is damaged."""
     field = None if entry.is_null else entry.WhichOneof("value")
     value = None if field is None else getattr(entry, field)
     if not isinstance(entry.name, str) or (field == "string_value" and not isinstance(value, str)):
@@ -173,5 +183,8 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:
-    """Build the topic of a message of `kind`, such as ``NBIRTH``, of a node or of one of its devices."""
+    """Build the MQTT topic of a Sparkplug message of a node, or of one of its devices.
+
+    `kind`: type of the message, such as ``NBIRTH`` or ``DDATA``.
+    """
     return "/".join([NAMESPACE, group, kind, node, *([] if device is None else [device])])

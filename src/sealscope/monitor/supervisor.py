@@ -1,8 +1,8 @@
-"""The supervisor runs every source, decoder and output of a monitor, and restarts it after an error.
+"""The supervisor runs every part of a monitor (sources, decoders and outputs) and restarts it after an error.
 
-An error of a part, or of a service that it needs, is an outage: logged once when it begins and once when it ends, and
-shown on page and metrics meanwhile. A part restarts after a pause that doubles each time. An error of the database
-counts as the outage of the part `DATABASE`.
+An error of a part, or of a service that it needs, begins an outage. It is logged once when it begins and once when it
+ends; meanwhile the page and the metrics show it. A part restarts after a pause that doubles each time. An error of
+the database counts as an outage of the part `DATABASE`.
 """
 
 from __future__ import annotations
@@ -32,14 +32,15 @@ _Work = Callable[[], object]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """A part cannot work without a missing resource, such as a folder: an outage logged without a traceback."""
+    """Raised by a part that lacks something it needs, such as a folder; the outage is logged without a traceback."""
 
 
 class SupervisedPart:
-    """A part of a monitor, or a service that it uses: its outages, and the pause after an error.
+    """A part of a monitor or a service that it uses, with its outages and the pause after an error.
 
-    Several threads may report outages, but only one at a time may call `attempt`. `since`: start of the present outage
-    [s since 1970], None if there is none; `count`: number of outages so far; `seconds`: total length of past ones [s].
+    `since` [s since 1970]: start of the present outage, None if there is none; `reason`: its reason; `count`: number
+    of outages so far; `seconds` [s]: total length of those that have ended. Several threads may report outages, but
+    only one at a time may call `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
@@ -50,7 +51,7 @@ class SupervisedPart:
         self._lock = threading.Lock()
 
     def begin_outage(self, reason: object) -> None:
-        """Begin an outage, log it and report it; an outage that lasts already keeps its first reason."""
+        """Begin an outage and log it; if there is one already, do nothing, and its first reason stays."""
         with self._lock:
             if self.since is not None:
                 return
@@ -60,7 +61,7 @@ class SupervisedPart:
         self._supervisor.on_change()
 
     def end_outage(self) -> None:
-        """End the outage, if there is one."""
+        """End the outage, if there is one, and log that; the next pause after an error is again the shortest."""
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -72,18 +73,19 @@ class SupervisedPart:
 
     @property
     def outage_s(self) -> float:
-        """The length of the present outage so far [s], 0 if there is none."""
+        """Length of the present outage so far [s], 0 if there is none."""
         return 0.0 if self.since is None else time.monotonic() - self._began
 
     @property
     def pause_s(self) -> float:
-        """The remaining pause before the next attempt [s]."""
+        """Time that remains until the next attempt is allowed [s], 0 if it is allowed now."""
         return max(0.0, self._due - time.monotonic())
 
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
-        """Run `work` unless the part pauses; return True if it ran without an error.
+        """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins an outage and a pause, twice as long as the one before. `at_once`: ignore the pause.
+        An error begins an outage and a pause, which is twice as long as the one before. `at_once`: True to run it
+        even during a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -107,10 +109,10 @@ class SupervisedPart:
 
 
 class Supervisor:
-    """The parts of a monitor, and their threads, which run until `stopping` is set.
+    """The parts of a monitor and their threads, which run until the event `stopping` is set.
 
-    `outage_reason`: maps an error of the database to the reason of its outage, other errors to None; `on_change`:
-    called when an outage begins or ends.
+    `outage_reason`: function that returns the reason of an outage for an error of the database, and None for other
+    errors; `on_change`: function called when an outage begins or ends.
     """
 
     def __init__(
@@ -123,31 +125,34 @@ class Supervisor:
         self._lock = threading.Lock()
 
     def part(self, name: str) -> SupervisedPart:
-        """Return the part of this name; a new one starts without an outage."""
+        """Return the part called `name`; create it, without an outage, if it does not exist."""
         with self._lock:
             if name not in self._parts:
                 self._parts[name] = SupervisedPart(name, self)
             return self._parts[name]
 
     def outages(self) -> list[dict[str, Any]]:
-        """Return the present outages: part, start [s since 1970] and reason."""
+        """List the present outages, each with the name of the part, its start [s since 1970] and its reason."""
         parts = [*self._parts.values()]  # a copy, as other threads may add parts
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Return (is reached, number of outages, their total length [s]) of each part, by name."""
+        """Summarise the outages of each part since the start, by name of the part.
+
+        Each value is (True if there is no outage now, number of outages, their total length [s]).
+        """
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
     def start(self, name: str, work: _Work, *, restart: bool = True, on_end: _Work = lambda: None) -> threading.Thread:
-        """Start a thread that runs `work`, and calls `on_end` at its end.
+        """Start a thread that runs `work` as the part `name` and then calls `on_end`; return the thread.
 
-        `restart`: run `work` again after each error, until `stopping` is set.
+        `restart`: True to run `work` again after each error, until `stopping` is set.
         """
         part = self.part(name)
 
         def work_with_timer() -> None:
-            """Run `work`, and end the outage of the part once it has run for `_WORKING_S`."""
+            """Run `work`; once it has run for `_WORKING_S` seconds, end the outage of the part."""
             timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()
@@ -164,7 +169,10 @@ class Supervisor:
         return _start_thread(attempts, name)
 
     def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
-        """Start a thread that runs `step` at intervals of `every_s` seconds, and `last` once `stopping` is set."""
+        """Start a thread that runs `step` every `every_s` seconds as the part `name`; return the thread.
+
+        Once `stopping` is set, it runs `last`, if given, and ends.
+        """
         part = self.part(name)
 
         def attempts() -> None:
@@ -177,10 +185,10 @@ class Supervisor:
 
 
 class LimitedLines(logging.Filter):
-    """A log filter that limits the lines per minute from one place in the code.
+    """A log filter that limits the number of lines per minute from one place in the code.
 
-    The number of lines left out is logged later. Each message becomes one printable line, as the names in it come from
-    outside.
+    The number of lines left out is logged later. Each message is made one printable line, because it may contain
+    names from outside.
     """
 
     def __init__(self) -> None:
@@ -188,7 +196,7 @@ class LimitedLines(logging.Filter):
         self._places: dict[tuple[str, str, int], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a record is within the limit of its place in the code; make it one printable line."""
+        """Return True if a log record is within the limit for its place in the code; make it one printable line."""
         place = (record.name, record.pathname, record.lineno)
         now, max_lines = time.monotonic(), _PACKAGE_LINES if record.name.startswith("sealscope") else _LIBRARY_LINES
         minute_start, n_records = self._places.get(place, (now, 0))
@@ -218,7 +226,7 @@ def describe_error(error: BaseException) -> str:
 
 
 def _start_thread(work: Callable[[], None], name: str) -> threading.Thread:
-    """Start a daemon thread that runs work, and return it."""
+    """Start a daemon thread that runs `work`, and return it."""
     thread = threading.Thread(target=work, name=name, daemon=True)
     thread.start()
     return thread

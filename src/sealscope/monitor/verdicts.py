@@ -1,8 +1,8 @@
-"""Verdicts on whole recordings: a watched folder's files are judged against their machine's healthy recordings.
+"""Verdicts on whole recordings: the files of a watched folder are compared with their machine's healthy recordings.
 
-The verdict is that of `sealscope diagnose --machine`. Page, metrics and messages state it as the actuator's result; the
-chart shows the blocks. The comparison with healthy recordings finds leaks that are present from the first sample on; a
-watch that learns from the same samples cannot find them.
+The verdict is the one that `sealscope diagnose --machine` gives. The page, metrics and messages state it as the
+result of the actuator; the chart shows the single blocks. The comparison with healthy recordings finds leaks that are
+present from the first sample on, which a watch that learns from the same samples cannot find.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ _FALSE_ALARM = VERDICT.false_alarm
 
 @dataclass(frozen=True)
 class RecordingVerdict:
-    """The verdict on one recording, on the clock of the monitor, as plain values for the database.
+    """The verdict on one recording, as plain values for the database; times are on the clock of the monitor [s].
 
-    `file`: name of the file; `summary`, `size`, `odds`: texts of `diagnose` for the verdict, the size or bound of the
-    leak, and the fraction of healthy recordings that look like it; `reason`, `cause`: as in a Diagnosis;
-    `state`: of NE 107; `start_s`, `end_s`: times of the first and last sample [s]; `onset_s`, `onset_interval_s`: start
-    of the leak [s], None if it leaks from the first sample, or not at all; `leak_lpm`, `total_lpm` with their 95 %
-    intervals, `bound_lpm` [L/min]: None if not stated; `chance`: probability that a leak-free recording scores as high;
-    `mark`: a person's mark that ended the alarm.
+    `file`: name of the file; `summary`, `size`, `odds`: texts for the verdict, for the size or bound of the leak, and
+    for the fraction of healthy recordings that look like this one; `reason`, `cause`: as in a Diagnosis; `state`: of
+    the machine by NAMUR NE 107; `start_s`, `end_s`: times of the first and last sample; `onset_s`,
+    `onset_interval_s`: start of the leak, None if it leaks from the first sample on or not at all; `leak_lpm`,
+    `total_lpm` [L/min]: flow of the leak, and of all leakage, with their 95 % intervals; `bound_lpm` [L/min]: upper
+    bound of a leak that is not found; these are None if not stated; `chance`: probability that a leak-free recording
+    scores as high, None if not known; `mark`: mark of a person that ended the alarm, else "".
     """
 
     file: str
@@ -60,7 +61,11 @@ class RecordingVerdict:
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
-        """Convert a diagnosis, adding `shift` [s] to its times; `start_s` and `end_s` include the shift already."""
+        """Convert a diagnosis, whose times are those of the recording, to a verdict on the clock of the monitor.
+
+        `start_s`, `end_s` [s]: times of the first and last sample on the monitor's clock; `shift` [s]: added to the
+        times in the diagnosis.
+        """
         plain = diagnosis.as_dict()  # has None for numbers that are not finite
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
         leaks = diagnosis.verdict == LEAK
@@ -89,7 +94,7 @@ class RecordingVerdict:
 
     @property
     def leaks(self) -> bool:
-        """True if the verdict is a leak."""
+        """True if the verdict is "leak"."""
         return bool(self.verdict == LEAK)
 
     @property
@@ -99,29 +104,32 @@ class RecordingVerdict:
 
     @property
     def decides(self) -> bool:
-        """True if the verdict or a person's mark states the condition of the machine, False if its blocks do."""
+        """True if the condition of the machine follows from this verdict or its mark, False if from single blocks.
+
+        The verdict `cannot tell` without a mark does not decide.
+        """
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if the verdict is within the allowed rate of false alarms.
+        """Return True if a leak-free recording scores as high so seldom that the allowed false-alarm rate is kept.
 
-        `chance`, the probability that a leak-free recording reaches this score, must not exceed a limit. The limit of
-        `chance` is the rate times the length of the recording, but at least `rarest` of `priors.toml`, the smallest
-        chance that can be known. True if `chance` is None.
+        The probability `chance` of this must not exceed the allowed rate times the length of the recording; the limit
+        is at least `rarest` of `priors.toml`, the smallest chance that can be known. Returns True if `chance` is
+        None.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """Expected number of equally high scores in 1000 h of healthy recordings, None if not known."""
+        """Expected number of scores as high as this in 1000 h of healthy recordings, None if it is not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
-        """Build the neutral verdict that is shown after a person marks this one, until the next recording.
+        """Build the verdict that is shown after a person has marked the alarm, until the next recording is judged.
 
-        `mark`: the person's mark, which the new verdict quotes. The file and its times stay.
+        It is `cannot tell`, for the same file and times, and quotes the `mark` ("invalid" or "repaired").
         """
         state, start_s, end_s = state_of("watched").as_dict(), self.start_s, self.end_s
         texts: dict[str, Any] = {"summary": f"marked {mark}", "reason": "the next recording is judged anew"}
@@ -129,9 +137,10 @@ class RecordingVerdict:
         return RecordingVerdict(self.file, CANNOT_TELL, state=state, start_s=start_s, end_s=end_s, **texts)
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Replace the leak of a block by that of the recording.
+        """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, and without a leak, the block gets no leak, and as interval 0 to the recording's bound.
+        Before the onset, or if the recording has no leak, the block has no leak either; its interval is then from 0
+        to the recording's bound, or None without a bound.
         """
         lpm, interval = self.leak_lpm, self.leak_interval_lpm
         if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):
@@ -140,17 +149,17 @@ class RecordingVerdict:
 
 
 def _parse_interval(ends: Any) -> Interval | None:
-    """Return the ends of an interval as a pair, None if one of them is unknown."""
+    """Convert the two ends of an interval to a pair of numbers; return None if there is none or an end is unknown."""
     return None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
 
 
 def judge_recording(
     machine: CommissionedMachine, recording: Recording, file: str, shift: float, *, limit_lpm: float | None = None
 ) -> RecordingVerdict:
-    """Judge a recording by the healthy ones of its machine, like `sealscope diagnose --machine`.
+    """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
-    `shift`: added to the recording's times to give the monitor's clock [s]; `limit_lpm`: leak that calls for a repair
-    [L/min], None for the limit in the machine's file.
+    `file`: name of its file; `shift` [s]: added to the recording's times to give the clock of the monitor;
+    `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in the machine's file.
     """
     if limit_lpm is not None:
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")

@@ -6,14 +6,15 @@ from typing import Literal
 
 from sealscope.parameters.fields import Part, choice, quantity
 
-#: Largest difference of a double-rod cylinder's areas over their mean: makers' tolerances.
+#: Largest difference of a double-rod cylinder's areas, divided by their mean: makers' tolerances.
 _MAX_DOUBLE_ROD_UNEVENNESS = 0.1
 
 
 class Cylinder(Part):
-    """Cylinder with end stops, eqs. (4.13)-(4.15), (4.18), (4.19), and its load; x = 0 at mid-stroke.
+    """Parameters of the cylinder, its end stops and its load, eqs. (4.13)-(4.15), (4.18), (4.19) of the thesis.
 
-    It is double-rod if A_A = A_B, else single-rod.
+    The position x is 0 at mid-stroke. The areas A_A and A_B of a double-rod cylinder are equal to within makers'
+    tolerances; those of a single-rod cylinder differ by more (`single_rod`).
     """
 
     A_A: float = quantity("piston area on side A", "m^2", gt=0, le=10)
@@ -41,17 +42,20 @@ class Cylinder(Part):
 
     @property
     def unevenness(self) -> float:
-        """Difference of the areas over their mean; 0 for a double rod."""
+        """Difference of the piston areas, divided by their mean; 0 if they are equal."""
         return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B))
 
     @property
     def single_rod(self) -> bool:
-        """True if the piston areas differ by more than manufacturing tolerances."""
+        """True if the piston areas differ by more than makers' tolerances, 10 % of their mean."""
         return self.unevenness > _MAX_DOUBLE_ROD_UNEVENNESS
 
 
 class Friction(Part):
-    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22), or another law with the same forces."""
+    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22) of the thesis.
+
+    `law` may select another law of friction with the same forces.
+    """
 
     F_pr: float = quantity("preload force of the seals", "N", ge=0, le=1e7)
     F_cfr: float = quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)

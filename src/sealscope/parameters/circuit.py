@@ -1,4 +1,4 @@
-"""Circuits: the connection of a machine's pump with the chambers of its cylinder, as every package asks for it."""
+"""The two hydraulic circuits: how a machine's pump or servo valve is connected with the chambers of its cylinder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class HydraulicCircuit(NamedTuple):
-    """Connection of pump and cylinder chambers, a row of the table below that `Rig.circuit` chooses.
+    """Connection of pump and cylinder chambers, either `PUMP_CIRCUIT` or `VALVE_CIRCUIT`; `Rig.circuit` chooses one.
 
     Attributes
     ----------

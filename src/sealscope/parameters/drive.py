@@ -8,7 +8,7 @@ from sealscope.parameters.fields import Part, choice, quantity
 
 
 class Motor(Part):
-    """PI-controlled servo motor, eqs. (4.2)-(4.6)."""
+    """Parameters of the servo motor and its PI speed control, eqs. (4.2)-(4.6) of the thesis."""
 
     R_c: float = quantity("winding resistance", "ohm", gt=0, le=1e4)
     L_c: float = quantity("winding inductance", "H", gt=0, le=10)
@@ -27,9 +27,9 @@ class Motor(Part):
 
 
 class Pump(Part):
-    """Bidirectional pump of fixed displacement, eq. (4.1), and its losses.
+    """Bidirectional pump of fixed displacement, eq. (4.1) of the thesis, and its losses.
 
-    Laminar slip is `G_pump`, viscous drag is within `motor.B_M`, constant friction within `motor.T_f`.
+    `G_pump` is the laminar slip. Viscous drag is part of `motor.B_M`, and constant friction of `motor.T_f`.
     """
 
     q_b: float = quantity("displacement", "m^3/rev", gt=0, le=0.1)
@@ -48,11 +48,12 @@ class Pump(Part):
 
 
 class HydraulicLine(Part):
-    """Lines between pump and cylinder: throttles (eqs. (4.7)-(4.12)), shut-off valves, filters.
+    """Lines between pump and cylinder: throttles (eqs. (4.7)-(4.12) of the thesis), shut-off valves, filters.
 
-    `orifices = "absent"`: the pump is piped to the cylinder directly (p_1 = p_A, p_2 = p_B, V_1 and V_2 unused), with
-    neither valves nor filters. Filters may clog by the volume that passes them (`clogged_resistance`) and have a
-    bypass valve. A circulation valve connects the ports of the pump; it is shut unless a run opens it.
+    With `orifices = "absent"` the pump is piped directly to the cylinder: p_1 = p_A, p_2 = p_B, V_1 and V_2 are
+    unused, and there are neither valves nor filters. A filter may clog with the volume that has passed it
+    (`clogged_resistance`), and has a bypass valve. A circulation valve connects the ports of the pump; it is shut
+    unless a run opens it.
     """
 
     orifices: Literal["absent", "present"] = choice("throttles and line volumes in the model")
@@ -88,7 +89,7 @@ class HydraulicLine(Part):
 
 
 class Fluid(Part):
-    """The oil, the air in it, and the pressure the closed circuit is charged to."""
+    """Parameters of the oil and the air in it, and the pressure to which the closed circuit is charged."""
 
     K_oil: float = quantity("effective bulk modulus", "Pa", gt=0, le=1e11)
     rho: float = quantity("density", "kg/m^3", gt=0, le=1e4)
@@ -103,10 +104,11 @@ class Fluid(Part):
 
 
 class MakeUp(Part):
-    """Accumulator, with check and relief valves between it and each side; `check_valves = "absent"`: none.
+    """Accumulator of the closed circuit, with check and relief valves between it and each side.
 
-    The accumulator holds the charge pressure at the start. Check valves feed the circuit; pilot-operated ones, which
-    the pressure of the other side opens, also let the oil back that the rod of a single-rod cylinder displaces.
+    With `check_valves = "absent"` there is none. The accumulator is at the charge pressure at the start. Check valves
+    feed the circuit. Pilot-operated ones, which the pressure of the other side opens, also return the oil that the
+    rod of a single-rod cylinder displaces.
     """
 
     check_valves: Literal["absent", "present", "pilot-operated"] = choice("make-up from an accumulator in the model")

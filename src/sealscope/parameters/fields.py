@@ -20,17 +20,17 @@ from sealscope.storage.plain_values import format_error
 def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: float) -> Any:
     """Declare a numeric parameter with its name in words, its SI unit ("1" if it has none) and its bounds.
 
-    `bounds`: `gt`, `ge`, `lt` or `le`, in that unit; `absent`: the value for a rig without the part or effect that the
-    number describes, or None if every rig must state it.
+    `bounds`: `gt`, `ge`, `lt` or `le`, in that unit. `absent`: the value for a rig without the part or effect that
+    the number describes, or None if every rig must state the parameter.
     """
     return Field(title=name, json_schema_extra={"unit": unit, "absent": absent}, **bounds)  # type: ignore[call-overload]
 
 
 def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a parameter that selects among named options, such as friction laws.
+    """Declare a parameter that selects one of several named options, such as a friction law.
 
-    `name`: the parameter in words; the field's annotation is a Literal of the options. `absent`: the option for a rig
-    whose file does not state one, or None if every rig must.
+    `name`: the parameter in words; the options are in the field's annotation, a Literal. `absent`: the option for a
+    rig whose file does not state the parameter, or None if every rig must state it.
     """
     return Field(title=name, json_schema_extra={"unit": "", "absent": absent})
 
@@ -42,9 +42,9 @@ def unit_of(field: FieldInfo) -> str:
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value that removes a parameter's part or effect from the model.
+    """Return the value that stands for the absence of a parameter's part or effect from the model.
 
-    None if every rig must state it.
+    A rig whose file does not state the parameter has this value; None if every rig must state it.
     """
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
@@ -57,12 +57,15 @@ def choices_of(field: FieldInfo) -> tuple[str, ...]:
 
 
 def with_unit(number: float, unit: str) -> str:
-    """Format `number` with its unit, if it has one."""
+    """Format `number` with its unit; without one if `unit` is "" or "1"."""
     return f"{number:g}" if unit in ("", "1") else f"{number:g} {unit}"
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format the first of pydantic's errors on `model` as "SYMBOL must be ..., got ...", with the unit of a bound."""
+    """Format the first of pydantic's errors on `model` as "SYMBOL must be ..., got ...".
+
+    A bound is followed by the parameter's unit.
+    """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
     has_bound = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
@@ -71,13 +74,13 @@ def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 class PartsDisagreeError(InputError):
-    """A rule on several parameters is broken, and none of them can be named as the cause."""
+    """A rule that relates several parameters is broken, and no single one of them is the cause."""
 
 
 class Part(BaseModel):
-    """A group of parameters, immutable and validated; a broken rule raises InputError.
+    """A group of parameters, such as those of the pump; immutable and validated.
 
-    Numbers must be finite, and unknown names are refused.
+    Numbers must be finite and within their bounds, and unknown names are refused; InputError is raised otherwise.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -91,7 +94,7 @@ class Part(BaseModel):
             raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy.
+        """Copy the part unchanged.
 
         Raises InputError if `update` is given, because pydantic would not validate its values.
         """

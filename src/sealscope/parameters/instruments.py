@@ -10,9 +10,9 @@ from sealscope.parameters.fields import Part, quantity, with_unit
 
 
 class PressureTransducer(Part):
-    """A pressure channel, with white noise of its own.
+    """A pressure transducer with the errors of its reading: noise, offset, drift, mains hum, delay and failures.
 
-    The noise is independent of the other channels' noise and of `sensors.common_noise`.
+    Its white noise is independent of that of other channels and of `sensors.common_noise`.
     """
 
     range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
@@ -40,7 +40,7 @@ class PressureTransducer(Part):
 
 
 class PositionEncoder(Part):
-    """Encoder of the piston's position."""
+    """Encoder of the piston's position, with its resolution, noise and scale error."""
 
     resolution: float = quantity("length of one count (0: no quantisation)", "m", ge=0, le=0.1)
     noise: float = quantity("white noise before counting, standard deviation", "m", ge=0, le=0.1)
@@ -62,7 +62,7 @@ class FlowMeter(Part):
 
 
 class Sensors(Part):
-    """Every sensor, by the name of its channel, and the noise that the pressure channels share."""
+    """All sensors, by the names of their channels, and the noise that is common to the pressure channels."""
 
     common_noise: float = quantity("white noise common to the pressure channels", "Pa", ge=0, le=1e8)
     p_1: PressureTransducer
@@ -75,7 +75,11 @@ class Sensors(Part):
 
 
 class Daq(Part):
-    """Data acquisition board; a transducer's range corresponds to `sensor_volts_lo` .. `sensor_volts_hi`."""
+    """Data acquisition board.
+
+    A transducer's range from `range_lo` to `range_hi` corresponds to `sensor_volts_lo` to `sensor_volts_hi` at the
+    board's input.
+    """
 
     bits: int = quantity("resolution of the conversion", "bit", ge=2, le=32)
     range: float = quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)
@@ -99,5 +103,5 @@ class Daq(Part):
 
     @property
     def step(self) -> float:
-        """One step of the conversion [V]: 2 range / 2^bits."""
+        """Voltage of one step of the conversion [V]: 2 range / 2^bits."""
         return 2.0 * self.range / 2.0**self.bits

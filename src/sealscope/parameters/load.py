@@ -1,4 +1,4 @@
-"""Rigs as TOML files: packaged ones by name, and a user's, each of which may extend another."""
+"""Load rigs from TOML files: packaged ones by their names, and a user's own, each of which may extend another."""
 
 from __future__ import annotations
 
@@ -93,26 +93,30 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
 
 @lru_cache(maxsize=32)
 def _load_packaged(name: str) -> Rig:
-    """Load a packaged rig by its name, once."""
+    """Load a packaged rig by its name; later calls return the same object."""
     return _load_file(_PACKAGED / f"{name}.toml", f"rigs/{name}.toml")
 
 
 def _is_path(text: str) -> bool:
-    """Return True if a text names a file and not a packaged rig."""
+    """Test whether a text is the path of a file, and not the name of a packaged rig."""
     return text.endswith(".toml") or "/" in text or os.sep in text or is_file_path(text)
 
 
 def _load_file(path: Path, place: str) -> Rig:
-    """Load a rig from its file and those that it extends; `place` names the file in messages."""
+    """Load a rig from its file and from the files that this one extends.
+
+    `place`: name of the file in messages.
+    """
     head, entries, columns = _read_layers(path, place, ())
     rig = Rig.from_entries(entries, name=head.get("name", path.stem), title=head.get("title", ""), place=place)
     return rig.with_channel_map(columns) if columns else rig
 
 
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
-    """Replace the table `[map]` (channel = column) in a rig's file.
+    """Replace the table `[map]` in a rig's file, or append it.
 
-    Raises InputError if the file is not a rig's or cannot be written, and leaves it unchanged.
+    `columns`: channel -> column of the machine's logs. Raises InputError, and leaves the file unchanged, if it is not
+    the file of a rig or cannot be written.
     """
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
@@ -133,9 +137,10 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
 
 
 class _RigFile(NamedTuple):
-    """Content of a rig's file.
+    """Content of a rig's file, including the files that it extends.
 
-    These are the table `[rig]`, the parameter entries by dotted name, and the log columns by channel.
+    `head`: its table `[rig]`; `entries`: the parameters by dotted name; `columns`: channel -> column of the machine's
+    logs.
     """
 
     head: dict[str, str]
@@ -144,9 +149,11 @@ class _RigFile(NamedTuple):
 
 
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
-    """Read a rig's file on top of the files that it extends; its entries and columns replace theirs.
+    """Read a rig's file together with the files that it extends.
 
-    `place`: name of the file in messages; `visited`: the files that led to this one, to detect loops.
+    Its parameters replace those of the extended files. Its table `[map]`, if it has one, replaces theirs as a whole.
+    `place`: name of the file in messages; `visited`: the files that led to this one, to detect circles. Raises
+    InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

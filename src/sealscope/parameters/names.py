@@ -1,4 +1,4 @@
-"""Names of parameters (bare if unique, else dotted), and overrides as typed on a command line."""
+"""Find parameters by their names, and split overrides as they are typed on a command line."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _OTHER_NAMES = {
 
 
 def resolve_name(name: str, dotted: Sequence[str]) -> str:
-    """Find a parameter's dotted name from that name itself or from a unique ending of it (`V_1`, `p_A.noise`).
+    """Find the dotted name of a parameter from a dotted name or a unique ending of it, such as `V_1` or `p_A.noise`.
 
-    Raises InputError if no parameter has the name, or several have.
+    `dotted`: the dotted names of all parameters. Raises InputError if no parameter has the name, or if several have.
     """
     if name in dotted:
         return name
@@ -41,9 +41,10 @@ def resolve_name(name: str, dotted: Sequence[str]) -> str:
 
 
 def parse_override(text: str) -> tuple[str, str]:
-    """Split an override `NAME=VALUE[unit]` into name and value; the value stays text, for `Rig.with_overrides`.
+    """Split an override `NAME=VALUE[unit]` into name and value.
 
-    Raises InputError if the name, the equals sign or the value is missing.
+    The value stays a text, which `Rig.with_overrides` parses. Raises InputError if the name, the equals sign or the
+    value is missing.
     """
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
@@ -53,7 +54,10 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
-    """Split all overrides of one command; raise InputError for a name with two values."""
+    """Split the overrides `NAME=VALUE[unit]` of a command into a mapping from name to value.
+
+    Raises InputError for a name with two different values.
+    """
     overrides: dict[str, str] = {}
     for text in texts:
         name, value = parse_override(text)

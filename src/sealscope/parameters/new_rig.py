@@ -1,4 +1,4 @@
-"""The file of a new rig from the numbers of a data sheet; all other values are assumed, and marked as such."""
+"""Write the file of a new rig from the numbers of a data sheet; all other values are assumed, and marked as such."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from sealscope.parameters.load import load_rig
 from sealscope.parameters.rig import GAS_OVER_ROD, Rig
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
-#: Dead volume of each side over the larger swept volume.
+#: Dead volume of each side, divided by the larger swept volume.
 _DEAD_VOLUME_RATIO = 0.25
-#: Speed of a supply's pump [rev/s]; pressure [Pa] above the setting at which the relief valve passes the pump's whole
-#: flow; precharge of the accumulator over the setting.
+#: Speed of a supply's pump [rev/s]; pressure [Pa] above its setting at which the relief valve passes the pump's whole
+#: flow; precharge of the accumulator, divided by that setting.
 _SUPPLY_SPEED, _RELIEF_RANGE, _PRECHARGE_RATIO = 25.0, 2.5e5, 0.7
 _STATED = "stated when this file was written: replace by drawing or data sheet"
 
@@ -22,7 +22,7 @@ _STATED = "stated when this file was written: replace by drawing or data sheet"
 def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[float, float]:
     """Compute the piston areas [m^2] of sides A and B from the diameters of bore and rod [m].
 
-    Raises InputError if the rod is not thinner than the bore.
+    A single rod is on side B. Raises InputError if the rod is not thinner than the bore.
     """
     if not (math.isfinite(bore) and 0.0 <= rod < bore):
         raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
@@ -33,8 +33,9 @@ def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by its pump.
 
-    All other parameters are those of the rig `thesis` (equal areas) or `single-rod-eha`. Some are scaled with the
-    machine's size: friction with the bore, moving mass and valves with the volume.
+    All other parameters are taken from the rig `thesis` (equal areas) or `single-rod-eha`. Some are scaled to the
+    machine's size: friction coefficients with the bore or the area, the moving mass and the check valves with the
+    volume.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ def valve_rig_text(
 ) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by a servo valve.
 
-    All other parameters are those of the rig `servo-valve`, some of them scaled with the machine's size.
+    All other parameters are taken from the rig `servo-valve`; some of them are scaled to the machine's size.
 
     Parameters
     ----------
@@ -128,7 +129,10 @@ def valve_rig_text(
 
 
 def _check_arguments(name: str, sizes: dict[str, float]) -> None:
-    """Check that the rig's name is valid and its sizes are > 0 and finite; raise InputError otherwise."""
+    """Check that the rig's name is valid, and that its sizes are finite and > 0.
+
+    `sizes`: name of an argument -> its value. Raises InputError otherwise.
+    """
     for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{argument} must be > 0, got {value:g}")
@@ -137,22 +141,23 @@ def _check_arguments(name: str, sizes: dict[str, float]) -> None:
 
 
 def _read_template(file: str) -> Template:
-    """Read the template of a rig's file."""
+    """Read the template with the name `file` for a rig's file."""
     return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
-    """Compute the chamber volume of a new cylinder relative to that of the rig `base`.
+    """Compute the ratio of a new cylinder's chamber volume to that of the rig `base`.
 
-    The volume is that of the larger side at mid-stroke, dead volume included. Areas in m^2, stroke in m.
+    The volume is that of the larger side at mid-stroke, including an assumed dead volume. `area_A`, `area_B` [m^2],
+    `stroke` [m].
     """
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
 
 def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
-    """Format the cylinder and friction parameters for a template, scaled from the rig `base`.
+    """Format the cylinder and friction parameters of a new rig, scaled from the rig `base`, for a template.
 
-    Returns the keys of the template -> text.
+    `area_A`, `area_B` [m^2], `stroke` [m]. Returns a mapping from the names in the template to texts.
     """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))

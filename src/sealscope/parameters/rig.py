@@ -26,7 +26,7 @@ Value = float | int | str
 P = TypeVar("P", bound=Part)
 #: Prefix of the source of a value that is not stated for this machine.
 ASSUMED = "assumed:"
-#: Gas of an accumulator over the oil that the rod displaces in a stroke.
+#: Volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke.
 GAS_OVER_ROD = 5.0
 
 
@@ -39,12 +39,15 @@ class ParameterEntry(NamedTuple):
     place: str
 
     def text(self) -> str:
-        """Format value and unit as stated."""
+        """Format the value and its unit as they were stated."""
         return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
 
 
 class ParameterRow(NamedTuple):
-    """A row of the table of parameters; `value` in the SI unit `unit`, `given` as the file states it."""
+    """A row of the table of parameters.
+
+    `value` is in the SI unit `unit`; `given` is value and unit as the rig's file states them.
+    """
 
     symbol: str
     name: str
@@ -56,10 +59,10 @@ class ParameterRow(NamedTuple):
 
 
 class Rig(Part):
-    """Parameters of one actuator; made by `load_rig`, changed only into another one by `with_overrides`.
+    """Parameters of one actuator, immutable; `load_rig` reads them, `with_overrides` returns a changed copy.
 
-    Numbers are SI doubles: `rig.motor.R_c` [ohm], `rig.sensors.p_A.noise` [Pa]. Two rigs are equal when all numbers and
-    choices are, whatever the units and sources they came with.
+    Numbers are SI doubles: `rig.motor.R_c` [ohm], `rig.sensors.p_A.noise` [Pa]. Two rigs are equal if all their
+    numbers and choices are equal, even if these were stated in other units or have other sources.
 
     Parameters
     ----------
@@ -119,7 +122,10 @@ class Rig(Part):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
-        """Check the rules on several parameters; raise ValueError, as pydantic requires, if one is broken."""
+        """Check the rules that relate several parameters.
+
+        Raises ValueError, as pydantic requires, if one is broken.
+        """
         cylinder, makeup, friction = self.cylinder, self.makeup, self.friction
         V, V_rod = cylinder.V, cylinder.V_rod
         if V_rod >= V:
@@ -151,9 +157,10 @@ class Rig(Part):
         return self
 
     def _check_valve(self) -> None:
-        """Check that valve and supply are both present or both absent, and suit the rig.
+        """Check that valve and supply are both present or both absent, and that the rest of the rig suits them.
 
-        Raises ValueError otherwise.
+        A valve-controlled rig has no throttles, no make-up valves and an integral gain of the motor's speed. Raises
+        ValueError otherwise.
         """
         valve, supply = self.valve, self.supply
         if self.circuit.valve_controlled != (supply.drive != "absent"):
@@ -177,9 +184,10 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Check the valves and filters of the lines, and the warm oil's viscosity.
+        """Check the shut-off valves and filters of the lines, and the viscosities of the oil.
 
-        Raises ValueError otherwise. Valves and filters need lines, and warm oil must be thinner than cold oil.
+        Valves and filters require lines, and oil must be thinner at 100 than at 40 deg C. Raises ValueError
+        otherwise.
         """
         line, oil = self.line, self.fluid
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
@@ -228,16 +236,16 @@ class Rig(Part):
 
     @property
     def circuit(self) -> HydraulicCircuit:
-        """Connection of pump and chambers."""
+        """Hydraulic circuit of the rig: valve-controlled if it has a servo valve, else pump-controlled."""
         return VALVE_CIRCUIT if self.valve.spool == "present" else PUMP_CIRCUIT
 
     @property
     def channel_map(self) -> dict[str, str]:
-        """Channel -> column of this machine's logs, from the table `[map]` of its file."""
+        """Mapping from channels to columns of this machine's logs, from the table `[map]` of its file."""
         return dict(self._channel_map)
 
     def with_channel_map(self, columns: Mapping[str, str]) -> Rig:
-        """Return the same rig with another map of columns."""
+        """Return the same rig with another channel map; `columns`: channel -> column of the machine's logs."""
         rig = self.model_copy()
         rig._channel_map = tuple(columns.items())
         return rig
@@ -250,11 +258,14 @@ class Rig(Part):
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
-        """Return value, unit, source and place of a parameter, as stated."""
+        """Return a parameter as it was stated, with value, unit, source and place.
+
+        `name`: its dotted name, or the bare symbol if that is unique.
+        """
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Return True if this machine's own values are stated for all the named parameters, with none assumed.
+        """Test whether all the named parameters are stated for this machine, and none of them is assumed.
 
         A value is assumed if its source begins with `assumed:`.
         """
@@ -267,17 +278,20 @@ class Rig(Part):
         return rig.with_channel_map(self.channel_map)
 
     def _stated_entries(self) -> dict[str, ParameterEntry]:
-        """Return the entries of all parameters by dotted name; raise InputError for a rig made without sources."""
+        """Return the entries of all parameters by dotted name.
+
+        Raises InputError for a rig that was built from bare parts, without sources.
+        """
         if not self._entries:
             raise InputError("a rig must have sources; make it with load_rig or Rig.from_entries, not from bare parts")
         return dict(self._entries)
 
     def with_overrides(self, overrides: Mapping[str, Value], *, source: str = "set by caller") -> Rig:
-        """Return another rig with some values replaced, each with the source `source`.
+        """Return another rig with some values replaced, each of them with the source `source`.
 
-        A name is bare where it is unique (`V_1`), else dotted (`sensors.p_A.noise`). A number is in SI; a text carries
-        its unit (`"0.8[ohm]"`, `"50 %"`) or is a choice's value. Raises InputError for an unknown or ambiguous name, a
-        wrong unit or a value out of range.
+        `overrides`: name -> value. The name may be the bare symbol if that is unique (`V_1`), else it is dotted
+        (`sensors.p_A.noise`). A number is in SI; a text states its unit (`"0.8[ohm]"`, `"50 %"`) or is the value of a
+        choice. Raises InputError for an unknown or ambiguous name, a wrong unit or a value out of range.
         """
         if not source.strip():
             raise InputError("source must not be blank")
@@ -293,10 +307,10 @@ class Rig(Part):
         return rig.with_channel_map(self.channel_map)
 
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
-        """Return the same rig with other piston areas [m^2], and volumes that fit them.
+        """Return the same rig with other piston areas [m^2], and with volumes that suit them.
 
-        The dead volume (not swept by the piston) and the accumulator's gas are scaled with the larger area, and marked
-        as assumed.
+        The areas have the source `source`. The dead volume, which the piston does not sweep, and the gas of the
+        accumulator are scaled with the larger area, and marked as assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -317,7 +331,7 @@ class Rig(Part):
         return rig.with_channel_map(self.channel_map)
 
     def table(self) -> list[ParameterRow]:
-        """List every parameter in the order of declaration."""
+        """List all parameters as rows of a table, in the order of their declaration."""
         entries = self._stated_entries()
         return [
             ParameterRow(
@@ -333,14 +347,15 @@ class Rig(Part):
         ]
 
     def present_values(self) -> dict[str, Value]:
-        """Return the SI values by dotted name, leaving out parameters that are absent from the model.
+        """Return the SI values by dotted name, without the parameters of parts and effects that the rig lacks.
 
-        They identify a machine across versions, because a parameter added in a later version is absent from older rigs.
+        They identify a machine across versions, because a parameter added in a later version is absent from older
+        rigs.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the rig to plain nested values, fit for JSON: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
+        """Convert the rig to nested values that JSON can contain: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
         for name, entry in self._stated_entries().items():
             *groups, symbol = name.split(".")
@@ -353,9 +368,9 @@ class Rig(Part):
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
-        """Read the rig that `as_dict` wrote, for example in a recording's provenance.
+        """Build the rig from the nested values of `as_dict`, for example in a recording's provenance.
 
-        `place` is named in errors.
+        `place`: where the values come from, for messages. Raises InputError for invalid values.
         """
         head = tree.get("rig")
         name, title = (head.get("name", ""), head.get("title", "")) if isinstance(head, Mapping) else ("", "")
@@ -364,9 +379,10 @@ class Rig(Part):
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
-        """Build a rig from the entries of its parameters, by dotted name.
+        """Build a rig from the entries of its parameters by dotted name.
 
-        A parameter without an entry has its `absent` value; raises InputError, which names `place`, if it has none.
+        A parameter without an entry gets its `absent` value. Raises InputError, which states `place`, if it has none,
+        and for an unknown name or an invalid value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
@@ -386,12 +402,15 @@ class Rig(Part):
 
 @cache
 def declared_fields() -> dict[str, FieldInfo]:
-    """Return pydantic's field of every parameter of a rig by dotted name, in the order of declaration."""
+    """Return the declarations (pydantic fields) of all parameters of a rig by dotted name, in order."""
     return dict(iter_fields(Rig))
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Make the entries of all parameters that need not be stated, with their `absent` values."""
+    """Build the entries of the parameters that a rig's file may omit, with their `absent` values.
+
+    `place`: the file, for messages.
+    """
     return {
         full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
         for full_name, field in declared_fields().items()
@@ -406,9 +425,10 @@ def declared_names() -> tuple[str, ...]:
 
 
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
-    """Build the part whose parameter names begin with `path`.
+    """Build a part of a rig, such as its pump, from the entries of its parameters.
 
-    An InputError names the place of the wrong value; for a rule on several parameters together it names `place`.
+    `path`: beginning of their dotted names, such as "pump.", empty for the whole rig. An InputError names the place
+    of the wrong value, or `place` if a rule on several parameters is broken.
     """
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
@@ -427,7 +447,10 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
 
 
 def _qualify_symbol(full_name: str, text: str) -> str:
-    """Replace the symbol at the start of `text` by its dotted name `full_name`, if several parameters have it."""
+    """Replace the symbol at the beginning of `text` by the dotted name, if several parameters have this symbol.
+
+    `full_name`: the dotted name of the parameter.
+    """
     symbol = full_name.rpartition(".")[2]
     is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
     return text if is_unique else full_name + text[len(symbol) :]
@@ -435,12 +458,15 @@ def _qualify_symbol(full_name: str, text: str) -> str:
 
 @cache
 def _short_name(full_name: str) -> str:
-    """Return the bare symbol of a dotted name if it is unique, else the dotted name."""
+    """Return the symbol of a parameter if no other one has it, else its dotted name."""
     return _qualify_symbol(full_name, full_name.rpartition(".")[2])
 
 
 def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
-    """Convert an entry to its SI number or its choice; raise InputError for a wrong type or unit, or no source."""
+    """Convert the entry of a parameter to a number in SI, or to the value of a choice.
+
+    Raises InputError for a wrong type or unit, a number that is not finite, an unknown option, or a missing source.
+    """
     short_name, place = _short_name(full_name), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():
         raise InputError(f"{short_name} must have a source, got none ({place})")
@@ -465,7 +491,10 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
 
 
 def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
-    """Parse an override, a number in SI or a text; return its SI value or choice, and its unit ("" for a choice)."""
+    """Parse an override, a number in SI or a text, to an SI value or the value of a choice; also return the unit.
+
+    The unit is "" for a choice. `place`: where the override comes from, for messages.
+    """
     field = declared_fields()[full_name]
     if choices_of(field):
         return (value.strip() if isinstance(value, str) else value), ""
@@ -476,7 +505,11 @@ def _parse_value(full_name: str, value: Any, place: str) -> tuple[Value, str]:
 
 
 def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
-    """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name."""
+    """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
+
+    `tree`: pairs of key and table; `place`: the file, for messages; `prefix`: beginning of the dotted names. Raises
+    InputError for an unknown name.
+    """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full_name = prefix + key
@@ -490,7 +523,10 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
 
 
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
-    """Check the table of a parameter in a rig's file, and convert it; raise InputError for a wrong key or type."""
+    """Check the table of a parameter in a rig's file, and convert it to an entry.
+
+    Raises InputError for an unknown name, a wrong key or a wrong type.
+    """
     if full_name not in declared_fields():
         raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
     short_name = _short_name(full_name)

@@ -12,15 +12,15 @@ _OVERLAP = "overlap of the edge from {} (< 0: underlap)"
 
 
 def _overlap(edge: str) -> Any:
-    """Declare the overlap [m] of a metering edge, such as "P to A"."""
+    """Declare the overlap [m] of a metering edge of the valve; `edge`: "P to A", for example."""
     return quantity(_OVERLAP.format(edge), "m", absent=0, ge=-0.1, le=0.1)
 
 
 class ServoValve(Part):
-    """Servo valve with four edges between supply (P), return (T) and the chambers; `spool = "absent"`: none.
+    """Servo valve with four metering edges between supply (P), return (T) and the chambers A and B.
 
-    The spool follows the command as a second-order system with a limited speed. The flow of an edge is that of an
-    orifice whose area grows linearly with the spool's travel beyond the overlap.
+    With `spool = "absent"` there is none. The spool follows the command as a second-order system with limited speed.
+    An edge is an orifice whose area grows linearly with the spool's travel beyond the overlap.
     """
 
     spool: Literal["absent", "present"] = choice("servo valve between supply and cylinder", absent="absent")
@@ -53,9 +53,10 @@ class ServoValve(Part):
 
 
 class Supply(Part):
-    """Supply of a servo valve: the rig's motor turns its pump at a constant speed, a relief valve holds the pressure.
+    """Supply of a servo valve: a pump driven at constant speed, with a relief valve that limits the pressure.
 
-    `drive = "absent"`: none. The pump draws from the return and feeds the line V_1 with an accumulator on it.
+    With `drive = "absent"` there is none. The rig's motor turns the pump, which draws from the return line and feeds
+    the line of volume V_1, to which an accumulator is connected.
     """
 
     drive: Literal["absent", "constant-speed"] = choice(

@@ -1,4 +1,4 @@
-"""The cylinder: chamber volumes, pressure build-up, hard stops at both caps, its load, the piston's acceleration."""
+"""The cylinder: chamber volumes, pressure build-up, end stops, loads on the piston, and the piston's acceleration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from sealscope.units import P_ATM
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
     """Compute the oil volumes [m^3] of chamber and hose on sides A and B, with the piston at mid-stroke.
 
-    `c`: a cylinder, or any object with the numbers V, V_rod, V_hose_A and V_hose_B [m^3].
+    They are V + V_hose_A and V - V_rod + V_hose_B. `c` is a cylinder, or any object with these attributes in m^3: the
+    chamber volume V, the volume V_rod that the rod takes from side B, and the hose volumes V_hose_A and V_hose_B.
     """
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
@@ -27,7 +28,8 @@ def chamber_volumes(
 ) -> tuple[float, float]:
     """Compute the oil volumes of sides A and B [m^3] at piston position x [m] from mid-stroke.
 
-    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1).
+    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1
+    of the thesis). `A_A`, `A_B`: piston areas [m^2].
     """
     if position_dependent:
         return V_A + A_A * x, V_B - A_B * x
@@ -36,18 +38,21 @@ def chamber_volumes(
 
 @contracted
 def pressure_rate(inflow: float, volume: float, K_oil: float) -> float:
-    """Compute the pressure rise dp/dt = K_oil/V Q [Pa/s] of an oil volume, eqs. (4.16)-(4.19).
+    """Compute the rate of change dp/dt = K_oil/V Q [Pa/s] of the pressure in an oil volume, eqs. (4.16)-(4.19).
 
-    `inflow` Q [m^3/s]: flow in, less flow out, less growth of the volume.
+    `inflow` Q [m^3/s]: flow in, minus flow out, minus growth of the volume; `volume` V [m^3]; `K_oil`: bulk modulus
+    [Pa].
     """
     return K_oil / volume * inflow
 
 
 @contracted
 def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) -> float:
-    """Compute the force [N] along +x of the end caps (at x = +-L/2) on the piston.
+    """Compute the force [N] that the end stops of the cylinder exert on the piston, positive along +x.
 
-    A cap is a stiff spring k_stop [N/m] with a damper d_stop [N s/m]. It acts in contact only and never pulls.
+    The stops are at x = +-L/2. Each is a stiff spring `k_stop` [N/m] with a damper `d_stop` [N s/m] that acts only
+    while the piston touches it, and never pulls. `x` [m], `v` [m/s]: position of the piston from mid-stroke, and its
+    velocity.
     """
     cap_sign = math.copysign(1.0, x)
     depth = abs(x) - 0.5 * L
@@ -57,7 +62,10 @@ def hard_stop_force(x: float, v: float, L: float, k_stop: float, d_stop: float) 
 
 @contracted
 def load_force(x: float, F_l: float, k_load: float) -> float:
-    """Compute the load [N] against +x of a constant force and a spring about mid-stroke: F_l + k_load x."""
+    """Compute the load F_l + k_load x [N] that acts on the piston against +x.
+
+    It is a constant force `F_l` [N] plus a spring of stiffness `k_load` [N/m] that is relaxed at mid-stroke, x = 0.
+    """
     return F_l + k_load * x
 
 
@@ -65,8 +73,8 @@ def load_force(x: float, F_l: float, k_load: float) -> float:
 def piecewise_linear_force(s: float, breakpoints: np.ndarray) -> float:
     """Compute a load [N] that is a piecewise linear function of a position s [m] or a velocity s [m/s].
 
-    F = a + b s + sum of c_k max(s - s_k, 0). `breakpoints` (n, 2): row 0 is (a, b), row k is (s_k, c_k), with the
-    change c_k of the slope at s_k.
+    F = a + b s + sum of c_k max(s - s_k, 0). Row 0 of `breakpoints` (n, 2) is (a, b). Each later row k is (s_k, c_k):
+    the slope changes by c_k at s_k.
     """
     force = breakpoints[0, 0] + breakpoints[0, 1] * s
     for k in range(1, breakpoints.shape[0]):
@@ -78,22 +86,27 @@ def piecewise_linear_force(s: float, breakpoints: np.ndarray) -> float:
 def piston_acceleration(
     p_A: float, p_B: float, friction: float, load: float, stop: float, A_A: float, A_B: float, M_eq: float
 ) -> float:
-    """Compute the piston's acceleration (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq [m/s^2], eq. (4.15) with caps."""
+    """Compute the piston's acceleration [m/s^2] from the forces on it, eq. (4.15) with end stops added.
+
+    It is (p_A A_A - p_B A_B - F_f - F_l + F_stop)/M_eq with the chamber pressures [Pa], the piston areas [m^2], the
+    moving mass `M_eq` [kg], and in N: `friction` F_f and `load` F_l, both against +x, and `stop` F_stop along +x.
+    """
     return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
 
 
 @contracted
 def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
-    """Compute the force A_opp p [N] of an opposing cylinder against +x.
+    """Compute the force A_opp p [N] with which a second cylinder pushes the piston against +x.
 
-    The cylinder is fed at p_opp [Pa] through an orifice of coefficient C_opp [m^3/(s Pa^0.5)]; v [m/s]: piston's
-    velocity. p = p_opp + v |v| (A_opp/C_opp)^2 is the orifice's law solved for the pressure, no lower than vacuum. The
-    oil of that cylinder is taken as incompressible (Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice).
+    The second cylinder is fed at `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)]. Its
+    pressure is p = p_opp + v |v| (A_opp/C_opp)^2, but never below vacuum, with the piston's velocity `v` [m/s]: the
+    orifice law solved for the pressure. The oil in the second cylinder is taken as incompressible (Merritt, Hydraulic
+    Control Systems, 1967, section 3.4, orifice).
     """
     drop_coefficient = A_opp / C_opp
     return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)
 
 
 def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
-    """Compute the mechanical power [W] that the chamber pressures give the piston: (p_A A_A - p_B A_B) v."""
+    """Compute the mechanical power (p_A A_A - p_B A_B) v [W] that the chamber pressures deliver to the piston."""
     return (p_A * A_A - p_B * A_B) * v

@@ -23,11 +23,12 @@ _MIN_ABSOLUTE_PRESSURE = 100.0
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
     """Compute the bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
-    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the volume of air over volume of oil r (`air_volume_ratio`). No air
-    dissolves. Without air K is exactly K_oil.
+    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), where r is the volume of air over the volume of oil at this pressure
+    (`air_volume_ratio`, with the same `air` and `n_air`). Air does not dissolve. Without air K is exactly K_oil.
 
-    Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
-    liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its friction.
+    Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances
+    of liquid and gas); in this form the hydraulic fluid of the Simscape library, from which the thesis took its
+    friction.
     """
     if not any_lane(air > 0.0):
         return K_oil + 0.0 * p  # lanes if p is lanes
@@ -47,19 +48,20 @@ def oil_density_ratio(dp: float, K_oil: float) -> float:
 
 @contracted
 def air_volume_ratio(p: float, air: float, n_air: float) -> float:
-    """Compute the volume of air over volume of oil at `p` [Pa gauge]: air (p_atm/p_abs)^(1/n).
+    """Compute the volume of free air over the volume of oil at the pressure `p` [Pa gauge].
 
-    `air`: that ratio at atmospheric pressure; `n_air`: polytropic exponent.
+    It is air (p_atm/p_abs)^(1/n): `air` is the ratio at atmospheric pressure, `n_air` the polytropic exponent n.
     """
     return air * math.pow(P_ATM / max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE), 1.0 / n_air)
 
 
 @contracted
 def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air: float) -> float:
-    """Compute the density ratio rho(p)/rho(p_0) of oil with free air, whose modulus is `effective_bulk_modulus`.
+    """Compute the density ratio rho(p)/rho(p_0) of oil with free air, both pressures in Pa gauge.
 
-    Its logarithm is the integral of dp/K. The part of the air is ln((1 + r_0)/(1 + r)), exactly; that of the liquid,
-    the integral of dp/(K_oil (1 + r)), is taken by Simpson's rule, with an error far below r dp/K_oil.
+    Its logarithm is the integral of dp/K, with the modulus K of `effective_bulk_modulus`. The air contributes ln((1 +
+    r_0)/(1 + r)) exactly. The liquid contributes the integral of dp/(K_oil (1 + r)), computed by Simpson's rule with
+    an error far below r dp/K_oil. r, r_0: `air_volume_ratio` at p and p_0.
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)
@@ -86,9 +88,9 @@ def thermal_density_ratio(T: NDArray[np.float64], T_0: float, alpha: float) -> N
 
 
 def thermal_stiffness_ratio(T: NDArray[np.float64], T_0: float) -> NDArray[np.float64]:
-    """Compute the bulk modulus ratio K(T)/K(T_0) = 10^(-0.0024 (T - T_0)) of mineral oils; T, T_0 [K].
+    """Compute the ratio K(T)/K(T_0) of a mineral oil's bulk modulus at the temperatures T [K] to that at T_0 [K].
 
-    Source: A. T. J. Hayward, How to estimate the bulk modulus of hydraulic fluids, Hydraulic Pneumatic Power 16 (1970)
-    28-40: isentropic secant modulus.
+    It is 10^(-0.0024 (T - T_0)). Source: A. T. J. Hayward, How to estimate the bulk modulus of hydraulic fluids,
+    Hydraulic Pneumatic Power 16 (1970) 28-40: isentropic secant modulus.
     """
     return np.asarray(10.0 ** (-_LOG_MODULUS_SLOPE * (T - T_0)))

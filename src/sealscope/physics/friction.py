@@ -16,7 +16,7 @@ from sealscope.physics.lanes import exponential, select
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_difference: bool) -> float:
     """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20).
 
-    `use_difference`: take p_A - p_B in place of the sum, as the equation is printed.
+    `use_difference`: take p_A - p_B instead of the sum, as the equation is printed in the thesis.
     """
     return F_pr + F_cfr * ((p_A - p_B) if use_difference else (p_A + p_B))
 
@@ -37,7 +37,8 @@ def karnopp_friction(
 ) -> float:
     """Compute Karnopp's friction force [N]: the piston sticks for |v| < v_th and slides by eq. (4.21) otherwise.
 
-    While it sticks, friction balances the `applied` force [N] up to the `breakaway` force [N] (see `stuck_velocity`).
+    While the piston sticks, friction balances the sum of all other forces on it, `applied` [N], up to `breakaway` [N]
+    (see `stuck_velocity`). The other parameters are those of `stribeck_friction`.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -56,22 +57,25 @@ def stuck_velocity(v: float, v_th: float) -> float:
 
 @contracted
 def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
-    """Compute the rate dz/dt = v - sigma_0 |v|/g z [m/s] of the bristles' mean deflection z [m] in LuGre's law.
+    """Compute the rate dz/dt [m/s] of the mean deflection z [m] of the contact's elastic bristles in LuGre's law.
 
-    `g` > 0 [N]: friction of steady sliding at v. At a steady v, z settles at g/sigma_0 sign(v), its largest magnitude.
+    dz/dt = v - sigma_0 |v|/g z, with the velocity v [m/s], the friction `g` > 0 [N] of steady sliding at v, and the
+    bristles' stiffness `sigma_0` [N/m]. At a constant v, z settles at g/sigma_0 sign(v), its largest magnitude.
 
-    Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with friction,
-    IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2), with g of eq. (4.21) in place of its Gaussian.
+    Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with
+    friction, IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2), with g of eq. (4.21) in place of its
+    Gaussian.
     """
     return v - sigma_0 * abs(v) / g * z
 
 
 @contracted
 def lugre_friction(v: float, z: float, dz: float, sigma_0: float, sigma_1: float, F_v: float, v_th: float) -> float:
-    """Compute LuGre's friction force [N] from the bristles' deflection z [m], its rate dz [m/s] and the velocity v.
+    """Compute LuGre's friction force [N] from the deflection of the contact's bristles and the velocity.
 
-    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v. The damping sigma_1 must vanish at speed: otherwise the force
-    could drive the motion.
+    F = sigma_0 z + sigma_1 exp(-(v/v_th)^2) dz + F_v v, with the bristles' mean deflection z [m] and its rate dz
+    [m/s] (`bristle_rate`) and the velocity v [m/s]. The bristles' damping sigma_1 must vanish at high speed;
+    otherwise the force could drive the motion.
 
     Source: as `bristle_rate`, eq. (3); the decay: H. Olsson, Control Systems with Friction, Lund 1996, section 5.
     """
@@ -85,10 +89,12 @@ def stribeck_friction(
 ) -> float:
     """Compute the thesis's friction force [N] at the velocity v [m/s], eqs. (4.21)-(4.22).
 
-    |v| > v_th: F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v;
-    |v| <= v_th: F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th, continuous at v_th.
-    `literal_bracket`: close the unbalanced bracket of eq. (4.22) after F_v v_th instead, F = v F_C [1 + (K_brk - 1)
-    exp(-C_c |v|) + F_v v_th] / v_th. Then F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and no pressure).
+    F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v for |v| > v_th,
+    F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th for |v| <= v_th, which is continuous at v_th.
+
+    Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1
+    + (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (from 73.2 N to 145 N with Table 4.1 and
+    no pressure).
     """
     speed = abs(v)
     if literal_bracket:

@@ -1,11 +1,11 @@
-"""Lanes: a numba type for a short vector of numbers, which the laws take in place of one number.
+"""Lanes: a numba type for a short vector of numbers, which the physical laws take in place of one number.
 
 One source serves a single run and eight runs on a processor's vector registers (sixteen in single precision). A law
 written without branches on its numbers (`select` instead of `if`) compiles for floats, for `LANES` and for `SINGLES`;
 the type of an array decides which of them `load` reads. Each operation on lanes is one LLVM vector instruction, so
-vectorisation does not depend on the compiler's heuristics. Products and sums may be contracted to fused multiply-adds:
-a lane and a single run agree to rounding, not to the bit. Lanes exist inside compiled functions only: `load` and
-`store` move them from and to rows of arrays.
+vectorisation does not depend on the compiler's heuristics. Products and sums may be contracted to fused
+multiply-adds, so a lane and a single run agree to rounding, not to the bit. Lanes exist inside compiled functions
+only: `load` and `store` move them from and to rows of arrays.
 """
 
 from __future__ import annotations
@@ -29,21 +29,24 @@ _FLAGS = ("contract",)  # LLVM may fuse products and sums
 
 
 class Lanes(types.Type):  # type: ignore[misc]
-    """The type of `width` numbers of the type `number`, float64 or float32."""
+    """The numba type of a vector of `width` numbers, its lanes; `number` is their type, float64 or float32."""
 
     def __init__(self, number: Any, width: int) -> None:
         self.number, self.width = number, width
         super().__init__(name=f"Lanes({number}, {width})")
 
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
-        """Allow any number to become lanes."""
+        """Tell numba that any single number can be converted to lanes, that is to a vector of equal numbers.
+
+        Returns None, which forbids the conversion, if `source` is not the type of a number.
+        """
         from numba.core.typeconv import Conversion
 
         return Conversion.safe if isinstance(source, types.Number) else None
 
 
 class Mask(types.Type):  # type: ignore[misc]
-    """The type of one truth value for each of the lanes."""
+    """The numba type of a vector of truth values, one for each lane of a vector of numbers."""
 
     def __init__(self, lanes: Lanes) -> None:
         self.lanes = lanes
@@ -55,7 +58,7 @@ _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
 def _vector_type(lanes: Lanes) -> Any:
-    """Return LLVM's vector type for lanes."""
+    """Return LLVM's vector type for a type of lanes."""
     return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
 
 
@@ -72,7 +75,7 @@ class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Build the instructions that copy one number into every lane."""
+    """Build the LLVM instructions that copy one number into every lane of a vector."""
     zero = ir.Constant(ir.IntType(32), 0)
     first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
@@ -80,7 +83,10 @@ def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
 
 
 def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
-    """Build the instructions that convert a number to lanes; lanes are returned unchanged."""
+    """Build the LLVM instructions that convert a number to a vector of lanes; a vector is returned unchanged.
+
+    `value_type`: numba's type of the value; `lanes`: type of the result.
+    """
     if isinstance(value_type, Lanes):
         return value
     return _broadcast(builder, context.cast(builder, value, value_type, lanes.number), lanes)
@@ -88,32 +94,37 @@ def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, l
 
 @lower_cast(types.Number, Lanes)  # type: ignore[untyped-decorator]
 def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, value: Any) -> Any:
-    """Convert a number to lanes where numba needs one type for both, such as at the ends of two branches."""
+    """Convert a number to lanes where numba needs one type for both, such as for the results of two branches."""
     return _convert_to_lanes(context, builder, value, value_type, lanes)
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the type of lanes in a mixture of lanes and plain numbers; None without lanes and for any other mixture."""
+    """Find the type of lanes to which arguments that mix lanes and plain numbers can be converted.
+
+    Returns None if no argument is lanes, if the lanes are of different types, or if there is an argument of another
+    kind.
+    """
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
 
 
 def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
-    """Overload `function` for lanes, alone or mixed with plain numbers, by the instructions `build(builder, *values)`.
+    """Define a Python function or operator on lanes, alone or mixed with plain numbers, for compiled code.
 
-    The result is lanes, or a mask of truth values if `is_test`.
+    `build(builder, *values)` writes the LLVM instructions. The result is lanes, or a mask of truth values if
+    `is_test`.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature for these argument types, or None if they are not lanes."""
+            """Return the function's signature for these argument types, or None if they are not lanes."""
             lanes = None if kws else _common_lanes_type(args)
             return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Build the instructions of one call, with plain numbers converted to lanes."""
+        """Build the LLVM instructions of one call, with plain numbers converted to lanes."""
         lanes = _common_lanes_type(sig.args)
         assert lanes is not None
         pairs = zip(args, sig.args, strict=True)
@@ -124,7 +135,10 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Divide lanes by one number: multiply by its reciprocal, which the compiler can move out of a loop."""
+    """Build the LLVM instructions that divide lanes by one number: they multiply by its reciprocal.
+
+    The compiler can then move the division out of a loop.
+    """
     lanes, number_type = sig.args
     number = context.cast(builder, args[1], number_type, types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
@@ -143,10 +157,13 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Return the function that builds the call of an LLVM intrinsic on lanes."""
+    """Build the function that writes the call of an LLVM intrinsic on lanes.
+
+    `name`: name of the intrinsic without type, such as "sqrt".
+    """
 
     def build(builder: Any, *values: Any) -> Any:
-        """Build the call; the intrinsic's name has the type as its suffix, such as llvm.sqrt.v8f64."""
+        """Build the call of the intrinsic, whose full name ends with the vector's type, such as llvm.sqrt.v8f64."""
         vector = values[0].type
         bits = 64 if vector.element == ir.DoubleType() else 32
         function_type = ir.FunctionType(vector, [vector] * len(values))
@@ -169,7 +186,7 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     @infer_global(_function)
     class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature for two masks of the same lanes, else None."""
+            """Return the signature of `&` or `|` for two masks of the same lanes; None for any other arguments."""
             compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
             return signature(args[0], *args) if compatible else None
 
@@ -198,19 +215,19 @@ def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) ->
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` if the condition is true, else `no`, lane by lane; both are computed."""
+    """Choose `yes` if the condition is true, else `no`, separately in each lane; both are computed in any case."""
     return yes if condition else no
 
 
 def _select_type(arg_types: Any) -> Any:
-    """Return the type of `select`'s result: the lanes of a mask or of either value, else a double."""
+    """Find the type of the result of `select`: that of the lanes in its arguments, a double if there are none."""
     if isinstance(arg_types[0], Mask):
         return arg_types[0].lanes
     return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
 
 
 def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the instructions of `select`: convert both values to one type, and choose by the condition."""
+    """Build the LLVM instructions of `select`: convert both values to one type, then choose by the condition."""
     result_type = _select_type(arg_types)
     pairs = zip(values[1:], arg_types[1:], strict=True)
     if isinstance(result_type, Lanes):
@@ -224,12 +241,12 @@ register_lowering(select, 3, _select_type, _lower_select)
 
 
 def any_lane(condition: Any) -> Any:
-    """Return True if a condition is true in any lane; a plain truth value is returned unchanged."""
+    """Return True if a condition is true in any lane; a plain truth value, of a single run, is returned unchanged."""
     return condition
 
 
 def _lower_any_lane(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the instructions of `any_lane`: a mask's bits, taken as one integer, are not all zero."""
+    """Build the LLVM instructions of `any_lane`: test that a mask's bits, taken as one integer, are not all zero."""
     if not isinstance(arg_types[0], Mask):
         return values[0]
     bits = ir.IntType(arg_types[0].lanes.width)
@@ -240,19 +257,25 @@ register_lowering(any_lane, 1, lambda _: types.boolean, _lower_any_lane)
 
 
 def _float_constant(value_type: Any, value: float) -> Any:
-    """Return LLVM's constant of a value, in every lane if `value_type` is lanes."""
+    """Return the LLVM constant of a number, in every lane if `value_type` is a type of lanes."""
     if not isinstance(value_type, Lanes):
         return ir.Constant(ir.DoubleType(), value)
     return ir.Constant(_vector_type(value_type), [value] * value_type.width)
 
 
 def nearest_integer(x: Any) -> Any:
-    """Round x to the nearest whole number, for |x| < 2^51 (2^22 in single precision), as a float."""
+    """Round x to the nearest whole number, returned as a float.
+
+    x| must be below 2^51, in single precision below 2^22.
+    """
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 
 def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the instructions of `nearest_integer` with the rounding constant of the argument's precision."""
+    """Build the LLVM instructions of `nearest_integer`: add a large constant and subtract it again.
+
+    The constant is that of the argument's precision; adding it leaves no bits for a fraction.
+    """
     large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == SINGLES else _ROUNDING_DOUBLE)
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
@@ -261,12 +284,15 @@ register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0], _lower_nea
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for whole n in -1022..1023; single precision limits n to -126..127."""
+    """Compute 2^n for a whole number n in -1022..1023, given as a float or as lanes.
+
+    In single precision n is limited to -126..127.
+    """
     return math.ldexp(1.0, int(n))
 
 
 def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the instructions of `power_of_two`: shift the biased exponent to its place above the mantissa."""
+    """Build the LLVM instructions of `power_of_two`: shift the biased exponent to its place above the mantissa."""
     n_type, n = arg_types[0], values[0]
     single = n_type == SINGLES
     integer = ir.IntType(32 if single else 64)
@@ -289,12 +315,12 @@ _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _is_array_of_lanes(array: Any) -> bool:
-    """Return True if the rows of an array of this type can be loaded as lanes."""
+    """Return True if the rows of arrays of this numba type can be loaded as lanes."""
     return isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the address of the lanes in a row of an array."""
+    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to lanes."""
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
@@ -310,11 +336,15 @@ def load(array: Any, row: int) -> Any:
 
 
 def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `load`."""
     return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
 def _loaded_type(arg_types: Any) -> Any:
-    """Return the type of lanes that `load` reads from an array, or None if the arguments are not array and row."""
+    """Find the type of lanes that `load` reads from an array.
+
+    Returns None if the arguments are not an array with loadable rows and an integer.
+    """
     is_loadable = _is_array_of_lanes(arg_types[0]) and isinstance(arg_types[1], types.Integer)
     return _LANES_OF_DTYPE[arg_types[0].dtype] if is_loadable else None
 
@@ -323,16 +353,17 @@ register_lowering(load, 2, _loaded_type, _lower_load)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes into row `row` of an array, as `load` reads them."""
+    """Write the numbers in lanes to row `row` of a C-ordered array; rows are counted as in `load`."""
 
 
 def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `store`."""
     builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
     return context.get_dummy_value()
 
 
 def _stored_type(arg_types: Any) -> Any:
-    """Return numba's type `none`, the result of `store`, or None if the array cannot contain such lanes."""
+    """Return numba's type `none`, the result of `store`, or None if the array cannot contain lanes of this type."""
     return types.none if _loaded_type(arg_types) == arg_types[2] else None
 
 
@@ -340,10 +371,11 @@ register_lowering(store, 3, _stored_type, _lower_store)
 
 
 def broadcast(value: Any) -> Any:
-    """Copy one number into every lane of doubles."""
+    """Copy one number into every lane of a vector of doubles."""
 
 
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
+    """Build the LLVM instructions of `broadcast`."""
     return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 
@@ -358,10 +390,12 @@ _ROUNDING_DOUBLE, _ROUNDING_SINGLE = 6755399441055744.0, 12582912.0
 
 @contracted
 def exponential(x: Any) -> Any:
-    """Compute exp(x), x limited to -708..709, as 2^n times a polynomial in r = x - n ln 2.
+    """Compute exp(x) for a number or for lanes, with x limited to -708..709.
 
-    The relative error is below 1e-14, the same for a number and for lanes. In single precision it is below 2e-6 for x
-    in -60..60; beyond -87..88 the result stays at a power of two.
+    exp(x) is 2^n times a polynomial in r = x - n ln 2. The relative error is below 1e-14, the same for a number and
+    for lanes. In single precision it is below 2e-6 for x in -60..60; beyond -87..88 the result stays at a power of
+    two.
+
     Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two parts);
     Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
     """

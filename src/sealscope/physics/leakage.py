@@ -15,9 +15,10 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def laminar_leakage(dp: float, G: float) -> float:
-    """Compute Q_L = G (p_A - p_B) [m^3/s] through a laminar gap of leakage conductance G [m^3/(s Pa)].
+    """Compute the leakage Q_L = G dp [m^3/s] from chamber A to B through a laminar gap.
 
-    Source: Merritt, Hydraulic Control Systems, 1967, leakage of an actuator.
+    `dp` = p_A - p_B [Pa]; `G`: leakage conductance [m^3/(s Pa)]. Source: Merritt, Hydraulic Control Systems, 1967,
+    leakage of an actuator.
     """
     return G * dp
 
@@ -26,7 +27,8 @@ def laminar_leakage(dp: float, G: float) -> float:
 def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
     """Compute the leakage Q_L [m^3/s] from chamber A to B through a laminar gap and an orifice in parallel.
 
-    `dp` = p_A - p_B [Pa], conductance `G` [m^3/(s Pa)], orifice coefficient `C` [m^3/(s Pa^0.5)].
+    `dp` = p_A - p_B [Pa]; `G`: conductance of the gap [m^3/(s Pa)]; `C`: flow coefficient of the orifice
+    [m^3/(s Pa^0.5)], which is linear in dp below about `dp_0` [Pa] (`orifice_flow`).
     """
     if not any_lane(C > 0.0):
         return laminar_leakage(dp, G)
@@ -35,7 +37,10 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
 
 @kernel
 def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float) -> np.ndarray:
-    """Compute `piston_leakage` [m^3/s] sample by sample for `dp` [Pa], `G` and `C`, each (n,)."""
+    """Compute the leakage [m^3/s] from chamber A to B at each of n samples, by `piston_leakage`.
+
+    `dp` [Pa], `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)] are arrays (n,); `dp_0` [Pa] is one number.
+    """
     Q_L = np.empty(dp.size)
     for k in range(dp.size):
         Q_L[k] = piston_leakage(dp[k], G[k], C[k], dp_0)

@@ -10,7 +10,11 @@ from sealscope.physics.lanes import select
 
 @contracted
 def controller_voltage(error: float, integral: float, k_p: float, K_i: float, V_max: float) -> float:
-    """Compute the winding voltage [V] of the PI speed controller, eq. (4.3), limited to the drive's supply +-V_max."""
+    """Compute the winding voltage [V] of the PI speed controller, eq. (4.3).
+
+    It is k_p error + K_i integral, limited to the drive's supply +-`V_max` [V]. `error` [rad/s]: set speed minus
+    actual speed; `integral` [rad]: its integral over time.
+    """
     voltage = k_p * error + K_i * integral
     return min(max(voltage, -V_max), V_max)
 
@@ -19,7 +23,10 @@ def controller_voltage(error: float, integral: float, k_p: float, K_i: float, V_
 def winding_current_rate(
     voltage: float, i: float, omega: float, R_c: float, L_c: float, C_e: float, i_max: float
 ) -> float:
-    """Compute the winding's di/dt = (V - R_c i - C_e omega)/L_c [A/s], eq. (4.4); 0 if it would pass +-i_max."""
+    """Compute the rate of change di/dt [A/s] of the winding current, eq. (4.4).
+
+    It is (voltage - R_c i - C_e omega)/L_c, or 0 where the current would leave +-`i_max` [A].
+    """
     rate = (voltage - R_c * i - C_e * omega) / L_c
     at_limit = ((i >= i_max) & (rate > 0.0)) | ((i <= -i_max) & (rate < 0.0))
     return select(at_limit, 0.0, rate)  # type: ignore[no-any-return]
@@ -27,7 +34,11 @@ def winding_current_rate(
 
 @contracted
 def shaft_acceleration(i: float, omega: float, load_torque: float, C_m: float, B_M: float, J_M: float) -> float:
-    """Compute the shaft's domega/dt = (C_m i - B_M omega - T_load)/J_M [rad/s^2], eq. (4.5)."""
+    """Compute the angular acceleration domega/dt [rad/s^2] of the motor's shaft, eq. (4.5).
+
+    It is (C_m i - B_M omega - load_torque)/J_M, with the current `i` [A], the speed `omega` [rad/s] and the torque
+    `load_torque` [N m] of the pump.
+    """
     return (C_m * i - B_M * omega - load_torque) / J_M
 
 

@@ -1,8 +1,9 @@
-"""The fixed-displacement pump, driven both ways, and its losses over speed and pressure.
+"""The fixed-displacement pump, which turns in both directions, and its losses over speed and pressure.
 
 Source of the losses: W. E. Wilson, Positive-displacement pumps and fluid motors, 1950 (laminar slip, viscous drag,
-friction by pressure, constant friction), and W. M. J. Schlosser, Mathematical model for displacement pumps and motors,
-Hydraulic Power Transmission 7 (1961) 252-257 and 324-328 (turbulent slip, hydrodynamic drag). D = q_b/(2 pi) [m^3/rad].
+friction by pressure, constant friction), and W. M. J. Schlosser, Mathematical model for displacement pumps and
+motors, Hydraulic Power Transmission 7 (1961) 252-257 and 324-328 (turbulent slip, hydrodynamic drag). D = q_b/(2 pi)
+[m^3/rad] is the displacement per radian.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
 
 @contracted
 def pump_torque(dp: float, q_b: float) -> float:
-    """Compute the torque q_b (p_1 - p_2)/(2 pi) [N m] of the port pressures on the shaft, eqs. (4.5)-(4.6)."""
+    """Compute the torque q_b dp/(2 pi) [N m] with which the port pressures load the shaft, eqs. (4.5)-(4.6).
+
+    `dp` = p_1 - p_2 [Pa]; `q_b`: displacement [m^3/rev].
+    """
     return q_b / (2.0 * math.pi) * dp
 
 
@@ -34,8 +38,8 @@ def pump_torque(dp: float, q_b: float) -> float:
 def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
     """Compute the coefficients (c_slip, k_h) of the pump's turbulent slip and of its hydrodynamic torque.
 
-    c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)], k_h = C_h rho D^(5/3)/2 [N m s^2], density `rho` [kg/m^3]
-    (Schlosser 1961).
+    c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)] and k_h = C_h rho D^(5/3)/2 [N m s^2], with the displacement
+    per radian D = q_b/(2 pi) [m^3/rad] and the oil's density `rho` [kg/m^3] (Schlosser 1961).
     """
     D = q_b / (2.0 * math.pi)
     return C_st * D ** (2.0 / 3.0) * math.sqrt(2.0 / rho), 0.5 * C_h * rho * D ** (5.0 / 3.0)
@@ -43,21 +47,25 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 
 @contracted
 def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
-    """Compute the turbulent slip [m^3/s] through the pump's gaps under `dp` [Pa]: an orifice law (Schlosser 1961)."""
+    """Compute the pump's turbulent slip [m^3/s]: the flow that leaks back through its gaps under `dp` [Pa].
+
+    It is the flow of an orifice with the coefficient `c_slip`, laminar below about `dp_0` [Pa] (Schlosser 1961).
+    """
     return orifice_flow(dp, c_slip, dp_0)
 
 
 @contracted
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
-    """Compute the friction torque [N m] of motor and pump, without viscous drag.
+    """Compute the friction torque [N m] of motor and pump at the speed `omega` [rad/s], without viscous drag.
 
-    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction, friction due to pressure, and the
-    hydrodynamic torque. sat limits to +-1, so that T is continuous at standstill.
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction, friction that grows with the
+    pressure difference `dp` [Pa], and the hydrodynamic torque. D = q_b/(2 pi) [m^3/rad]. sat limits its argument to
+    +-1, so that T is continuous at standstill.
     """
     smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
     return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)
 
 
 def hydraulic_power(Q_1: Any, dp: Any) -> Any:
-    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump gives the oil."""
+    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump delivers to the oil."""
     return Q_1 * dp

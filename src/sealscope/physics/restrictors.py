@@ -16,10 +16,10 @@ def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
 
 
 def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
-    """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle `c` in series with a shut-off valve.
+    """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve.
 
-    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2: the valve opens the fraction `opening` of its line's area, whose
-    coefficient is `c_line`. Fully open C = c, shut C = 0.
+    1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, with the throttle's coefficient `c` and that of the free line,
+    `c_line`. The valve opens the fraction `opening` of the line's area: fully open C = c, shut C = 0.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
@@ -32,7 +32,10 @@ _series_coefficient = law(series_coefficient)
 
 @law
 def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
-    """Compute `series_coefficient` in compiled code; exactly `c` for a fully open valve."""
+    """Compute the flow coefficient of a throttle and a shut-off valve in series in compiled code.
+
+    The formula is that of `series_coefficient`; a fully open valve gives exactly `c`.
+    """
     return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
 
@@ -40,8 +43,9 @@ def compiled_series_coefficient(c: float, c_line: float, opening: float) -> floa
 def orifice_flow(dp: float, c: float, dp_0: float) -> float:
     """Compute the flow [m^3/s] through an orifice under the pressure difference `dp` [Pa].
 
-    Q = c dp / (dp^2 + dp_0^2)^(1/4), eqs. (4.9)-(4.12) made smooth at dp = 0, where the square root's slope is
-    infinite: turbulent, c sign(dp) sqrt|dp|, for |dp| >> dp_0, and laminar, c dp / sqrt(dp_0), for |dp| << dp_0.
+    Q = c dp / (dp^2 + dp_0^2)^(1/4), with the flow coefficient `c` [m^3/(s Pa^0.5)]. This is the square-root law of
+    eqs. (4.9)-(4.12), made smooth at dp = 0 where its slope is infinite: turbulent flow c sign(dp) sqrt|dp| for |dp|
+    >> dp_0, laminar flow c dp / sqrt(dp_0) for |dp| << dp_0.
     """
     return c * dp / math.sqrt(math.sqrt(dp * dp + dp_0 * dp_0))
 
@@ -54,11 +58,11 @@ def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
 
 @contracted
 def _solve_scaled_flow(b: float, a: float) -> float:
-    """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) of an orifice; a >= 0, b >= 0.
+    """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) >= 0 of an orifice, with a >= 0 and b >= 0.
 
-    w r(w), r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1, is the pressure difference over dp_0 (the inverse of
-    `orifice_flow`). The left side rises and is convex, so the root is unique. Halley's method finds it to 1e-12 of w,
-    in one iteration if a >> 1, where r hardly matters.
+    w r(w) with r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1 is the orifice's pressure difference over dp_0: `orifice_flow`
+    inverted. The left side of the equation rises and is convex, so the root is unique. Halley's method finds it to a
+    relative error of 1e-12, in a single iteration if a >> 1, where r hardly matters.
     """
     w = b / (a + 1.0)
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # r(w) approximated for small and large w
@@ -80,10 +84,11 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 
 @contracted
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
-    """Compute the flow Q [m^3/s] of a one-way throttle in an implicit stage, from d + g Q(d) = total.
+    """Compute the flow Q [m^3/s] of a one-way throttle at the end of an implicit stage of the solver.
 
-    d [Pa]: pressure difference of the throttle at the stage's end; `total` [Pa]: this difference if nothing flowed; `g`
-    >= 0 [Pa s/m^3]: fall of the difference per unit flow. The root is unique and has the sign of `total`.
+    Q solves d + g Q(d) = total: d [Pa] is the pressure difference at the end of the stage, `total` [Pa] what it would
+    be if nothing flowed, and `g` >= 0 [Pa s/m^3] its fall over the stage per unit flow. The root is unique and has
+    the sign of `total`. `c_forward`, `c_reverse`, `dp_0`: as in `one_way_coefficient` and `orifice_flow`.
     """
     c = one_way_coefficient(total, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)
@@ -93,12 +98,12 @@ def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: f
 
 @contracted
 def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
-    """Compute the resistance [Pa s/m^3] of a filter that has passed the oil volume `V` [m^3]; `R` when new.
+    """Compute the resistance [Pa s/m^3] of a filter through which the oil volume `V` [m^3] has passed.
 
-    The blocking laws of filtration at a constant dirt concentration, dR/dV = k R_new (R/R_new)^n, give
-    R = R_new (1 + (1 - n) k V)^(1/(1 - n)): the factor is 1 + k V for a cake (n = 0), exp(k V) for intermediate (1),
-    (1 - k V/2)^-2 for standard (1.5) and 1/(1 - k V) for complete blocking (2). The base is limited to 1e-3, below
-    which a filter with n > 1 would pass almost nothing.
+    `R` is its resistance when new. The blocking laws of filtration at a constant dirt concentration, dR/dV = k R_new
+    (R/R_new)^n, give R = R_new (1 + (1 - n) k V)^(1/(1 - n)). The factor is 1 + k V for cake filtration (n = 0),
+    exp(k V) for intermediate (n = 1), (1 - k V/2)^-2 for standard (n = 1.5) and 1/(1 - k V) for complete blocking
+    (n = 2). 1 + (1 - n) k V is limited to at least 1e-3, where a filter with n > 1 passes almost nothing.
 
     Source: J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187.
     """
@@ -111,11 +116,13 @@ def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
 def filtered_flow(
     total: float, g: float, R: float, p_bypass: float, G_bypass: float, c_forward: float, c_reverse: float, dp_0: float
 ) -> float:
-    """Compute the flow Q [m^3/s] of a throttle in series with a filter and its bypass valve in an implicit stage.
+    """Compute the flow Q [m^3/s] of a throttle and a filter in series at the end of an implicit stage of the solver.
 
-    d + g Q(d) + dp_f(Q) = total. The filter's drop dp_f is R Q while the valve is shut, and follows from
-    Q = dp_f/R + G_bypass (dp_f - p_bypass) above `p_bypass` [Pa]. Each case is linear in Q, so that
-    `implicit_orifice_flow` solves it.
+    The equation is d + g Q(d) + dp_f(Q) = total, with d, g and `total` as in `implicit_orifice_flow`. The filter has
+    the resistance `R` [Pa s/m^3] and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens at the drop
+    `p_bypass` [Pa]: the drop dp_f is R Q while the valve is shut, and follows from Q = dp_f/R + G_bypass (dp_f -
+    p_bypass) while it is open. In both cases dp_f is linear in Q, so that `implicit_orifice_flow` solves the
+    equation.
     """
     filter_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
@@ -126,9 +133,9 @@ def filtered_flow(
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute the magnitude [m^3/s] of the flow through a filter with a bypass valve.
+    """Compute how much oil [m^3/s, >= 0] flows through a filter rather than through its bypass valve.
 
-    `Q` [m^3/s]: flow through both; `R` [Pa s/m^3]: the filter's resistance. The valve opens at the drop `p_bypass`
-    [Pa], with the conductance `G_bypass` [m^3/(s Pa)].
+    `Q` [m^3/s]: flow through filter and bypass together; `R` [Pa s/m^3]: resistance of the filter. The bypass valve
+    opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

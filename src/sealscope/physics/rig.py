@@ -1,13 +1,15 @@
-"""The right-hand side dy/dt of the whole rig from its laws, eqs. (4.1)-(4.22).
+"""The right-hand side dy/dt of the whole rig from its physical laws, eqs. (4.1)-(4.22) of the thesis.
 
-State y, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega [rad/s] and
-angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up [m^3] that
-the make-up has delivered, deflection z [m] of LuGre's bristles, position x_s [m] and speed v_s [m/s] of a servo valve's
-spool, or in place of these the oil [m^3] that has passed clogging filters. Without throttles there are no line volumes:
-the pump is connected to the chambers, p_1 = p_A and p_2 = p_B. With a servo valve the pump runs at a constant speed
-from the return (p_2) to the supply (p_1), and the valve's edges connect both to the chambers. With throttles, only
-their two flows are stiff (microseconds, against milliseconds for the rest), so the right-hand side is in two parts:
-`rates_without_throttles` and `throttle_rates`. `p` is always the rig's numbers, `RigNumbers`.
+The state y contains, in the order of `STATES`: controller integral I [rad], winding current i [A], motor speed omega
+[rad/s] and angle theta [rad], piston position x [m] and velocity v [m/s], pressures p_A, p_B, p_1, p_2 [Pa], oil V_up
+[m^3] that the make-up has delivered, deflection z [m] of LuGre's bristles, and position x_s [m] and speed v_s [m/s]
+of a servo valve's spool. In a rig with clogging filters the last two are the oil [m^3] that has passed each filter.
+
+Without throttles there are no line volumes: the pump is connected to the chambers, p_1 = p_A and p_2 = p_B. With a
+servo valve the pump runs at a constant speed from the return (p_2) to the supply (p_1), and the valve's edges connect
+both to the chambers. With throttles, only their two flows are stiff (microseconds, against milliseconds for the
+rest), so the right-hand side is in two parts: `rates_without_throttles` and `throttle_rates`. The argument `p` is
+always the rig's numbers, `RigNumbers`.
 """
 
 from __future__ import annotations
@@ -77,13 +79,13 @@ _CHOICES = {
 DERIVED = ("c_A_in", "c_A_out", "c_B_in", "c_B_out", "V_A", "V_B", "c_slip", "k_h")
 #: The numbers of `RigNumbers`.
 NUMBERS = (*PARAMETERS, *DERIVED)
-#: Laws that some rigs do without. Each is a tuple, empty if the law is not in force: numba specialises on its length,
-#: so that the law is not compiled in. Throttles in the lines; air in the oil; rod seals or make-up; balance of mass in
-#: place of volume; Karnopp's friction; LuGre's; friction that differs between the directions; pilot-operated check
-#: valves; relief valves; an accumulator that is not isothermal; a damper; a load in addition to the rig's own, (True,)
-#: over time, or its two tables (`piecewise_linear_force`) over position and velocity; a servo valve and its supply;
-#: filters in the lines; losses of motor and pump beyond the linear ones; an opposing cylinder; boiling oil; filters
-#: that clog; filters with a bypass.
+#: Laws that only some rigs have. Each is a tuple, empty if the law is not in force: numba specialises on its length,
+#: so that the law is then not compiled in. In this order: throttles in the lines; air in the oil; leaking rod seals
+#: or a make-up; balance of mass in place of volume; Karnopp's friction; LuGre's friction; friction that differs between
+#: the directions; pilot-operated check valves; relief valves; an accumulator that is not isothermal; a damper; a load
+#: in addition to the rig's own, (True,) over time, or its two tables (`piecewise_linear_force`) over position and
+#: velocity; a servo valve and its supply; filters in the lines; losses of motor and pump beyond the linear ones; an
+#: opposing cylinder; boiling oil; filters that clog; filters with a bypass.
 LAWS = (
     *("throttled", "aerated", "open_circuit", "conserving", "sticking", "bristled", "one_sided"),
     *("piloted", "relieved", "polytropic", "damped", "pushed", "valved"),
@@ -112,11 +114,13 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 @law
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
-    """Compute the flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
+    """Compute the flow coefficients of the throttles for both directions: (c_A_in, c_A_out, c_B_in, c_B_out).
 
-    `exponent`: 1 if the closed fraction is of the area (eq. 4.8), 2 if of the diameter (the text). `literal` False: on
-    both sides the flow towards the cylinder is free and the return throttled (the text and Appendix A); True: side B is
-    the other way round, as eqs. (4.9)-(4.12) are printed. Shut-off valves are in series (`series_coefficient`).
+    They are in m^3/(s Pa^0.5), eqs. (4.7)-(4.12); "in" is the flow towards the cylinder. Each throttle is in series
+    with a shut-off valve (`series_coefficient`). `exponent`: 1 if the closed fraction is one of the area (eq. 4.8), 2
+    if it is one of the diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and
+    the return is throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs.
+    (4.9)-(4.12) are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -132,7 +136,11 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Compute the derived numbers `DERIVED`; `exponent`, `literal`: see `throttle_flow_coefficients`."""
+    """Compute the numbers that follow from a rig's parameters, in the order of `DERIVED`.
+
+    They are the flow coefficients of the throttles, the oil volumes of both sides at mid-stroke, and the coefficients
+    of the pump's losses. `exponent`, `literal`: see `throttle_flow_coefficients`.
+    """
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
     V_A, V_B = cylinder.mid_stroke_volumes(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
@@ -140,24 +148,31 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
 
 
 def parameter_values(rig: Rig) -> RigValues:
-    """Collect the values of a rig's parameters from which its numbers are computed."""
+    """Collect the parameters of a rig, in SI units, from which the numbers of the compiled laws are computed."""
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return the arguments `exponent` and `literal` of `throttle_flow_coefficients` for a rig."""
+    """Return a rig's choice between two readings of the throttles' equations, as `exponent` and `literal`.
+
+    Both are arguments of `throttle_flow_coefficients`.
+    """
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Compute the coefficients of the rig's throttles (`throttle_flow_coefficients`)."""
+    """Compute a rig's throttle coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)].
+
+    "in" is the flow towards the cylinder, A and B are the sides (`throttle_flow_coefficients`).
+    """
     return throttle_flow_coefficients(parameter_values(rig), *throttle_readings(rig))  # type: ignore[no-any-return]
 
 
 def rig_numbers(rig: Rig) -> RigNumbers:
-    """Build the numbers of a rig for the compiled laws.
+    """Convert a rig to the numbers and choices that the compiled physical laws take.
 
-    These are its parameters, the numbers derived from them, and the choice of laws.
+    These are its parameters in SI units, the numbers derived from them (`DERIVED`), and for each optional law
+    (`LAWS`) whether it is in force.
     """
     values = parameter_values(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
@@ -193,7 +208,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the dtype of the record that `pack_numbers` returns.
+    """Build the NumPy dtype of the record into which `pack_numbers` packs a rig's numbers.
 
     `lengths`: for each law in `LAWS`, the length of its tuple in `RigNumbers` (0: the rig does not have this law).
     """
@@ -203,9 +218,9 @@ def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
 
 
 def pack_numbers(p: RigNumbers) -> Any:
-    """Pack the numbers into one record, which compiled functions pass by its address instead of 100 values.
+    """Pack a rig's numbers into one record, which compiled functions pass by its address instead of 100 values.
 
-    Numbers with the tables of a load, which do not fit into a record, are returned unchanged.
+    If the rig has a load over position or velocity, whose tables do not fit into a record, `p` is returned unchanged.
     """
     lengths = tuple(len(getattr(p, name)) for name in LAWS)
     if len(p.pushed) > 1:
@@ -215,10 +230,10 @@ def pack_numbers(p: RigNumbers) -> Any:
 
 @contracted
 def limit_state(y: State, p: RigNumbers) -> State:
-    """Limit motor current and spool in the state after a step, and overwrite the states that the rig does not use.
+    """Limit the motor current and the spool in a state after a step of the solver; return the new state.
 
-    Without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is the return's pressure. States that no law of the
-    rig changes are set to 0, so that the compiler removes them.
+    States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
+    the return's pressure. States that no law of the rig changes are set to 0, so that the compiler removes them.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -235,10 +250,11 @@ def limit_state(y: State, p: RigNumbers) -> State:
 
 @contracted
 def vapour_floor(q: float, p: RigNumbers) -> float:
-    """Compute the pressure [Pa] of a volume whose pressure state is q [Pa]: q, but at least the vapour pressure.
+    """Compute the pressure [Pa] of an oil volume from its pressure state q [Pa]: q, but at least the vapour pressure.
 
-    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q then continues by the oil's bulk modulus:
-    rho(q) V is the mass of oil in the volume V, and V (1 - rho(q)/rho(p_vap)) the cavity, so that mass balances hold.
+    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q then continues by the oil's bulk
+    modulus so that mass balances hold: rho(q) V is the mass of oil in the volume V, and V (1 - rho(q)/rho(p_vap)) the
+    cavity.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -249,7 +265,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
 @contracted
 def pressures_of(y: State, p: RigNumbers) -> Pressures:
-    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] of a state, no lower than the vapour pressure (`vapour_floor`)."""
+    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] in a state, none below the vapour pressure (`vapour_floor`)."""
     return vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), vapour_floor(y[P_1], p), vapour_floor(y[P_2], p)
 
 
@@ -266,7 +282,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
 @contracted
 def pump_difference(y: State, p: RigNumbers) -> float:
-    """Compute the pump's pressure difference [Pa], port 1 less port 2."""
+    """Compute the pressure difference across the pump [Pa], port 1 minus port 2."""
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     if len(p.throttled) > 0 or len(p.valved) > 0:
         return p_1 - p_2
@@ -275,9 +291,10 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction [N] on the piston by the rig's law, and LuGre's bristle rate [m/s], 0 for other laws.
+    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
 
-    `applied` [N]: sum of all other forces on the piston. Eqs. (4.20)-(4.22), unless the rig has another law.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead; the rate is 0 unless
+    it has LuGre's. `applied` [N]: sum of all other forces on the piston.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -300,7 +317,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the resistances [Pa s/m^3] of the filters in lines A and B.
 
-    They grow with the oil volume that has passed (`clogged_resistance`).
+    The resistance of a clogging filter grows with the oil volume that has passed it (`clogged_resistance`).
     """
     if len(p.clogging) == 0:
         return p.R_A, p.R_B
@@ -312,10 +329,10 @@ def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
 def implicit_flows(
     total_A: float, total_B: float, g_A: float, g_B: float, y: State, p: RigNumbers
 ) -> tuple[float, float]:
-    """Compute the line flows Q_A, Q_B [m^3/s] in an implicit stage from d + g Q(d) = total on either side.
+    """Compute the line flows Q_A, Q_B [m^3/s] at the end of an implicit stage of the solver.
 
-    `total` [Pa], `g` [Pa s/m^3], d: see `implicit_orifice_flow`. A filter in series with the throttle of its line,
-    p_1 - p_A = d + R Q, adds R to g.
+    On each side the flow solves d + g Q(d) = total, with `total` [Pa], `g` [Pa s/m^3] and d as in
+    `implicit_orifice_flow`. A filter in series with the throttle, p_1 - p_A = d + R Q, adds its resistance R to g.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -331,7 +348,7 @@ def implicit_flows(
 
 @contracted
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the magnitudes [m^3/s] of the flows through the filters of lines A and B, without their bypasses."""
+    """Compute how much oil [m^3/s, >= 0] flows through the filters of lines A and B, without their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
     if len(p.bypassed) == 0:
         return abs(Q_A), abs(Q_B)
@@ -342,9 +359,9 @@ def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the throttles' flows [m^3/s]: Q_A from line 1 to chamber A, Q_B from chamber B to line 2.
+    """Compute the flows [m^3/s] through the throttles: Q_A from line 1 to chamber A, Q_B from chamber B to line 2.
 
-    Eqs. (4.9)-(4.12). The pressure drop of a filter in series is R Q (Darcy's law).
+    Eqs. (4.9)-(4.12). A filter in series with a throttle has the pressure drop R Q (Darcy's law).
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
@@ -362,7 +379,7 @@ def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
-    """Compute the bulk modulus [Pa] of the oil and its air in a volume at `pressure` [Pa]."""
+    """Compute the bulk modulus [Pa] of the oil, with the air in it if the rig has any, at `pressure` [Pa gauge]."""
     if len(p.aerated) == 0:
         return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
@@ -370,7 +387,11 @@ def bulk_modulus(pressure: float, p: RigNumbers) -> float:
 
 @contracted
 def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
-    """Compute the oil's density ratio rho(pressure)/rho(reference), both pressures [Pa]."""
+    """Compute the oil's density at `pressure` over that at `reference`, both in Pa gauge.
+
+    Air in the oil and boiling are taken into account if the rig has them. Below the vapour pressure the ratio
+    continues with the pressure states, so that mass is conserved (`vapour_floor`).
+    """
     if len(p.aerated) == 0:
         return oil_density_ratio(pressure - reference, p.K_oil)
     p_a, p_b = vapour_floor(pressure, p), vapour_floor(reference, p)
@@ -384,10 +405,11 @@ def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
 
 @contracted
 def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the volume flows [m^3/s] out of a source and into a sink at the pressures `source` and `sink` [Pa].
+    """Compute the volume flow [m^3/s] out of a source and that into a sink, which differ if the oil's density does.
 
-    `Q` [m^3/s] is the flow at the upstream end, which is the sink for Q < 0. The flow at the other end carries the same
-    mass, rho_in Q_in = rho_out Q_out. If the rig balances volumes, both flows are Q.
+    `Q` [m^3/s] is the flow at the upstream end: at the source, or at the sink for Q < 0. The flow at the other end
+    carries the same mass, rho_in Q_in = rho_out Q_out, with the densities at the pressures `source` and `sink` [Pa].
+    In a rig that balances volumes instead of masses both flows are Q.
     """
     if len(p.conserving) == 0:
         return Q, Q
@@ -398,9 +420,10 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
 
 @contracted
 def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures:
-    """Compute the rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that the throttles' flows cause.
+    """Compute the pressure rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that the throttles' flows cause.
 
-    `Q_A`, `Q_B` [m^3/s]: from line 1 to chamber A, from chamber B to line 2 (`throttle_flows`). Eqs. (4.16)-(4.19).
+    `Q_A` [m^3/s] flows from line 1 to chamber A, `Q_B` from chamber B to line 2 (`throttle_flows`). Eqs.
+    (4.16)-(4.19).
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     from_1, to_A = flows_at_both_ends(Q_A, y[P_1], y[P_A], p)
@@ -415,7 +438,7 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def supply_pressure(y: State, p: RigNumbers) -> float:
-    """Compute the pressure [Pa] of the make-up's accumulator."""
+    """Compute the pressure [Pa gauge] of the make-up's accumulator, from which lost oil is replaced."""
     if len(p.polytropic) > 0:  # empty unless the gas is polytropic, so that the law is chosen at compile time
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
@@ -425,8 +448,8 @@ def supply_pressure(y: State, p: RigNumbers) -> float:
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), by check and relief valves.
 
-    The sides are the pump's ports, or the chambers in a rig without lines. Each check valve is piloted by the other
-    side.
+    Sides 1 and 2 are the pump's ports, or the chambers A and B in a rig without lines. The pressure on each side can
+    open the check valve of the other if these are pilot-operated.
     """
     supply = supply_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
@@ -447,9 +470,9 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the pressure rates dp_A/dt .. dp_2/dt [Pa/s] due to external leakage and make-up.
+    """Compute the pressure rates (dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt) [Pa/s] due to external leakage and make-up.
 
-    Also returns the make-up's flow [m^3/s] out of the accumulator, at the accumulator's pressure.
+    Also returns the flow [m^3/s] that leaves the make-up's accumulator, as a volume at the accumulator's pressure.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -472,9 +495,9 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
 
 @contracted
 def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
-    """Compute a servo valve's flows [m^3/s] from P to A, A to T, P to B and B to T.
+    """Compute a servo valve's flows [m^3/s] from supply P to A, from A to return T, from P to B, and from B to T.
 
-    A spool position x_s > 0 opens the edges P-A and B-T, x_s < 0 the other two.
+    A spool position x_s > 0 opens the edges P-A and B-T, x_s < 0 the other two; A and B are the chambers.
     """
     x_s, Q_N, dp_N, x_max, dp_lam = y[SPOOL], p.Q_N, p.dp_N, p.x_max, p.dp_lam
     p_A, p_B, p_P, p_T = pressures_of(y, p)
@@ -488,9 +511,10 @@ def valve_flows(y: State, p: RigNumbers) -> tuple[float, float, float, float]:
 
 @contracted
 def supply_compliance(p_1: float, p: RigNumbers) -> float:
-    """Compute the compliance [m^3/Pa] of the supply line with its accumulator at p_1 [Pa].
+    """Compute the compliance [m^3/Pa] of the supply line: the oil it takes in per unit rise of its pressure.
 
-    (V_1 + V_oil)/K + V_gas/(n p_abs), with the oil V_oil = V_acc - V_gas in the accumulator.
+    It is (V_1 + V_oil)/K + V_gas/(n p_abs) at the supply pressure `p_1` [Pa gauge], with the gas V_gas and the oil
+    V_oil = V_acc - V_gas in the supply's accumulator.
     """
     V_gas = external.gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
     oil_compliance = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
@@ -499,9 +523,9 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Compute the rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that a servo valve and its supply cause.
+    """Compute the pressure rates dp_A/dt, dp_B/dt, dp_1/dt, dp_2/dt [Pa/s] that a servo valve and its supply cause.
 
-    `Q_1` [m^3/s]: flow of the pump into the supply. The return's pressure is constant.
+    `Q_1` [m^3/s]: flow of the pump into the supply, whose pressure is p_1. The return's pressure p_2 is constant.
     """
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
@@ -522,7 +546,11 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute dy/dt without the throttles' flows; command `u` [V], `G` and `C` of `piston_leakage`, load `F` [N]."""
+    """Compute the state's rates dy/dt from all physical laws but the throttles' flows.
+
+    `y`: state in the order of `STATES`; `u`: command [V]; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: leakage
+    coefficients (`piston_leakage`); `F`: load [N] in addition to the rig's own; `p`: the rig's numbers.
+    """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)
@@ -585,7 +613,10 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 
 @contracted
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute dy/dt of the whole rig; arguments as in `rates_without_throttles`."""
+    """Compute the state's rates dy/dt from all physical laws of the rig.
+
+    The arguments are those of `rates_without_throttles`.
+    """
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:
         Q_A, Q_B = throttle_flows(y, p)
@@ -595,7 +626,10 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Write the outputs (`OUTPUTS`) of a state to `row` (21,); arguments as in `rates_without_throttles`."""
+    """Write the outputs of a state, its numbers and the flows and voltage that follow from them, to `row` (21,).
+
+    The order is that of `OUTPUTS`; the arguments are those of `rates_without_throttles`.
+    """
     for m in range(len(y)):
         row[m] = y[m]
     row[P_A], row[P_B], row[P_1], row[P_2] = pressures_of(y, p)

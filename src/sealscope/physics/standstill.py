@@ -24,9 +24,9 @@ BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 @law
 def standstill_force(x: float, p: RigNumbers) -> float:
-    """Compute the force [N] against +x that the chamber pressures carry at standstill at x [m].
+    """Compute the force [N] that the chamber pressures must carry to hold the piston at rest at x [m].
 
-    It is the load, with an opposing cylinder's, less the force of an end stop.
+    It is the load against +x, including that of an opposing cylinder, minus the force of an end stop.
     """
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
@@ -34,10 +34,11 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 
 @law
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute p_A, p_B [Pa] that carry `force` [N] against +x at standstill: p_A A_A - p_B A_B = force.
+    """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
-    With a make-up the lower pressure is the charge pressure. Without one the circuit contains as much oil as with the
-    charge pressure throughout: the mean of both pressures, weighted by the sides' volumes, is the charge pressure.
+    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without one the circuit
+    contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted by the oil
+    volumes of the two sides, is the charge pressure.
     """
     if p.made_up:
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
@@ -53,11 +54,12 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Fill a state `y` of zeros with the standstill of a pump-controlled rig.
+    """Fill the zero state `y` (14,) with the standstill of a pump-controlled rig; return 0, or a code of failure.
 
-    `x` [m]: position; `force` [N]: against +x. The motor holds the pump with the current i = T_load/C_m, eq. (4.5), for
-    which the integral of the speed controller is R_c i/K_i, eq. (4.3). Returns 0, or a code: `BELOW_VACUUM`,
-    `BEYOND_DRIVE`.
+    `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
+    (4.5); the integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3). The code is
+    `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if the current or voltage is beyond the drive's
+    limits.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -72,9 +74,10 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
 
 @law
 def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
-    """Compute p_A, p_B [Pa] that carry `force` [N] against +x behind a servo valve with equal edges at null.
+    """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest behind a centred servo valve.
 
-    p_A + p_B = p_1 + p_2: edges to supply and return have equal drops (Merritt, Hydraulic Control Systems, 1967,
+    `force` [N]: load against +x; `p_1`, `p_2` [Pa]: pressures of supply and return. p_A + p_B = p_1 + p_2, because
+    the edges to supply and return are equal and have equal pressure drops (Merritt, Hydraulic Control Systems, 1967,
     section 5.2). An overlapped valve may trap another mean pressure; this one is assumed.
     """
     p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
@@ -82,10 +85,10 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 
 
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
-    """Compute p_1, p_A, p_B [Pa] at standstill with a servo valve at null.
+    """Compute p_1, p_A, p_B [Pa] of a rig with its servo valve centred and its piston at rest at `x` [m].
 
-    The supply's pressure is constant there: p_1 is the root of dp_1/dt, which falls as p_1 rises, by bisection.
-    `force` [N] against +x; `x` [m]: position of the piston.
+    `force` [N]: load against +x. The supply pressure p_1 is the one that stays constant: the root of dp_1/dt, which
+    falls as p_1 rises, is found by bisection.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
@@ -104,14 +107,16 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """Compute the state (14,) at standstill with the piston at x_0 [m], under the rig's load and `push` [N] against +x.
+    """Compute the state (14,) of a rig at rest with the piston at x_0 [m].
 
-    The pressures carry the load (`pressures_at_standstill`), the motor holds the pump against them (`stand_still`).
-    Without load and with equal areas all pressures are the charge pressure and all else is 0. With a servo valve at
-    null the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
-    underlap, creeps from there.
+    The rig's load and `push` [N] act against +x. The pressures carry them (`pressures_at_standstill`), and the motor
+    holds the pump against the pressures (`stand_still`). Without load and with equal areas all pressures are the
+    charge pressure and all other states but the position are 0. In a rig with a servo valve the valve is centred and
+    the motor runs at the supply's speed (`supply_at_standstill`). A machine that leaks, or whose valve has an
+    underlap, creeps from this state.
 
-    Raises InputError if a pressure is below vacuum or above the supply's, or if the drive cannot hold the load.
+    Raises InputError if a pressure is below vacuum (with a servo valve: outside of the range from return to supply),
+    or if the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push
@@ -134,7 +139,11 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Fill the zero state `y` with the equilibrium at x [m] behind a servo valve, under `force` [N] against +x."""
+    """Fill the zero state `y` (14,) with the equilibrium of a rig whose servo valve is centred, and return it.
+
+    `x` [m]: position of the piston; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the
+    force, or if the drive cannot hold the supply.
+    """
     m = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:

@@ -1,4 +1,4 @@
-"""The state of the rig: names and order of its numbers, and the tuple of floats (or lanes) that the laws take."""
+"""The state of the rig: names and order of its numbers, and the tuple of them that the physical laws take."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Pressures = tuple[float, float, float, float]
 
 @contracted
 def state_of(y: np.ndarray) -> State:
-    """Convert a state (14,) to the tuple of numbers that the laws take."""
+    """Convert a state from an array (14,) to the tuple of numbers that the physical laws take."""
     return y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13]
 
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute the state y + h dy."""
+    """Compute the state y + h dy, number by number."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -51,6 +51,9 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Compute the state y with h s added to p_A, p_B, p_1, p_2; `s`: their rates [Pa/s]."""
+    """Compute the state y with h s added to its pressures p_A, p_B, p_1 and p_2.
+
+    `h` [s]: length of a step; `s`: the four rates of the pressures [Pa/s].
+    """
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -1,4 +1,4 @@
-"""The servo valve: a spool of the second order with a limited speed, and four edges that it opens."""
+"""The servo valve: a spool that follows the command as a second-order lag, and the four edges that it opens."""
 
 from __future__ import annotations
 
@@ -11,21 +11,26 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def spool_target(u: float, u_N: float, x_max: float) -> float:
-    """Compute the spool's target position x_max u/u_N [m] for the command u [V], limited to its stroke +-x_max."""
+    """Compute the position [m] to which a command moves the spool: x_max u/u_N, limited to the stroke +-x_max.
+
+    `u` [V]: command; `u_N` [V]: command of the full stroke `x_max` [m].
+    """
     return x_max * min(max(u / u_N, -1.0), 1.0)
 
 
 @contracted
 def spool_speed(v_s: float, v_max: float) -> float:
-    """Compute the spool's dx_s/dt [m/s]: its speed state v_s, limited to +-v_max (the rate limit of its drive)."""
+    """Compute the velocity dx_s/dt [m/s] of the spool: the speed state v_s, which the drive limits to +-v_max."""
     return min(max(v_s, -v_max), v_max)
 
 
 @contracted
 def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_s: float, v_max: float) -> float:
-    """Compute the spool's dv_s/dt = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s [m/s^2]; 0 if it would pass +-v_max.
+    """Compute the rate dv_s/dt [m/s^2] of the spool's speed: that of a second-order lag, or 0 at the speed limit.
 
-    `x_d` [m] target of the spool, `omega_s` [rad/s], `zeta_s` damping ratio, `v_max` [m/s].
+    dv_s/dt = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s with position `x_s` and target position `x_d` [m], speed
+    `v_s` [m/s], natural frequency `omega_s` [rad/s] and damping ratio `zeta_s`. It is 0 where v_s would leave
+    +-`v_max` [m/s].
 
     Source: Merritt, Hydraulic Control Systems, 1967, chapter 7: a servo valve as a second-order lag.
     """
@@ -36,7 +41,10 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
 
 @contracted
 def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> tuple[float, float]:
-    """Limit a spool's position [m] to its stroke and its speed [m/s] to +-v_max; at a stop it moves only inwards."""
+    """Limit the spool's position [m] to its stroke +-x_max and its speed [m/s] to +-v_max; return both.
+
+    At an end of the stroke only a speed that points inwards remains.
+    """
     v = min(max(v_s, -v_max), v_max)
     v = select(x_s >= x_max, min(v, 0.0), select(x_s <= -x_max, max(v, 0.0), v))
     return min(max(x_s, -x_max), x_max), v
@@ -44,10 +52,12 @@ def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> t
 
 @contracted
 def edge_flow(dp: float, travel: float, overlap: float, Q_N: float, dp_N: float, x_max: float, dp_lam: float) -> float:
-    """Compute the flow [m^3/s] through a metering edge under `dp` [Pa] with the spool moved `travel` [m] towards open.
+    """Compute the flow [m^3/s] through one metering edge of the valve under the pressure difference `dp` [Pa].
 
-    The orifice law (`orifice_flow`) with c = Q_N/sqrt(dp_N) max(travel - overlap, 0)/x_max: the area grows linearly
-    beyond the overlap, and an edge without overlap passes `Q_N` at `dp_N` and full stroke. Underlap: overlap < 0.
+    `travel`: position [m] of the spool, positive if it opens this edge; `overlap` [m]: travel at which the edge
+    opens, < 0 for an underlap. The flow is that of an orifice (`orifice_flow`, laminar below about `dp_lam` [Pa])
+    with the coefficient c = Q_N/sqrt(dp_N) max(travel - overlap, 0)/x_max. An edge without overlap passes the rated
+    flow `Q_N` [m^3/s] under `dp_N` [Pa] at full stroke `x_max` [m].
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 5.2, general valve analysis.
     """

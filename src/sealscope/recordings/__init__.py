@@ -1,4 +1,4 @@
-"""The Recording, its files, and findings on the quality of its data."""
+"""Recordings of an actuator: the class Recording, its files, and findings on the quality of its data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pressures of the actuator, and the pair of its chambers."""
+"""Names of the pressure channels: both chambers of the cylinder and both ports of the pump."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ DISPLAY_UNITS = ("bar", "MPa", "kPa", "psi")
 
 
 def chambers_of(recording: Container[str]) -> tuple[str, ...]:
-    """List the chamber pressures that a recording has."""
+    """List the chamber pressures among the channels of a recording, p_A before p_B."""
     return tuple(name for name in CHAMBERS if name in recording)

@@ -29,7 +29,7 @@ CHANNEL_UNITS: Mapping[str, str] = MappingProxyType(
 )
 #: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meter, command.
 FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
-#: Channels that change over minutes: constant or mostly missing values are no defect there.
+#: Channels that change slowly, over minutes: constant or mostly missing values are no defect in them.
 SLOW = frozenset({"T_oil"})
 #: What each channel, and the time, measures.
 LONG_NAMES: Mapping[str, str] = MappingProxyType(
@@ -57,5 +57,8 @@ UNUSED = "columns not used"
 
 
 def flow_source(channels: Container[str]) -> str | None:
-    """Choose the best available channel for the flow to the cylinder; None if there is none."""
+    """Choose the best available channel for computing the flow to the cylinder; None if there is none.
+
+    The order of preference is that of `FLOW_SOURCES`.
+    """
     return next((name for name in FLOW_SOURCES if name in channels), None)

@@ -1,4 +1,4 @@
-"""The cycle of a duty: the period after which the command, or the pressure difference, repeats."""
+"""The duty cycle of a machine: the period after which its command, or its pressure difference, repeats."""
 
 from __future__ import annotations
 
@@ -22,29 +22,33 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s]; None if nothing repeats.
 
-    Uses the command if it moves, else the pressure difference, else the only chamber pressure. The result is cached
-    with the recording and shared by its `Recording.only` views.
+    The signal examined is the command if it moves, else the difference of the chamber pressures, or the only one. The
+    result is cached with the recording, and shared by its views with fewer channels (`Recording.only`).
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
     def compute(recording: Recording) -> float | None:
-        """Estimate the period of the signal in which the duty repeats."""
+        """Estimate the period of the duty signal of a recording."""
         return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
 
     return compute_once(recording, "cycle", compute, names) if names else None
 
 
 def duty_signal(channels: Sequence[Array]) -> Array:
-    """Return the signal (n,) in which the duty repeats: the only channel, or the difference of two channels."""
+    """Compute the signal (n,) in which the duty cycle shows.
+
+    `channels`: the command, or one or both chamber pressures (n,). The signal is the only channel, or the first minus
+    the second.
+    """
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
 
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    The period is the lag of a maximum of the autocorrelation after its first negative value: the first of the nearly
-    highest maxima, refined by a parabola. The maximum must reach 0.6; the period is between 0.2 s and 20 s and at most
-    a fifth of the signal.
+    The period is the lag at which the autocorrelation has its first maximum that is nearly as high as the highest
+    one. Maxima before its first negative value do not count. The lag is refined by a parabola. The maximum must reach
+    0.6, and the period must be between 0.2 s and 20 s and at most a fifth of the signal.
     """
     stride = max(1, int(rate / _CYCLE.rate))
     n = signal.size // stride
@@ -76,9 +80,10 @@ def estimate_period(signal: Array, rate: float) -> float | None:
 
 
 def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
-    """Estimate the fundamental frequency [Hz] of a signal (n,) at even times `t` (n,) [s] from the slope of its phase.
+    """Estimate the fundamental frequency [Hz] of a periodic signal (n,) from the slope of its phase over time.
 
-    `period`: approximate period [s] (`estimate_period`); the signal has two periods or more.
+    `t` (n,): times [s] in even steps; `period`: approximate period [s], as from `estimate_period`. The signal must
+    cover at least two periods.
     """
     n_period = max(1, round(period / (t[1] - t[0])))
     n_periods = t.size // n_period

@@ -40,8 +40,8 @@ _SUFFIXES = {suffix: kind for kind, entry in _FORMATS.items() for suffix in entr
 SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
 #: Formats read in this process; damaged files of the others can crash their libraries or fill the memory.
 _SAFE_FORMATS = ("text", "lvm")
-#: Limits for a file of these: time _BASE_TIME [s] + size / _MIN_SPEED [bytes/s], memory _BASE_MEMORY [bytes] +
-#: _MEMORY_RATIO * size.
+#: Limits for reading a file of another format: time _BASE_TIME [s] + size / _MIN_SPEED [bytes/s], memory
+#: _BASE_MEMORY [bytes] + _MEMORY_RATIO * size.
 _BASE_TIME, _MIN_SPEED, _MIN_SPEED_SHEETS = 10.0, 20e6, 5e5
 _BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
 #: Deepest nesting of archives that is unpacked.
@@ -241,7 +241,7 @@ def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
 
 
 def check_target(file: Path) -> None:
-    """Raise InputError unless the suffix of a file to write is that of a format."""
+    """Raise InputError unless `file` has the suffix of a format in which recordings can be written."""
     if file.suffix.lower() not in SUFFIXES:
         raise InputError(f"a recording's file must end in {', '.join(SUFFIXES)}, got {file.name}")
 

@@ -1,4 +1,4 @@
-"""Convert to and from pandas data frames and xarray data sets, with the names and attributes of the files."""
+"""Convert recordings to and from pandas data frames and xarray data sets, named and described as in the files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 def to_pandas(
     values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> pandas.DataFrame:
-    """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`; its `attrs` hold the description."""
+    """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`.
+
+    Arguments as from `Recording.series`. The `attrs` of the frame contain the units by column, the rate, the
+    provenance and the history. Raises MissingExtra without pandas.
+    """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
     frame = pandas.DataFrame(columns, index=pandas.Index(values["t"].copy(), name="t [s]"))
@@ -36,7 +40,10 @@ def to_pandas(
 
 
 def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
-    """Read the requested columns of a data frame; a named or non-integer index is a column, too."""
+    """Read the requested columns of a data frame to the fields of a recording.
+
+    The index is a column, too, if it has a name or contains dates, time differences or floating-point numbers.
+    """
     pandas = import_library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
@@ -63,7 +70,10 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
 
 
 def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
-    """Convert a column to datetime64, timedelta64, doubles or texts; `dtypes`: the module pandas.api.types."""
+    """Convert a column, a pandas series, to an array of datetime64, timedelta64, doubles or texts.
+
+    `dtypes`: the module pandas.api.types; `name`: name of the column in messages. Raises InputError for other types.
+    """
     if dtypes.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -79,7 +89,10 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set over the coordinate `t`; its variables have `units` and `long_name` as in the NetCDF files."""
+    """Make a data set of variables over the coordinate `t`, with `units` and `long_name` as in the NetCDF files.
+
+    Arguments as from `Recording.series`. Raises MissingExtra without xarray.
+    """
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {
         name: ("t", series.copy(), {"units": units[name], "long_name": LONG_NAMES.get(name, name)})

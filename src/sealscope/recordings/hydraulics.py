@@ -1,4 +1,4 @@
-"""Checks that readings can come from a hydraulic machine: no noise, copied channel or wrong unit of time."""
+"""Check that readings can come from a hydraulic machine: no noise alone, no copied channel, no wrong unit of time."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ _COPY_TOLERANCE = 1e-6
 
 
 def find_implausibility(recording: Recording) -> str | None:
-    """Find a reason why pressures and speed cannot come from one machine; None if there is none.
+    """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
-    p_A - p_B, which drives a leak, must move, but one chamber may rest at the charge pressure, as in a lift. Unit,
-    offset and range of the pressures do not matter; constant and absent channels are ignored.
+    Three defects are recognised: p_B is a copy of p_A; the motor speed differs from the rate of the motor angle by a
+    constant factor; or p_A - p_B, or the only pressure that varies, is nothing but noise. One chamber may rest at the
+    charge pressure, as in a lift. Unit, offset and range of the pressures do not matter; constant and absent channels
+    are ignored.
     """
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
     signals = {name: recording[name] for name in names}
@@ -36,9 +38,10 @@ def find_implausibility(recording: Recording) -> str | None:
 
 
 def _describe_speed_mismatch(recording: Recording) -> str | None:
-    """Describe a speed that follows the derivative of the angle at another scale.
+    """Describe a motor speed that differs from the rate of the motor angle by a constant factor, as by a wrong unit.
 
-    None if there is none.
+    None if the factor is within 1 / `misfit` and `misfit`, if the two do not correlate, if one of them is absent or
+    in raw counts, or if there are too few samples.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
@@ -59,18 +62,15 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 def _is_noise(values: Array) -> bool:
     """Test whether a signal (n,) is mostly white noise.
 
-    The mean square of its third difference, which is 20 variances for white noise, must exceed 20 variances times the
-    prior `noise`. Missing samples count as noise.
+    The mean square of the third difference of white noise is 20 times its variance. The signal is noise if this mean
+    square exceeds 20 times its variance times the prior `noise`, or if samples are missing.
     """
     # `not <=`, so that missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * np.var(values)
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Describe the lack of chamber pressures; None if at least one is present.
-
-    The text lists the unused columns, with a map for them.
-    """
+    """Describe the lack of chamber pressures, with the unused columns of the file; None if a pressure is present."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

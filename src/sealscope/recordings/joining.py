@@ -1,4 +1,4 @@
-"""Start times of recordings, and joining the files into which a logger cut one run."""
+"""Find the start times of recordings, and join the files into which a logger cut one run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    Taken from the provenance, else from the file's name; a date without a time of day stands for midnight.
+    It is taken from the provenance, else from the name of the file, which is that in the provenance or `file`. A date
+    without a time of day stands for midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -43,8 +44,8 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 def file_seconds(recording: Recording, path: Path) -> float:
     """Find the time of the first sample [s since 1970] of the recording in the file `path`.
 
-    It is taken from the provenance, else from the file's name. Otherwise the file's modification time counts as the
-    time of the last sample.
+    It is taken from the provenance, else from the file's name. Without either, the last sample has the time at which
+    the file was last modified.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -54,7 +55,7 @@ def file_seconds(recording: Recording, path: Path) -> float:
 
 
 def _parse_file_name(name: str) -> float | None:
-    """Parse the date and time in a file's name [s since 1970]; None if there is none."""
+    """Parse the date and time in a file's name to seconds since 1970; None if it contains no date."""
     match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None
@@ -69,13 +70,16 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Return the time of t = 0 [s since 1970] that the provenance states; None if it states none."""
+    """Find the time of t = 0 [s since 1970] in the provenance of a recording; None if it states none."""
     epoch = recording.provenance.get("start_epoch_s")
     return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
 
 
 def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> None:
-    """Check that recordings have samples and the same channels, units and rate; raise InputError otherwise."""
+    """Check that recordings have samples, and the same channels, units and rate; raise InputError otherwise.
+
+    `names`: names of the recordings in messages.
+    """
     first = recordings[0]
     for name, recording in zip(names, recordings, strict=True):
         if len(recording) == 0:
@@ -90,10 +94,11 @@ def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> 
 
 @checked_call
 def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None) -> Recording:
-    """Join recordings of one run to a single recording.
+    """Join the recordings of one run to a single recording.
 
-    Each recording must begin after the previous one has ended: by the start times of the files or, if these are not
-    all known or are equal, by the times `t`. Time between recordings stays a gap, which `inspect` reports.
+    Each recording must begin after the previous one has ended. Their order follows from the start times in their
+    files. If these are not all known, or are all equal, it follows from the times `t`. Time between recordings stays
+    a gap, which `inspect` reports.
 
     Parameters
     ----------

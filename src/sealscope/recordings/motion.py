@@ -1,7 +1,7 @@
 """Tests whether a reading moves: constant channels, held values, and changes that are only rounding.
 
-The noise of a transducer never stops. A value that stays identical for longer than the noise allows is a rail, a held
-value or a dead channel.
+The noise of a transducer never stops. A value that stays identical for longer than the noise allows is an end of its
+range, a value that the logger repeats, or a dead channel.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from sealscope.recordings.recording import Recording
 #: Changes up to this fraction of a reading's largest value are rounding errors: the reading does not move.
 ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
-#: Shortest run of equal values that can be stuck [samples], samples compared with on either side, and the expected
-#: number of such runs in a channel below which one is stuck.
+#: Shortest run of equal values that can be stuck [samples]; number of samples on either side with which it is
+#: compared; expected number of such runs in a channel below which a run is stuck.
 _MIN_STUCK, _NEIGHBOURHOOD, _MAX_EXPECTED = 5, 100, 1e-6
 #: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
 _MIN_JUMP = 3.5
@@ -30,7 +30,7 @@ _QUANTUM_SAMPLES = 2**15
 
 
 def is_constant(values: Array) -> bool:
-    """Test whether all samples (n,) are equal; a NaN equals nothing."""
+    """Test whether all samples (n,) are equal; False if one is NaN."""
     return bool(np.ptp(values) == 0)
 
 
@@ -40,9 +40,10 @@ def is_moving(values: Array) -> bool:
 
 
 class Holds(NamedTuple):
-    """The samples of a pressure at which it is held.
+    """Samples at which a pressure is held, i.e. stays identical for too long to be a reading.
 
-    `flags` (n,): True for held samples; `pending`: index of the first sample that later samples may turn into a hold.
+    `flags` (n,): True for held samples. `pending`: index of the first sample whose flag may still change when later
+    samples are appended.
     """
 
     flags: NDArray[np.bool_]
@@ -50,11 +51,12 @@ class Holds(NamedTuple):
 
 
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
-    """Find the samples (n,) of a pressure that stay identical for longer than its noise allows.
+    """Find the samples of a pressure `values` (n,) that stay identical for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is not
-    flagged. A run at the beginning also continues a hold at the value `before` (NaN: none), and is then flagged
-    entirely. A last run that is still too short is pending.
+    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is
+    not flagged. If a hold at the value `before` precedes the samples (NaN: none), a run of this value at their
+    beginning continues it and is flagged as a whole. A run at the end that is still too short is pending. `rate`
+    [Hz].
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -69,10 +71,10 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
 
 def describe_hold(recording: Recording) -> str | None:
-    """Describe a chamber pressure that stops moving, in a recording without missing samples.
+    """Describe the longest stretch over which a chamber pressure does not move; None if there is none.
 
-    None if there is none. A pressure does not move while it is held (`find_holds`), or if it is a straight line to
-    within `ROUNDING`. Short recordings and constant channels, which `inspect` reports, are not described.
+    A pressure does not move while it is held (`find_holds`), or if it is a straight line to within `ROUNDING`. No
+    sample may be missing. Short recordings and constant channels, which `inspect` reports, are not described.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -94,7 +96,10 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Return the smallest difference of neighbours in sorted values that exceeds rounding; 0 if there is none."""
+    """Find the smallest difference between neighbours in sorted `values` (n,).
+
+    Differences up to `ROUNDING` times the range of the values do not count; 0 if there are no others.
+    """
     steps = np.diff(values)
     steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0
@@ -106,12 +111,12 @@ def estimate_quantum(values: Array) -> float:
 
 
 def find_stuck(values: Array) -> NDArray[np.intp]:
-    """Find runs of equal values too long for the signal around them: first index and length of each (k, 2).
+    """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
-    With p the fraction of unchanged samples in the 100 samples on either side (the larger of both), a run of length m
-    has the chance p^(m-1) to begin at a given sample. It is stuck if fewer than 1e-6 such runs are expected in the
-    channel, and if the value jumps by more than three quantisation steps at its beginning or end: a slow quantised
-    signal at a turning point does not move either, but leaves in single steps.
+    Let p be the fraction of unchanged samples among the 100 samples before or after a run, whichever is larger. A run
+    of length m then begins at a given sample with the probability p^(m-1). It is stuck if fewer than 1e-6 such runs
+    are expected in the channel, and if the value jumps by more than three quantisation steps at its beginning or end.
+    A slow quantised signal at a turning point does not move either, but leaves in single steps.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
@@ -129,7 +134,10 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Compute the fraction of unchanged samples from `begin` to `end` (k,), estimated as (m + 1) / (n + 2)."""
+        """Estimate the fraction of unchanged samples between indices `begin` and `end` (k,).
+
+        It is (m + 1) / (n + 2) if m of n samples equal the one before.
+        """
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

@@ -8,9 +8,10 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Return the mean oil temperature [deg C], measured or else stated in the file's header.
+    """Compute the mean oil temperature [deg C] of a recording; None if it is not known.
 
-    None if unknown. Readings outside the range of oil temperatures (`priors.toml`) count as missing.
+    The channel T_oil is used, without readings outside the range of oil temperatures (`priors.toml`), else the
+    temperature in the file's header.
     """
     if "T_oil" in recording and recording.units["T_oil"] == "K":
         limits = RECORDINGS.oil

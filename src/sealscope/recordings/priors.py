@@ -6,10 +6,12 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class ClockPriors(PriorTable):
-    """Priors on a logger's clock.
+    """Assumptions on the clock of a data logger.
 
-    `scatter`: of irregular intervals [sampling steps]; `near`: longest interval without a loss [usual intervals]; the
-    others are dimensionless.
+    `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular; `rate`: largest
+    relative error of the stated rate; `near` [usual intervals]: longest interval in which no sample is missing;
+    `lost`: largest fraction of lost samples in one recording; `late`: largest fraction of samples with a time before
+    an earlier one.
     """
 
     scatter: float
@@ -20,7 +22,15 @@ class ClockPriors(PriorTable):
 
 
 class StalePriors(PriorTable):
-    """Priors on samples that repeat the one before; `shortest` is in s, the others are dimensionless."""
+    """Assumptions on samples that repeat the previous sample.
+
+    To estimate the time for which a channel repeats its samples: `runs`: fewest runs of equal values; `spread`:
+    largest relative deviation of a run's duration from the median; `share`: fraction of the runs that must be within
+    it; `shortest` [s]: shortest time that matters. Rows are repeated if they are `repeats` times as many as expected
+    by chance, which is at least the fraction `fewest` of all rows. `moves`: smallest range over a run that counts as
+    motion, as a fraction of the channel's range; `leap`: quantile of a channel's changes that a jump exceeds;
+    `stuck`: largest fraction of stuck samples in a pressure that is used.
+    """
 
     runs: int
     spread: float
@@ -34,16 +44,23 @@ class StalePriors(PriorTable):
 
 
 class SpikePriors(PriorTable):
-    """Samples that leap and return."""
+    """Assumptions on spikes, samples that leap and return at once; both fields are dimensionless.
+
+    `times`: smallest ratio of a spike to the changes around it; `share`: largest fraction of spikes in a channel.
+    """
 
     times: float
     share: float
 
 
 class UnsignedPriors(PriorTable):
-    """Priors on a speed without a sign.
+    """Assumptions on a motor speed that is recorded without its sign.
 
-    `half`, `nearby` in s, `changes` in 1/s, the others dimensionless.
+    `noise`: largest speed of the other sign, relative to the largest speed; `half` [s]: time on either side of a
+    sample over which the piston speed is taken; `nearby` [s]: time on either side over which noise is averaged;
+    `error`: relative error of the flow computed from the position; `changes` [1/s]: usual number of reversals per
+    second; `least`: smallest ratio of the motions in the two directions; `correlation`: smallest correlation of speed
+    and motion.
     """
 
     noise: float
@@ -56,7 +73,13 @@ class UnsignedPriors(PriorTable):
 
 
 class HumPriors(PriorTable):
-    """Priors on hum of the mains; `lowest`, `around` in Hz, the others dimensionless."""
+    """Assumptions on hum of the mains in a channel.
+
+    `lowest` [Hz]: frequency from which the power of the channel is counted; `loud`: fraction of this power from which
+    hum is a warning; `alone`: fraction from which the sensor may be disconnected; `around` [Hz]: distance on either
+    side of a line over which the spectrum is its background; `over_rest`, `over_median`: smallest ratios of a line to
+    the largest and to the median amplitude of the background.
+    """
 
     loud: float
     alone: float
@@ -67,9 +90,9 @@ class HumPriors(PriorTable):
 
 
 class CreepPriors(PriorTable):
-    """Priors on a mean chamber pressure that creeps.
+    """Assumptions on a mean chamber pressure that drifts steadily.
 
-    `rate`: smallest rate [Pa/s]; `seconds`: shortest recording [s].
+    `rate` [Pa/s]: smallest drift that is reported; `seconds` [s]: shortest recording in which it is searched for.
     """
 
     rate: float
@@ -77,16 +100,18 @@ class CreepPriors(PriorTable):
 
 
 class HoldPriors(PriorTable):
-    """Lengths beyond which equal pressure samples are no reading, in `seconds` [s] and in `samples`."""
+    """Lengths beyond which equal samples of a pressure are no reading: both `seconds` [s] and `samples` [samples]."""
 
     seconds: float
     samples: int
 
 
 class ReadingPriors(PriorTable):
-    """Pressures and speeds of one machine.
+    """Assumptions on pressures and speeds that come from one machine.
 
-    `noise` [share of the variance]; `rate` [Hz]; `samples` [samples]; the others are numbers.
+    `noise` [share of the variance]: white noise above which a pressure contains nothing else. The motor speed is
+    compared with the rate of the motor angle, both averaged to `rate` [Hz], if there are `samples` [samples] or more:
+    `correlation`: smallest correlation of the two; `misfit`: ratio of the two above which a unit is wrong.
     """
 
     noise: float
@@ -97,14 +122,18 @@ class ReadingPriors(PriorTable):
 
 
 class OilRange(PriorTable):
-    """Temperatures that an oil has: `coldest`, `hottest` [K]."""
+    """Range of temperatures that oil can have, from `coldest` [K] to `hottest` [K]."""
 
     coldest: float
     hottest: float
 
 
 class CyclePriors(PriorTable):
-    """Priors on the duty cycle; `longest` in s, `rate` in Hz, `correlation` dimensionless."""
+    """Assumptions on the duty cycle of a machine.
+
+    `longest` [s]: longest period; `correlation`: smallest autocorrelation at a lag of one period; `rate` [Hz]: rate
+    to which the signal is averaged before it is analysed.
+    """
 
     longest: float
     correlation: float
@@ -112,10 +141,10 @@ class CyclePriors(PriorTable):
 
 
 class GapPriors(PriorTable):
-    """Lengths of gaps [s].
+    """Assumptions on gaps in a recording.
 
-    `motion`: longest gap of a channel that is interpolated by a line; `hole`: length over which a bridged gap has less
-    weight.
+    `motion` [s]: longest gap that is interpolated by a line in positions, angles, speeds and flows; `hole` [s]:
+    length above which a bridged gap has less weight in the diagnosis.
     """
 
     motion: float
@@ -123,7 +152,10 @@ class GapPriors(PriorTable):
 
 
 class RecordingPriors(PriorTable):
-    """The tables of `recordings/priors.toml`."""
+    """All tables of `recordings/priors.toml`.
+
+    `possible`: SI unit -> largest magnitude that any sensor reads in it; "any" stands for all other units.
+    """
 
     clock: ClockPriors
     stale: StalePriors

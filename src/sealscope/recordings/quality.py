@@ -1,6 +1,6 @@
-"""The quality of a recording: defects are found and named, never repaired.
+"""Find defects in a recording: they are reported, never repaired.
 
-Quantised and slow signals pass each test of a channel's values.
+Quantised and slow signals pass all tests of a channel's values.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ Severity = Literal["note", "warning", "fatal"]
 SHORTEST = 226
 #: Intervals between these numbers of sampling steps are regular; a longer one is a gap.
 _MIN_STEP, _MAX_STEP = 0.5, 1.5
-#: Parts of a recording whose mean pressures must creep by like steps, to within these factors of the median step.
+#: Number of parts of a recording whose mean pressures are compared; the steps from part to part must be within these
+#: factors of the median step.
 _CREEP_PARTS, _MIN_CREEP, _MAX_CREEP = 8, 0.5, 2.0
-#: Fewest samples at the value of a rail, and the run length [samples] from which a single step away from it suffices.
+#: Fewest samples at the value of a rail (a clipped end of the range), and length of a run there [samples] from which
+#: a smaller jump suffices.
 _MIN_AT_RAIL, _LONG_RUN = 5, 20
-#: Smallest jump to or from a rail [quantisation steps], and that of a long run; how many times as many samples a rail
-#: has as any of the values next to it.
+#: Smallest jump to or from a rail [quantisation steps], and that for a long run; smallest ratio of the samples at a
+#: rail to those at any of the values next to it.
 _MIN_JUMP, _MIN_LONG_JUMP, _MIN_CROWD = 3.5, 1.5, 5
 #: Shortest channel that is searched for hum [s], so that a line is narrow.
 _MIN_HUM_TIME = 1.5
@@ -43,9 +45,10 @@ _CLOCK, _HUM, _CREEP, _SENSOR_LIMITS = RECORDINGS.clock, RECORDINGS.hum, RECORDI
 class Finding:
     """One defect of a recording.
 
-    `code` names it; `severity` is ``fatal`` (the recording cannot be analysed as it is), ``warning`` (check the time or
-    the channel before relying on a verdict) or ``note``; `channel` is None for the time; `count`: samples or intervals
-    concerned; `first_t`: time of the first [s]; `text`: a sentence.
+    `code`: name of the kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning``
+    (check the time or the channel before relying on a verdict) or ``note``; `channel`: the channel, None for the
+    time; `count`: number of samples or intervals concerned; `first_t`: time of the first of them [s], None if it has
+    none; `text`: description in words.
     """
 
     code: str
@@ -58,7 +61,7 @@ class Finding:
 
 @checked_call
 def inspect(recording: Recording) -> tuple[Finding, ...]:
-    """Find the defects of a recording's time base and channels.
+    """Find the defects of a recording's times and channels.
 
     Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
     ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
@@ -99,7 +102,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _sample_time(recording: Recording, index: int) -> float | None:
-    """Return the time of a sample [s]; None if it has none."""
+    """Return the time of the sample `index` [s]; None if it has no time."""
     t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
@@ -109,7 +112,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, where: NDArray[Any], text: str, severity: Severity = "warning") -> None:
-        """Add a finding on the intervals or samples `where`, unless there are none."""
+        """Add a finding on the samples or intervals with the indices `where`, unless there are none."""
         if where.size:
             findings.append(Finding(code, severity, None, where.size, _sample_time(recording, int(where[0])), text))
 
@@ -153,14 +156,14 @@ def _time_findings(recording: Recording) -> list[Finding]:
 
 
 def _format_repetitions(count: int) -> str:
-    """Format a number of times: `once`, `2 times`."""
+    """Format the number of times that something happens: `once`, `2 times`."""
     return "once" if count == 1 else f"{count} times"
 
 
 def _creep_findings(recording: Recording) -> list[Finding]:
-    """Find a steady drift of the mean chamber pressure over the whole recording.
+    """Find a steady drift of the mean chamber pressure over the whole recording; a sealed circuit shows none.
 
-    A sealed circuit shows none. Empty if there is no drift, or if the recording is too short.
+    The list is empty if there is no drift, if the recording is too short, or if a chamber pressure is not in Pa.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -182,7 +185,7 @@ def _creep_findings(recording: Recording) -> list[Finding]:
 
 @dataclass
 class _ChannelReport:
-    """The findings on one channel of a recording."""
+    """Collects the findings on one channel of a recording."""
 
     recording: Recording
     name: str
@@ -194,12 +197,12 @@ class _ChannelReport:
         self.findings.append(Finding(code, severity, self.name, count, first_t, f"{self.name}: {text}"))
 
     def format_value(self, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value, or a difference of values, in the unit of the log."""
+        """Format a value in the unit that the channel had in its log; `is_span`: the value is a difference of two."""
         return self.recording.format_value(self.name, value, digits, is_span=is_span)
 
 
 def _channel_findings(recording: Recording, name: str, values: Array) -> list[Finding]:
-    """Find the defects of a channel's values (n,)."""
+    """Find the defects in the values (n,) of the channel `name`."""
     report, unit = _ChannelReport(recording, name), recording.units[name]
     is_pressure, may_rest = name.startswith("p_"), name in ("u", "q_leak", "q_comp")
     if is_pressure and unit == COUNTS:
@@ -247,7 +250,10 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 
 
 def _report_missing(report: _ChannelReport, values: Array) -> None:
-    """Report missing samples (n,), or that only every k-th row has a value."""
+    """Add a finding on missing samples, or on a channel that has a value on every k-th row only.
+
+    `values` (n,): samples of the channel, NaN where missing. Nothing is added if none is missing.
+    """
     is_missing, rate = np.isnan(values), report.recording.rate
     if not is_missing.any():
         return
@@ -265,13 +271,16 @@ def _report_missing(report: _ChannelReport, values: Array) -> None:
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
-    """Flag the finite samples (n,), in an SI unit, whose magnitude exceeds the range of any sensor."""
+    """Flag the finite samples (n,) whose magnitude no sensor can read (`possible` in `priors.toml`).
+
+    `unit`: SI unit of `values`.
+    """
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
     return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Return the k >= 2 for which only every k-th row has a value; 0 if there is none.
+    """Find the k >= 2 for which a channel has a value on every k-th row only; 0 if there is none.
 
     `present`: indices of the rows with a value.
     """
@@ -288,10 +297,11 @@ def _format_ordinal(number: int) -> str:
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
-    """Find the maximal stretches, as slices, with even sampling and finite values.
+    """Split a recording into stretches, as slices, with even sampling and no missing values.
 
-    `channels`: names to consider, by default all but the slow ones. Each interval of a stretch is between half and one
-    and a half steps of `recording.rate`. Raises InputError for a channel that the recording does not have.
+    Rows with missing values are in no stretch. `channels`: names of the channels that must be complete, by default
+    all but the slow ones. Each interval of a stretch lasts between half and one and a half sampling steps. Raises
+    InputError for a channel that the recording lacks.
     """
     n = len(recording)
     is_complete = np.isfinite(recording.t)
@@ -306,17 +316,17 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
-    """Flag the intervals (n - 1,) between samples that last 0.5 to 1.5 steps of the recording's rate."""
+    """Flag the intervals (n - 1,) between samples that last 0.5 to 1.5 sampling steps."""
     with np.errstate(invalid="ignore"):
         steps = np.diff(recording.t) * recording.rate
     return np.asarray((steps > _MIN_STEP) & (steps < _MAX_STEP))
 
 
 class Rail(NamedTuple):
-    """The samples at a clipped end of a channel's range.
+    """An end of a channel's range at which its samples are clipped.
 
-    `side`: `low` or `high`; `value`: the value at that end; `samples`: number of samples with this value; `first`:
-    index of the first one.
+    `side`: `low` or `high`; `value`: the value at this end; `samples`: number of samples with this value; `first`:
+    index of the first of them.
     """
 
     side: str
@@ -332,15 +342,13 @@ def is_mostly_clipped(values: Array) -> bool:
 
 
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
-    """Find the ends of the range at which finite values (n,) are clipped.
+    """Find the ends of the range at which finite values (n,) are clipped; the low end only if `low_end`.
 
-    The low end is tested only if `low_end`.
-
-    A clipped end has far more samples than any of the five nearest values, in runs that
-    the signal enters or leaves by a jump of more than three quantisation steps (one for a long run). The crest of a
-    slow quantised signal does not count: its neighbours have nearly as many samples, and it is entered step by step.
-    Nor does a square wave, with as many samples at its other level. An end is also clipped if a run of `stuck` (from
-    `find_stuck`) lies there.
+    At a clipped end many samples have the same value: far more than any of the five nearest values has. They form
+    runs which the signal enters or leaves by a jump of more than three quantisation steps, or one and a half for a
+    long run. The crest of a slow quantised signal does not count: its neighbours have nearly as many samples, and it
+    is entered step by step. Nor does a square wave, which has as many samples at its other level. An end is also
+    clipped if one of the runs `stuck`, as from `find_stuck`, lies there.
     """
     if not values.size:
         return []
@@ -370,7 +378,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
 @lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
-    """Return the smallest FFT-friendly length n >= `count`, with no prime factor above 5.
+    """Find the smallest length n >= `count` of a fast Fourier transform, with no prime factor above 5.
 
     Equals `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
     """
@@ -380,7 +388,7 @@ def fast_length(count: int) -> int:
 
 
 class HumLine(NamedTuple):
-    """A spectral line of the mains: frequency [Hz], amplitude, and its fraction of the power over 20 Hz."""
+    """Spectral line of the mains: frequency [Hz], amplitude, and its fraction of the channel's power above 20 Hz."""
 
     frequency: float
     amplitude: float
@@ -388,10 +396,11 @@ class HumLine(NamedTuple):
 
 
 def find_hum(values: Array, rate: float) -> list[HumLine]:
-    """Find spectral lines of the mains, 50 or 60 Hz, in values (n,) sampled at `rate` [Hz].
+    """Find spectral lines of the mains, at 50 or 60 Hz, in values (n,) sampled at `rate` [Hz].
 
-    A line must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz around it, in the
-    Hann-windowed periodogram of the detrended values; its amplitude is 2 |X| / sum(w). Less than 1.5 s is not analysed.
+    The spectrum X is that of the detrended values times a Hann window w, and the amplitude of a line is 2 |X| /
+    sum(w). A line must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz of it. The
+    list is empty for less than 1.5 s.
     """
     n = values.size
     if n / rate < _MIN_HUM_TIME:

@@ -1,4 +1,4 @@
-"""The Recording: labelled time series with units, a rate and a history, on which the whole project is built.
+"""The Recording: time series with names, units, a sampling rate and a history, on which the whole project is built.
 
 A Recording is what a rig's data logger would have written. Only its provenance states where it comes from (a
 simulator, a file, a stream); the truth of a simulation is never part of it.
@@ -40,7 +40,7 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Copy values to a read-only array of doubles, unless they already are one that owns its memory."""
+    """Copy values to a read-only array of doubles, unless they already are such an array that owns its memory."""
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -50,7 +50,7 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A result that one thread computes while others wait for it; `known` is True once it is computed."""
+    """A cached result, which one thread computes while others wait for it; `known` is True once it is computed."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -161,7 +161,7 @@ class Recording:
         return int(self.t.size)
 
     def _format_extent(self) -> str:
-        """Format number of samples, rate and duration."""
+        """Format the number of samples, the rate and the duration."""
         return f"{format_count(len(self), 'sample')}, {self.rate:g} Hz, {self.duration:g} s"
 
     def __repr__(self) -> str:
@@ -188,25 +188,28 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the file's columns of measured pressures, positions, speeds and flows that no channel uses."""
+        """Names of the columns with measured pressures, positions, speeds or flows that no channel uses."""
         names = self.provenance.get("unused", ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
     @property
     def remarks(self) -> dict[str, str]:
-        """Entries in the header of the recording's file, such as operator, machine and oil temperature."""
+        """Remarks in the header of the recording's file, such as the operator or the machine: name -> text."""
         return clean_remarks(self.provenance)
 
     def unit_in_log(self, name: str) -> str | None:
-        """Return the unit that a channel had in its log.
+        """Return the unit in which a channel was logged.
 
-        None if it was in SI units or counts, or not read from a log.
+        None if it was in SI units or counts already, or if it was not read from a log.
         """
         units = self.provenance.get("log_units")
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
     def format_value(self, name: str, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value of a channel in the unit of the log; `is_span`: a difference, to which no offset applies."""
+        """Format a value of a channel, given in SI, in the unit of the log, with `digits` significant digits.
+
+        `is_span`: the value is a difference of two values, to which the offset of a unit does not apply.
+        """
         unit = self.units[name]
         display_unit = self.unit_in_log(name) or unit
         if display_unit != unit:
@@ -216,35 +219,35 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are displayed, that of the log or else bar."""
+        """Unit in which pressures are displayed: the unit of the log, or bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 
     def between(self, start: float, stop: float) -> Recording:
-        """Return the samples with start <= t < stop [s]."""
+        """Return a recording of the samples with start <= t < stop [s]."""
         return self._select((self.t >= start) & (self.t < stop), f"cut to {start:g} s <= t < {stop:g} s")
 
     def samples(self, rows: slice) -> Recording:
-        """Return the samples of a slice, with their times."""
+        """Return a recording of the samples in a slice; their times stay as they are."""
         return self._select(rows, f"cut to samples {rows.start} to {rows.stop}")
 
     def _select(self, rows: Any, note: str) -> Recording:
-        """Return the selected rows, a slice or a mask (n,), with `note` added to the history."""
+        """Return a recording of the selected rows, a slice or a mask (n,), and add `note` to its history."""
         channels = {name: values[rows] for name, values in self.channels.items()}
         bridged = None if self.bridged is None else self.bridged[rows]
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
 
     def only(self, names: Iterable[str]) -> Recording:
-        """Return the recording with the named channels only."""
+        """Return a recording with the named channels only."""
         part = replace(self, channels={name: self[name] for name in names})
         object.__setattr__(part, "_results", self._results)  # shared, see `compute_once`
         return part
 
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
-        """Return (values, units, description) of the recording for writers, with the time as series `t`.
+        """Return the content of the recording for writers of files: (values, units, description).
 
-        `values`: name -> samples (n,); `units`: name -> unit; `description`: rate, provenance and history as JSON
-        values. Raises InputError for values that JSON does not have.
+        `values`: name -> samples (n,), with the time as series `t`; `units`: name -> unit; `description`: rate,
+        provenance and history as JSON values. Raises InputError for values that JSON does not have.
         """
         from sealscope.recordings.formats.table import make_description
 
@@ -354,17 +357,17 @@ class Recording:
 
 
 def make_recording(fields: RecordingFields) -> Recording:
-    """Make a recording from the fields that a reader returns."""
+    """Make a recording from the fields of a file that a reader returns."""
     return Recording(*fields[:-1])  # without the `kind` of the file
 
 
 def compute_once(
     recording: Recording, key: Hashable, compute: Callable[[Recording], _T], channels: Iterable[str] | None = None
 ) -> _T:
-    """Compute `compute(recording)` once for each `key`, and cache the result with the recording.
+    """Return `compute(recording)`, computed once for each `key` and then cached with the recording.
 
-    `channels`: the channels on which the result depends, by default all. Views by `Recording.only` share the results
-    whose channels they have.
+    `channels`: the channels on which the result depends, by default all. Views of the recording with fewer channels
+    (`Recording.only`) share the result if they have these channels.
     """
     all_channels = frozenset(recording.channels)
     names = all_channels if channels is None else all_channels.intersection(channels)

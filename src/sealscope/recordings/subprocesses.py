@@ -1,8 +1,8 @@
-"""Run risky work in subprocesses that have limits of time, memory and disk.
+"""Run risky work in subprocesses with limited time, memory and disk space.
 
 A damaged file makes the C libraries of some formats crash, hang or fill the memory, and they do not react to signals.
-A subprocess is started when it is first needed, serves one request after the other, and ends with the program. It is a
-fresh interpreter, not a fork, so that scripts need no `__main__` guard; it imports nothing from the working folder.
+A subprocess is started when it is first needed, serves one request after the other, and ends with the program. It is
+a fresh interpreter, not a fork, so that scripts need no `__main__` guard; it imports nothing from the working folder.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class _Process:
     """A subprocess that serves one request after the other."""
 
     def __init__(self) -> None:
-        """Start a new interpreter, with a temporary folder for it."""
+        """Start a new Python interpreter, with a temporary folder of its own."""
         self._is_fresh = True
         self._folder = tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
@@ -71,9 +71,11 @@ class _Process:
         return self._process.poll() is None
 
     def send(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
-        """Run a pickled request; return (result or error, traceback of the error or None, is_spent).
+        """Run a pickled request in the subprocess; return (result or error, traceback, is_spent).
 
-        `limit`: longest time of the work [s]. `is_spent`: the process occupies too much memory to be used again.
+        `request`: function, arguments and limits; `limit`: longest time of the work [s]. The traceback is that of the
+        error as text, None for a result. `is_spent`: the process occupies too much memory to be used again. Raises
+        CrashedSubprocessError if the process ends without an answer, or takes too long.
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
@@ -96,7 +98,7 @@ class _Process:
         return value, remote_traceback, is_spent
 
     def end(self) -> None:
-        """Kill the process and remove its folder."""
+        """Kill the process and remove its temporary folder."""
         self._process.kill()
         self._process.communicate()
         self._folder.cleanup()
@@ -107,7 +109,7 @@ _idle: list[_Process] = []
 
 
 def _take_process() -> _Process:
-    """Take an idle process, or start a new one."""
+    """Take an idle subprocess that is still alive, or start a new one."""
     with suppress(IndexError):
         while True:
             process = _idle.pop()
@@ -123,8 +125,9 @@ def run_in_subprocess(
     """Run ``work(*arguments)`` in a subprocess and return its result; arguments and result are pickled.
 
     `limit`: longest time [s]; `memory`: most memory [bytes], at most `MAX_MEMORY` and half the machine's; `disk`:
-    longest file that it may write [bytes]. Raises CrashedSubprocessError if the process crashes or exceeds `limit`, and
-    the errors of `work`: SealscopeError and MemoryError as they are, others as a RuntimeError with the same text.
+    largest file that it may write [bytes]. Raises CrashedSubprocessError if the process crashes or exceeds `limit`.
+    SealscopeError and MemoryError of `work` are raised as they are, other errors as a RuntimeError with the same
+    text.
     """
     with _slots:
         process = _take_process()
@@ -145,7 +148,11 @@ def run_in_subprocess(
 
 
 def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Run ``work(file, *arguments)`` by `run_in_subprocess`; errors name `file` as given, not by its absolute path."""
+    """Run ``work(file, *arguments)`` in a subprocess and return its result.
+
+    `limits`: as for `run_in_subprocess`. The subprocess gets the absolute path, but errors name the file as the
+    caller did.
+    """
     place = file.absolute()  # the process may work in another folder
     try:
         return run_in_subprocess(work, place, *arguments, **limits)
@@ -156,7 +163,8 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
     """Limit the time [s] (0: no limit), memory [bytes] and file size [bytes] of this process.
 
-    A timer of the system ends it when the time is over, even if its parent is dead.
+    A timer of the operating system ends the process when the time is over, even if its parent is dead. Systems
+    without such limits are left without.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -172,7 +180,7 @@ def _set_limits(seconds: float, memory: int, disk: int) -> None:
 
 
 def _is_spent() -> bool:
-    """Test whether this process occupies more memory than an idle process may."""
+    """Test whether this process occupies more memory than an idle process may; False if that cannot be found out."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[5])  # data pages, which RLIMIT_DATA limits
     except OSError:
@@ -181,7 +189,10 @@ def _is_spent() -> bool:
 
 
 def _serve() -> None:
-    """Serve requests from standard input until it ends; output of libraries is discarded."""
+    """Serve requests from standard input, one after the other, until it ends.
+
+    The answers go to standard output; what libraries print there is discarded.
+    """
     responses = os.fdopen(os.dup(1), "wb")
     discard = os.open(os.devnull, os.O_WRONLY)
     os.dup2(discard, 1)

@@ -1,4 +1,4 @@
-"""Build the page's charts: their lines in display units, their data for the script, and their still pictures."""
+"""Build the charts of the page: lines in display units, data for the page's script, and still pictures."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ SAMPLES = "samples"
 POINTS, STILL_POINTS = 16_000, 800
 #: Samples around the onset that are all drawn, so that the ringing is visible.
 NEAR_SAMPLES = 6_000
-#: Largest value drawn. Values count as constant if their range is below the second number, or below the third relative
-#: to their size.
+#: Largest value drawn. Values count as constant if their range is below the second number, or below the third
+#: relative to their size.
 _MAX_DRAWN, _MIN_EXTENT, _MIN_RELATIVE_EXTENT = 1e100, 1e-100, 1e-12
-#: Unit of pressures -> unit of their details.
+#: Unit of wavelet details, by the unit of the pressures.
 _DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
-#: SI unit of other channels -> display unit.
+#: Display unit of other channels, by their SI unit.
 _DISPLAY_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
 
 
@@ -37,8 +37,8 @@ _DISPLAY_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min"}
 class Mark:
     """A moment marked on every chart: `t` [s] on the recording's time axis, and its label.
 
-    `known=True` marks a moment that is known independently of the diagnosis, such as the onset of a leak that was put
-    in on purpose; it is drawn in another style. Raises InputError if `t` is not finite.
+    `known=True` marks a moment that is known independently of the diagnosis, such as the onset of a leak that was
+    made on purpose; it is drawn in another style. Raises InputError if `t` is not finite.
     """
 
     t: float
@@ -51,7 +51,7 @@ class Mark:
 
 
 class ChartLine(NamedTuple):
-    """One line of a chart: label, name of its style in the style sheet, and values in the chart's unit."""
+    """One line of a chart: its label, its style's name in the style sheet, and its values in the chart's unit."""
 
     label: str
     style: str
@@ -59,11 +59,12 @@ class ChartLine(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """One chart.
+    """One chart of the page.
 
-    `base`: time axis of its lines (all samples, centres of the RMS windows, or times of the leak over the recording);
-    `band`: True if the second and third line are the interval of the first; `limits`: ends of the axis, None to show
-    all values; `level`: repair limit, None if there is none.
+    `key`: its identifier; `group`: group of charts on the page to which it belongs; `base`: name of the time axis of
+    its lines, that of all samples, of the centres of the RMS windows, or of the leak over the recording; `band`: True
+    if the second and third line are the interval of the first; `limits`: ends of the y axis, None to show all values;
+    `level`: repair limit, None if there is none.
     """
 
     key: str
@@ -85,7 +86,7 @@ class Chart(NamedTuple):
 
     @property
     def is_cut(self) -> bool:
-        """True if values lie beyond the limits of the axis."""
+        """True if some values lie outside the limits of the y axis."""
         low, high = self.limits or (-np.inf, np.inf)
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
@@ -106,9 +107,10 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 
 
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
-    """Return the display unit of values in `unit`, and the scale by which to divide them.
+    """Choose the unit in which values in the SI unit `unit` are displayed; return it, and its size in SI.
 
-    `detail`: for a wavelet detail. Raises InputError for an unknown pressure unit.
+    Values are divided by this size for display. `detail`: True for a wavelet detail of a pressure, which has a
+    smaller unit. Raises InputError for an unknown pressure unit.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
@@ -120,16 +122,17 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Return the display unit of a detail, and the scale by which to divide its values.
+    """Choose the unit in which a wavelet detail is displayed; return it, and its size in the units of the values.
 
-    Both are squared for d3d4. `unit`: unit of the channel.
+    Values are divided by this size for display. Both are squared for d3d4, the product of two details. `unit`: unit
+    of the channel; `name`: name of the detail, such as "d3".
     """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
 
 def detail_label(name: str) -> str:
-    """Return the displayed name of a detail."""
+    """Return the name by which a wavelet detail is displayed, such as "d3·d4" for "d3d4"."""
     return "d3·d4" if name == PRODUCT else name
 
 
@@ -160,7 +163,7 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build the charts of the windowed RMS: d1..d4 of each chamber, then d3d4 of each."""
+    """Build the charts of the RMS of wavelet details in windows: d1 to d4 of each chamber, then d3d4 of each."""
     charts = []
     for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
@@ -185,9 +188,9 @@ _MAX_LIMIT_RATIO = 4.0
 
 
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
-    """Build the chart of the leak over the recording, with its interval and the repair limit.
+    """Build the chart of the leak over the time of the recording, with its interval and the repair limit.
 
-    The list is empty if the course of the leak is not known. `height`: height of the chart.
+    Returns a list with this chart, empty if the leak over time is not known. `height`: height of the chart in pixels.
     """
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
@@ -216,10 +219,10 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
 
 
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
-    """Compute the limits of the axis, which include zero, all estimates and all intervals.
+    """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals.
 
-    If the intervals more than double the range, only 90 % of their ends are included, as a few wide intervals would
-    flatten the curve.
+    `low`, `high`: ends of the intervals, not finite if unknown. If the intervals more than double the range, only 90
+    % of their ends are included, because a few wide intervals would flatten the curve.
     """
     required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
@@ -232,7 +235,7 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each detail of each chamber; those of the same detail follow each other."""
+    """Build a chart for each wavelet detail of each chamber; the charts of the same detail follow each other."""
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -251,8 +254,9 @@ Moment = tuple[str, float, float | None]
 class DrawnCharts(NamedTuple):
     """All charts in the form that a page needs.
 
-    `data`: plain JSON values for the script; `still`: key of a chart -> still picture; `base`: times at which the
-    channels are drawn; `span`: first and last of them [s]; `fine`: ends of the interval in which all samples are drawn.
+    `data`: plain JSON values for the script; `still`: still picture of each chart, by its key; `base`: times at which
+    the channels are drawn; `span` [s]: first and last of these times; `fine` [s]: ends of the interval in which all
+    samples are drawn.
     """
 
     data: dict[str, Any]
@@ -269,9 +273,10 @@ def draw(
     diagnosis: Diagnosis,
     marks: Sequence[Mark],
 ) -> DrawnCharts:
-    """Decimate and encode the lines of all charts, and draw the still picture of each.
+    """Reduce and encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
-    Peaks are preserved, as each bucket of samples contributes its minimum and its maximum.
+    Peaks are preserved, because the minimum and the maximum of each bucket of samples are drawn. `chambers`: wavelet
+    details, for their time axes; `marks`: moments to mark on every chart, besides the onset of the diagnosis.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
@@ -310,12 +315,15 @@ def draw(
 
 
 def _clip_values(values: Array) -> Array:
-    """Clip values to +-`_MAX_DRAWN`, so that no scale overflows."""
+    """Limit finite values to +-`_MAX_DRAWN`, because larger ones would make the scale of a chart overflow."""
     return np.where(np.isfinite(values), np.clip(values, -_MAX_DRAWN, _MAX_DRAWN), values)
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset [s], and its interval [s] clipped to `span`; None for each that is not known."""
+    """Return the onset of the leak [s], and its interval limited to the time `span` [s] of the chart.
+
+    Each is None if it is not known.
+    """
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None
@@ -328,9 +336,10 @@ def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float 
 def render_still(
     chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
 ) -> Picture:
-    """Draw the still picture of a chart, 860 wide and `chart.height` high.
+    """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high.
 
-    `t`: times [s] of the values of its `lines`; `span`: ends of the time axis [s]; `moments`: marked moments.
+    `lines`: values (n,) of each line, at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`:
+    moments and intervals to mark.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)

@@ -1,4 +1,4 @@
-"""Compute the wavelet details and their RMS for the page, from all parts of a recording that can be transformed."""
+"""Compute wavelet details of the chamber pressures and their RMS for the page, from all usable samples."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from sealscope.reporting.series import ordered_time
 from sealscope.signals.details import QUANTITIES, details, min_samples
 from sealscope.signals.windows import WINDOW_SIZE, WINDOW_STEP, rms, windowed_rms
 
-#: RMS windows that each half of a recording needs for a comparison.
+#: Number of RMS windows that each half of a recording needs for a comparison.
 HALF_WINDOWS = 10
 
 
 class ChamberDetails(NamedTuple):
     """Wavelet details d1..d4 of one chamber's pressure, and d3d4, the product of d3 and d4.
 
-    `values`: name -> (n,) over the whole recording, NaN if the transform reaches an end or a defect of the data;
-    `window_t`: (w,) centres of the RMS windows [s]; `window_rms`: name -> (w,), NaN between two parts. d1..d4 are in
-    the channel's unit, d3d4 in its square.
+    `values`: by name, each detail (n,) over the whole recording, NaN where it depends on samples beyond an end or on
+    a defect of the data; `window_t` (w,) [s]: centres of the windows over which the RMS is computed; `window_rms`: by
+    name, the RMS (w,), NaN between two usable parts of the recording. d1..d4 are in the channel's unit, d3d4 in its
+    square.
     """
 
     channel: str
@@ -34,7 +35,10 @@ class ChamberDetails(NamedTuple):
 
 
 class DetailChange(NamedTuple):
-    """RMS of one detail in two parts of a recording, in the channel's unit (d3d4: its square); None if not known."""
+    """The RMS of one wavelet detail in two parts of a recording.
+
+    `before`, `after`: in the unit of the channel, for d3d4 in its square; None if it cannot be computed.
+    """
 
     channel: str
     name: str
@@ -43,17 +47,20 @@ class DetailChange(NamedTuple):
 
     @property
     def percent(self) -> float | None:
-        """Change as in the thesis, ``100 (after - before) / before`` [%]; None if one is missing or `before` is 0."""
+        """Relative change as the thesis defines it, ``100 (after - before) / before`` [%].
+
+        None if one of the two is missing, or `before` is 0.
+        """
         if self.before is None or self.after is None or self.before <= 0:
             return None
         return 100 * (self.after - self.before) / self.before
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """Compute the wavelet details of one chamber; return them with a note on omitted samples.
+    """Compute the wavelet details of the pressure of one chamber; return them with a note on omitted samples.
 
-    Only the usable parts of the recording are transformed. If the data cannot be transformed, the details are None and
-    the note is the reason.
+    `channel`: "p_A" or "p_B". Only parts of the recording that are long enough and without a defect are transformed.
+    If there are none, the details are None, and the note is the reason. The note is "" if no samples are omitted.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
@@ -97,9 +104,10 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
 
 class Parts(NamedTuple):
-    """Two parts of a recording to compare.
+    """Two parts of a recording that are compared on the page.
 
-    The first part is t < `end` [s], the second t >= `start` [s]; `heads`: their headings; `text`: reason of the choice.
+    `end` [s]: end of the first part; `start` [s]: start of the second part; `heads`: their headings in the table;
+    `text`: sentence that explains the choice.
     """
 
     end: float
@@ -109,10 +117,10 @@ class Parts(NamedTuple):
 
 
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
-    """Choose the parts of a recording to compare: before and after the onset's interval, or the two halves.
+    """Choose the parts of a recording to compare: before and after the interval of the onset, or the two halves.
 
-    A recording without an onset whose halves have fewer than `HALF_WINDOWS` windows is not divided, as the difference
-    would reflect the stroke and not the seal.
+    The halves are compared if no onset was found. If each has fewer than `HALF_WINDOWS` RMS windows, the recording is
+    not divided: a difference would reflect the stroke and not the seal.
     """
     t = ordered_time(recording.t, recording.rate)[0]
     if diagnosis.onset_s is not None:
@@ -130,7 +138,10 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 
 
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
-    """Compute the RMS of each detail of each chamber in the two parts; None for a part without samples."""
+    """Compute the RMS of each wavelet detail of each chamber in two parts of the recording.
+
+    The RMS is None for a part without finite values.
+    """
     t = ordered_time(recording.t, recording.rate)[0]
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())
@@ -138,6 +149,6 @@ def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) 
 
 
 def _rms(values: Array) -> float | None:
-    """Compute the RMS of the finite values; None if there are none."""
+    """Compute the RMS of the finite values; return None if there are none."""
     finite = values[np.isfinite(values)]
     return float(rms(finite)) if finite.size else None

@@ -1,4 +1,4 @@
-"""Write the index of a folder of pages: a row for each recording with its verdict and action, the most severe first."""
+"""Write the index of a folder of pages, with the verdict and action of each recording, the most severe first."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Return the sort key of a page: by verdict, then leak over the repair limit, then flow, then name."""
+    """Compute the key by which pages are sorted, the most severe diagnosis first.
+
+    It compares the verdict, then the leak as a fraction of the repair limit, then the flow, then the name of the
+    file.
+    """
     severity = diagnosis.severity
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
     total_lpm = None if diagnosis.total_leakage is None else diagnosis.total_leakage.lpm
@@ -25,7 +29,10 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index of pages in its folder, given the path and the diagnosis of each page."""
+    """Write the index page of a folder, with a row for each of its pages; return its path.
+
+    `path`: the index page; `pages`: path and diagnosis of each page, in the same folder.
+    """
     ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

@@ -1,4 +1,4 @@
-"""Format a diagnosis for the page and the terminal: choose texts of `messages.toml` and fill in their values."""
+"""Format a diagnosis as text for the page and the terminal, by filling values into the texts of `messages.toml`."""
 
 from __future__ import annotations
 
@@ -26,18 +26,24 @@ ABSENT = "–"
 
 @cache
 def _texts() -> dict[str, dict[str, str]]:
-    """Load `messages.toml`: section -> key -> text."""
+    """Load the texts in `messages.toml`, by section and key."""
     return tomllib.loads((resources.files("sealscope.reporting") / "messages.toml").read_text(encoding="utf-8"))
 
 
 def say(name: str, /, **values: Any) -> str:
-    """Return the text `section.key` of `messages.toml` with `values` in its placeholders."""
+    """Format a text of `messages.toml` with `values` in its placeholders.
+
+    `name`: section and key of the text, such as "since.whole".
+    """
     section, _, key = name.partition(".")
     return _texts()[section][key].format(**values)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Format `value` with `digits` significant digits, without an exponent from 1e-6 to 1e9; a dash for None or NaN."""
+    """Format a number with `digits` significant digits; a dash for None or NaN.
+
+    Between 1e-6 and 1e9 it is written without an exponent.
+    """
     if value is None or isnan(value):
         return ABSENT
     if not isfinite(value):
@@ -51,7 +57,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """Format a time in seconds, with one decimal from 10 s on, and from an hour on also as h:mm:ss."""
+    """Format a time in seconds: from 10 s on with one decimal, from an hour on also as h:mm:ss; a dash if unknown."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
     text = f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s"
@@ -62,7 +68,7 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a sentence for the heading of page and card."""
+    """Format the verdict as a sentence for the heading of the page and of the card, its picture."""
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
         key = diagnosis.cause
@@ -72,14 +78,20 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the cause of the change, None without one; a leak is a cause only if the verdict is "leak"."""
+    """Return the named cause of the change, or None if there is none.
+
+    A kind of leak is returned only if the verdict is "leak".
+    """
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return True if the reason is shown with the verdict: `cannot tell`, or a change that is no leak."""
+    """Return True if the reason is to be shown with the verdict.
+
+    This is so for `cannot tell`, and for a change with a named cause that is no leak.
+    """
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
@@ -90,7 +102,7 @@ def state_text(machine_state: MachineState) -> str:
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the onset of the leak with its interval; None without a leak."""
+    """Format the time since which the machine leaks, with its interval; return None if the verdict is no leak."""
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -102,9 +114,9 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Format the leak flow [L/min], or the reason why none is stated.
+    """Format the leak flow [L/min], or the reason why no flow is stated.
 
-    For other verdicts than "leak" the text is the upper bound of a leak, None if it is not known.
+    For verdicts other than "leak", format the upper bound of a leak; return None if it is not known.
     """
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
@@ -122,7 +134,7 @@ def how_much(diagnosis: Diagnosis) -> str | None:
 
 
 def _pump_fraction(diagnosis: Diagnosis) -> str | None:
-    """Format the leak as a fraction of the pump's flow; None if it is not known."""
+    """Format the leak as a fraction of the pump's flow; return None if this is not known."""
     severity = diagnosis.severity
     if severity is None or severity.pump_share is None:
         return None
@@ -130,7 +142,7 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return the reason why the leak has no L/min, and the remedy."""
+    """Return the text that says why the leak cannot be stated in L/min, and how that can be remedied."""
     if "leak_lpm" not in diagnosis.refuses:
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
@@ -142,12 +154,12 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
 
 
 def flow_basis(diagnosis: Diagnosis) -> str | None:
-    """Format the machine data on which all L/min of the diagnosis are based; None if no machine is known."""
+    """Format the machine data on which all flows [L/min] of a diagnosis are based; return None if unknown."""
     return None if diagnosis.machine is None else machine_text(diagnosis.machine)
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Format the area and displacement on which flows are based, and their origin."""
+    """Format the piston area and pump displacement on which flows [L/min] are based, and where they come from."""
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -163,7 +175,7 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the leak as a fraction of the repair limit, or else of the pump's flow; None if neither is known."""
+    """Format the leak as a fraction of the repair limit, or else of the pump's flow; return None if unknown."""
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
         return None
@@ -178,14 +190,14 @@ def how_bad(diagnosis: Diagnosis) -> str | None:
 
 
 def _format_range(low: float, high: float) -> str:
-    """Format a range with two digits, or a single number if both ends are then equal."""
+    """Format a range with two significant digits, or as one number if both ends are then equal."""
     return " to ".join(dict.fromkeys((number(low, 2), number(high, 2))))
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow and as a speed of creep, if known.
+    """Format the leak in three other forms: in mL/min, relative to the pump's flow, and by a piston's speed of creep.
 
-    None if none of the three is known.
+    Forms that are not known are left out; None is returned if all are unknown.
     """
     severity = diagnosis.severity
     if severity is None:
@@ -200,9 +212,9 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, and the smallest detectable step; None if not known.
+    """Format the total leakage past pump and piston, and the smallest change of it that could be detected.
 
-    `basis`: True to add the machine data on which L/min are based.
+    `basis`: True to add the machine data on which flows are based. Returns None if the total leakage is not known.
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -222,7 +234,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage as a fraction of the pump's flow, with the smallest detectable step.
+    """Format a total leakage as a fraction of the pump's flow, with the smallest change that could be detected.
 
     `pressure`: text of the pressure at which the leakage is stated.
     """
@@ -239,7 +251,7 @@ def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
 def leakage_in_short(diagnosis: Diagnosis) -> str | None:
     """Format the total leakage past pump and piston in a few words.
 
-    None if it is not known, or if the verdict is "leak".
+    Returns None if it is not known, or if the verdict is "leak".
     """
     leakage = diagnosis.total_leakage
     if leakage is None or diagnosis.verdict == "leak":
@@ -258,12 +270,16 @@ def states_flow(diagnosis: Diagnosis) -> bool:
 
 
 def _format_percent(fraction: float | None) -> str:
-    """Format a fraction in percent, a dash for None."""
+    """Format a fraction in percent with two significant digits; a dash for None."""
     return ABSENT if fraction is None else f"{number(100.0 * fraction, 2)} %"
 
 
 def how_sure(diagnosis: Diagnosis) -> str:
-    """Format the evidence: odds of a healthy recording like this one, score, threshold, false alarms."""
+    """Format the strength of the evidence for the verdict.
+
+    It states the odds that a healthy recording looks like this one, the score, the threshold, and the false-alarm
+    probability.
+    """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
     odds, found_cause = _odds(diagnosis), cause(diagnosis)
@@ -280,14 +296,14 @@ def how_sure(diagnosis: Diagnosis) -> str:
 
 
 def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the odds of a healthy recording like this one; if unknown, the false-alarm probability."""
+    """Format the odds that a healthy recording looks like this one; if unknown, the false-alarm probability."""
     return _odds(diagnosis) or false_alarms(diagnosis)
 
 
 def _odds(diagnosis: Diagnosis) -> str | None:
-    """Format the odds that a healthy recording looks like this one; None if they are not known.
+    """Format the odds that a healthy recording looks like this one; return None if they are not known.
 
-    After `no leak` without an alarm the odds are those of an equally large change.
+    If the verdict is `no leak` and no detector raised an alarm, the text says "shows as much change" instead.
     """
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
@@ -305,7 +321,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """List the next checks, most useful first."""
+    """List the recommended next steps as sentences, most useful first."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
@@ -336,20 +352,23 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def quality_summary(diagnosis: Diagnosis) -> str:
-    """Format the number of findings and the worst severity among them."""
+    """Format the number of findings on the quality of the data, and the worst severity among them."""
     severities = {finding.severity for finding in diagnosis.quality}
     worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
     return f"{format_count(len(diagnosis.quality), 'finding')}{worst}"
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Format a note on pressures in raw counts, with the remedy; None if there are none."""
+    """Format a note on pressures that are recorded in raw counts, with the remedy; return None if there are none."""
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
 
 def format_unused_columns(diagnosis: Diagnosis) -> str | None:
-    """Format a note on unused columns that could be channels, with --map options; None if there are none."""
+    """Format a note on unused columns of the file that could be channels, with the options --map that use them.
+
+    Returns None if there are none.
+    """
     if not diagnosis.unused:
         return None
     lines = " ".join(f"--map '{suggest_map_entry(Label.parse(name))}'" for name in diagnosis.unused[:4])
@@ -357,7 +376,7 @@ def format_unused_columns(diagnosis: Diagnosis) -> str | None:
 
 
 def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Format the verdict, its figures and the next step as about five lines of text; `width`: columns of a line."""
+    """Format a diagnosis in short: the verdict, its numbers and the next step; `width`: columns of a line."""
     odds = odds_or_false_alarms(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
         ("state", state_text(diagnosis.state)),
@@ -374,7 +393,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
 
 
 def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Format the verdict, its figures, and all methods and findings as text; `width`: columns of a line.
+    """Format a whole diagnosis as text: verdict, numbers, all methods and all findings; `width`: columns of a line.
 
     The text has no colours, and no control characters, which file names or headers could contain.
     """
@@ -399,7 +418,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
 
 
 def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
-    """Build the rows on onset, size and severity of the leak."""
+    """Build the rows (label, text or None) on the onset, the size and the severity of the leak."""
     size, basis = how_much(diagnosis), flow_basis(diagnosis)
     if size is not None and basis is not None and diagnosis.leak_lpm is not None:
         size = f"{size}; {basis}"
@@ -407,13 +426,13 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 
 
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Format a line with the verdict, and a paragraph for each row with a text."""
+    """Format a line with the file and the verdict, and a paragraph for each row (label, text) that has a text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, 12, width)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak with its interval, or its upper bound."""
+    """Format the leak flow with its interval, or its upper bound if the verdict is no leak."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm,) * 2
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -423,7 +442,7 @@ def format_leak_flow(diagnosis: Diagnosis) -> str:
 
 
 def what_to_do(diagnosis: Diagnosis) -> str:
-    """Return the first next step, or the reason for `cannot tell`."""
+    """Return the first recommended step; for `cannot tell`, the reason of the verdict instead."""
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 

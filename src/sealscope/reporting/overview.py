@@ -19,7 +19,10 @@ CURVE_WIDTH = 20
 
 
 def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
-    """Draw values (n,) as `width` bars scaled between minimum and maximum, blank for missing samples."""
+    """Draw values (n,) as a line of `width` bar characters, scaled between minimum and maximum.
+
+    A blank stands for missing samples.
+    """
     finite = values[np.isfinite(values)]
     if not finite.size:
         return " " * width
@@ -39,12 +42,15 @@ def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
 
 
 def _format_short(value: float) -> str:
-    """Format a number with four digits; from 1e4 to 1e9 as an integer instead of with an exponent."""
+    """Format a number with four significant digits; from 1e4 to 1e9 as an integer instead of with an exponent."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Format a recording for inspection before a verdict: clock, channels with range and curve, notes, findings."""
+    """Format an overview of a recording: its clock, its channels with range and small curve, notes and findings.
+
+    `name`: name of the recording; `findings`: defects of its data.
+    """
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""

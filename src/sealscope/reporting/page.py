@@ -51,15 +51,15 @@ def report(
     recording : Recording
         The recording that was judged.
     path : str or path-like
-        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is written atomically. A PDF is printed
-        by a browser of Chromium's family or by WeasyPrint, whichever is installed. The card is a picture of 1200 x 630
-        pixels with machine, date, verdict, L/min and its curve, which is drawn by a browser.
+        The page, ending in .html, .htm or .pdf, or its card, ending in .png. It is written atomically. A PDF is
+        printed by a browser of Chromium's family or by WeasyPrint, whichever is installed. The card is a picture of
+        1200 x 630 pixels with machine, date, verdict, L/min and its curve, which is drawn by a browser.
     diagnosis : Diagnosis, optional
         Its diagnosis; by default that of `sealscope.diagnose` with the `rig`.
     rig : Rig, str or path-like, optional
         A Rig, the name of a packaged rig or the path of a TOML file; its values label the schematic.
     marks : sequence of Mark, optional
-        Further moments on every chart.
+        Further moments that are marked on every chart.
     truth_onset_s, truth_leak_lpm : float, optional
         True onset [s] and leak [L/min], if known, to be shown next to the verdict.
     title : str, optional
@@ -108,7 +108,7 @@ def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Di
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    None if `rig` states no dimensions, or no packaged rig was stated.
+    Returns None if `rig` states no dimensions, or if no packaged rig was stated.
     """
     from sealscope.parameters import load_rig, rig_names
 
@@ -122,7 +122,10 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Return the marks of a page, with the true onset if it is known; raise InputError for an empty recording."""
+    """Collect the marks of all charts: `marks`, and the true onset [s] if it is known.
+
+    Raises InputError if the recording is empty, for then there is no page.
+    """
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -137,7 +140,10 @@ def render_card(
     truth_onset_s: float | None = None,
     title: str | None = None,
 ) -> str:
-    """Render the card as HTML of `WIDTH` x `HEIGHT` pixels; arguments as for `report`."""
+    """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
+
+    The arguments and errors are those of `report`.
+    """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
     particulars = collect_particulars(recording, _choose_rig(diagnosis, rig))
@@ -169,7 +175,7 @@ def render_page(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> str:
-    """Render the page as HTML; arguments and errors as for `report`."""
+    """Render the page of a diagnosis as HTML; the arguments and errors are those of `report`."""
     from markupsafe import Markup
 
     pressure_unit = pressure_unit or recording.pressure_unit
@@ -215,7 +221,11 @@ def render_page(
 def _change_rows(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    """Build the values for the table of changes: RMS of each detail in both parts, and the limit of the bars [%]."""
+    """Build the template's values for the table that compares the details' RMS in two parts of the recording.
+
+    Returns `changes`, rows of (channel, detail, unit, RMS before, RMS after, change [%]); `bar_limit` [%], the
+    largest change that the bars show; and `parts`.
+    """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
     for change in features.changes(recording, chambers, parts):
@@ -237,7 +247,7 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (dotted name, text) of all entries of nested mappings."""
+    """Yield the entries of nested mappings as pairs of dotted name and text."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.recordings.recording import Array
 
-#: First word of a style -> path of its symbol, relative to its position.
+#: SVG path of each symbol, relative to its position, by the first word of its style.
 SYMBOLS = {
     "point": "m-3 0a3 3 0 1 0 6 0a3 3 0 1 0-6 0z",
     "bound": "m-4 0a4 4 0 1 0 8 0a4 4 0 1 0-8 0zm4 4v12m-3.5-4l3.5 4l3.5-4",
@@ -22,7 +22,7 @@ _MIN_BOX = 2.0
 
 
 class SvgPath(NamedTuple):
-    """A shape of a picture: name of its style in the style sheet, SVG path, and tooltip."""
+    """A shape of a picture: name of its style in the style sheet, its SVG path, and its tooltip, "" for none."""
 
     style: str
     path: str
@@ -30,7 +30,10 @@ class SvgPath(NamedTuple):
 
 
 class SvgText(NamedTuple):
-    """A text at a position in the picture; `turned`: it reads upwards."""
+    """A text at the position `x`, `y` of a picture, from its frame's top left corner.
+
+    `anchor`: part of the text at this position, as in SVG; `turned`: True if the text reads upwards.
+    """
 
     x: float
     y: float
@@ -41,10 +44,11 @@ class SvgText(NamedTuple):
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with a frame of `width` x `height`; `shapes` are drawn in their order, then the `labels`.
+    """A chart as SVG shapes and texts, in a frame of `width` x `height` pixels.
 
-    `x_ends`, `y_ends`: ends of the axes, as powers of ten for a logarithmic x axis (`log`); `margins`: left of the
-    frame, above, right and below.
+    `shapes` are drawn in their order, then the `labels`.
+    `x_ends`, `y_ends`: values at the ends of the axes; `log`: True for a logarithmic x axis, whose ends are then
+    powers of ten, such as (-2, 1); `margins`: free space left of the frame, above, right of it and below.
     """
 
     width: float
@@ -64,7 +68,7 @@ class Picture:
 
     @property
     def styles(self) -> set[str]:
-        """The styles of its shapes."""
+        """Names of the styles of all its shapes."""
         return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
@@ -79,15 +83,18 @@ class Picture:
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 
     def draw(self, style: str, path: str, title: str = "") -> None:
-        """Draw a path in units of the picture."""
+        """Draw an SVG path in pixels of the picture; `style`: its name in the style sheet; `title`: its tooltip."""
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
-        """Draw the line through points (n,), broken at missing y; `digits`: decimals of the coordinates."""
+        """Draw the line through points (n,) in values of the axes, interrupted where y is missing (NaN).
+
+        `digits`: decimals of the coordinates in the SVG path.
+        """
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Format the line through points (n,) as an SVG path, which begins anew after missing y."""
+        """Format the line through points (n,) as an SVG path, interrupted at a missing y (NaN)."""
         is_drawn = np.isfinite(y)
         is_first = is_drawn & ~np.append(False, is_drawn[:-1])
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
@@ -101,22 +108,25 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from `begin` to `end`, from `low` to `high` or over the whole height."""
+        """Draw a box from x = `begin` to `end` and from y = `low` to `high`; None means the end of the frame."""
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw a vertical line over the whole height."""
+        """Draw a vertical line at `x` over the whole height of the frame."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a horizontal line over the whole width."""
+        """Draw a horizontal line at `y` over the whole width of the frame."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
-        """Draw one of the `SYMBOLS` at `x`, `down` units below the top of the frame."""
+        """Draw one of the `SYMBOLS`, which the first word of `style` names, at `x`.
+
+        `down`: distance from the top of the frame in pixels.
+        """
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
@@ -125,7 +135,7 @@ class Picture:
         self.symbol(style, x, float(self.y(y)), title)
 
     def frame(self, count: int) -> None:
-        """Draw the frame, and about `count` horizontal grid lines with their values."""
+        """Draw the frame, and about `count` horizontal grid lines with their values on the left."""
         for value in ticks(*self.y_ends, count):
             self.level("grid", value)
             self.labels.append(SvgText(-6.0, float(self.y(value)) + 4.0, f"{value:g}", "end"))
@@ -137,7 +147,7 @@ class Picture:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """Choose about `count` round values between low and high, with steps of 1, 2 or 5 times a power of ten."""
+    """Choose about `count` round values between low and high, at steps of 1, 2 or 5 times a power of ten."""
     min_step = (high - low) / count
     power = 10.0 ** np.floor(np.log10(min_step))
     step = float(next(m for m in (1, 2, 5, 10) if m * power >= min_step * 0.999) * power)

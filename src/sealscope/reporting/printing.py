@@ -68,10 +68,10 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 
 
 def _inline_styles(page: str) -> str:
-    """Prepare a page for WeasyPrint by copying the style sheet into each drawing.
+    """Prepare a page (HTML) for WeasyPrint: copy its style sheet into each drawing, and resolve its variables.
 
-    WeasyPrint neither applies the sheet to drawings nor supports variables in them. Variables are replaced by their
-    values for print.
+    WeasyPrint neither applies the style sheet of a page to drawings nor supports variables in them. A variable is
+    replaced by its value for print.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -85,18 +85,21 @@ def _inline_styles(page: str) -> str:
 
 
 def _find_browser() -> str | None:
-    """Find the path of an installed browser; None if there is none."""
+    """Find the path of an installed browser of Chromium's family; return None if there is none."""
     return next(filter(None, map(shutil.which, (*BROWSERS, *_PLACES))), None)
 
 
 def _is_complete_pdf(data: bytes) -> bool:
-    """Return True if a PDF is complete: its end points to a cross-reference table (ISO 32000-1, 7.5.5)."""
+    """Return True if the bytes of a PDF are complete: their end points to a cross-reference table.
+
+    Source: ISO 32000-1, 7.5.5.
+    """
     end = re.search(rb"startxref\s+(\d+)\s+%%EOF\s*$", data[-1024:])
     return end is not None and re.match(rb"%PDF.*(xref|\d+ \d+ obj)", data[:4] + data[int(end[1]) :][:20]) is not None
 
 
 def _is_complete_png(data: bytes, width: int, height: int) -> bool:
-    """Return True if a PNG has this size and is complete up to the chunk IEND with its checksum."""
+    """Return True if the bytes of a PNG have this size in pixels and end with the chunk IEND and its checksum."""
     head = struct.pack(">8sL4sLL", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", width, height)
     return data.startswith(head) and data.endswith(b"\0\0\0\0IEND\xaeB`\x82")
 
@@ -104,9 +107,10 @@ def _is_complete_png(data: bytes, width: int, height: int) -> bool:
 def _write_by_browser(
     browser: str, page: str, target: Path, options: list[str], kind: str, is_complete: Callable[[bytes], bool]
 ) -> None:
-    """Run a browser that writes the page to `target`; raise InputError unless the file is complete.
+    """Run a browser that converts the page (HTML) to a file; raise InputError unless the file is complete.
 
-    `kind`: name of the file's kind, for the message.
+    `target`: the file that the browser writes; `options`: those that tell it to do so; `kind`: name of the kind of
+    file, for the error message; `is_complete`: function that tests the bytes of the file.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"

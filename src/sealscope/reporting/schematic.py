@@ -1,4 +1,4 @@
-"""Draw the actuator as a labelled schematic after ISO 1219, with the rig's rods, throttles, make-up or valve."""
+"""Draw the actuator as a schematic with symbols of ISO 1219: cylinder, rods, throttles, make-up and servo valve."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sealscope.parameters import Rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages, template
 
-#: Label -> parameter of the rig, display unit, value of that unit in SI.
+#: By label in the drawing: parameter of the rig, its display unit, and the size of that unit in SI.
 _VALUES = {
     "A_A": ("cylinder.A_A", "mm²", 1e-6),
     "A_B": ("cylinder.A_B", "mm²", 1e-6),
@@ -28,11 +28,13 @@ _BORE, _ROD = 78.0, 18.0
 
 
 class Circuit(NamedTuple):
-    """The drawn parts of a machine.
+    """The parts of a machine that the schematic shows.
 
-    `cylinder`: name of its kind; `rods`: sides with a rod, "A", "B" or "AB"; `rod`: height of the rod in the drawing,
-    for a single rod sqrt(1 - A_small / A_large) of the bore; `throttles`, `make_up`, `bypass`: True if the lines have
-    them; `valve`: True if a servo valve drives the cylinder; `values`: label -> value with unit, "" if not known.
+    `cylinder`: kind of the cylinder, such as "double-rod cylinder"; `rods`: sides with a rod, "A", "B" or "AB";
+    `rod`: height of the drawn rod, for a single rod sqrt(1 - A_small / A_large) of the drawn bore; `throttles`,
+    `make_up`, `bypass`: True if the machine has throttles in its lines, make-up valves, or a bypass with a flow
+    meter; `valve`: True if a servo valve drives the cylinder; `values`: by label, the value with its unit, "" if it
+    is not known.
     """
 
     cylinder: str
@@ -46,10 +48,11 @@ class Circuit(NamedTuple):
 
 
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
-    """Choose the parts to draw; without a rig only the parts of every pump-controlled actuator are drawn.
+    """Choose the parts of a machine to draw in the schematic.
 
-    `recorded`: the recorded channels; with `q_leak` a bypass is drawn. `machine`: areas and displacement of a machine
-    without a rig.
+    `rig`: the rig, None if it is not known: then only the parts that every pump-controlled actuator has are drawn;
+    `recorded`: recorded channels; with `q_leak` among them a bypass is drawn; `machine`: areas and displacement that
+    are known without a rig, None for none.
     """
     bypass, values = "q_leak" in recorded, dict.fromkeys(_VALUES, "")
     if rig is None:
@@ -71,7 +74,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 
 
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
-    """Return (kind, sides with a rod, height of the drawn rod) of a cylinder.
+    """Determine the kind of a cylinder, its sides with a rod ("A", "B" or "AB"), and the height of the drawn rod.
 
     `areas`: piston areas of the sides A and B, in any common unit.
     """
@@ -83,12 +86,12 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format an SI value in `unit` with four digits; `scale`: size of the unit in SI."""
+    """Format a value in SI as a number with four significant digits and `unit`; `scale`: size of this unit in SI."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 
 def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> str:
-    """Draw the machine as SVG, with its sensors, their columns in the file, and the leak past the piston."""
+    """Draw the schematic of a machine as SVG, with its sensors, their columns in the file, and the leak if any."""
     leaking = diagnosis.verdict == "leak"
     amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
     return template.render(
@@ -104,7 +107,7 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
 
 
 def channel_columns(recording: Recording) -> dict[str, str]:
-    """Return channel -> column of the file; {} if the recording does not state them."""
+    """Return the name of each channel's column in the file, by channel; {} if the recording does not state them."""
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

@@ -17,12 +17,14 @@ _MISSING = -32768
 
 @dataclass(frozen=True)
 class DrawnTimes:
-    """The times at which all series of a recording are drawn.
+    """The times at which the channels of a recording are drawn.
 
-    `t`: (m,) [s], never decreasing; `starts`, `stops`: (k,) first and last (exclusive) sample of each bucket; `width`:
-    samples in a full bucket, 1 if all samples are drawn; `fine`: samples that are all drawn at any `width`; `breaks`:
-    points at which the line is broken by a gap in time; `by_sample`: True if the time stamps are out of order; `t` is
-    then the number of the sample over the rate.
+    Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are
+    drawn. `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): first sample of each
+    bucket, and the one after its last; `width`: number of samples in a full bucket, 1 if all samples are drawn;
+    `fine`: range of samples that are all drawn, whatever the width; `breaks`: indices at which a point is inserted to
+    interrupt the line at a gap in time; `by_sample`: True if the time stamps do not increase; the times are then the
+    number of the sample over the sampling rate.
     """
 
     t: Array
@@ -34,9 +36,10 @@ class DrawnTimes:
     by_sample: bool
 
     def reduce(self, values: Array) -> Array:
-        """Reduce values (n,) to minimum and maximum of each bucket, (m,), in an order that follows the trend.
+        """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        A bucket of one sample gives one point. Buckets without finite samples and gaps give NaN, which breaks the line.
+        A bucket gives its minimum and its maximum, the minimum first if its values rise; a bucket of one sample gives
+        one point. Buckets without finite samples give NaN, as do gaps in time, which interrupts the line.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -47,16 +50,17 @@ class DrawnTimes:
 
 
 def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
-    """Interleave the first and second points of the buckets; a bucket of one sample has no second point."""
+    """Interleave the first and second points (k,) of k buckets; a bucket with the size 1 has no second point."""
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
     return np.asarray(pairs[is_point])
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Return an increasing time axis [s], and True if it replaces time stamps that do not increase.
+    """Choose an increasing time axis (n,) [s] for a recording with the time stamps `t` (n,) [s].
 
-    The replacement is the number of the sample over the rate.
+    If they do not increase, the time axis is the number of the sample over the sampling rate [Hz], and the second
+    result is True; otherwise they are returned, with False.
     """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
@@ -65,12 +69,12 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
 def choose_drawn_times(
     t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0
 ) -> DrawnTimes:
-    """Choose the samples that a chart draws: two per bucket, about `points` in all.
+    """Choose the times at which a chart draws a recording: two for each bucket of samples, about `points` in all.
 
-    All samples near `near` [s] are drawn in addition, none if that is None. `t`: time stamps (n,) [s]; `rate`: nominal
-    rate [Hz]; `near_samples`: number of samples that are all drawn. Buckets have equal numbers of samples, so that a
-    drawn peak is at most one bucket away from its true time. A gap in time starts a new bucket, and an additional point
-    there interrupts the line; only the longest gaps if there are many.
+    `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which `near_samples`
+    samples are all drawn, None for no such time. Buckets have equal numbers of samples, so a drawn peak is at most
+    one bucket away from its true time. A gap in time starts a new bucket, and an additional point there interrupts
+    the line; if there are many gaps, only the longest ones do.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -93,10 +97,10 @@ def choose_drawn_times(
 
 
 def encode_values(values: Array) -> dict[str, Any]:
-    """Encode values as base64 of 16-bit integers; NaN is -32768.
+    """Encode values as base64 text of 16-bit integers, for the script of the page.
 
-    The integers q are a grid of 65 534 steps from minimum to maximum, decoded as `low + (q + 32767) * step`; minimum
-    and maximum are exact to rounding.
+    The integers q are a grid of 65 534 steps from the minimum `low` to the maximum, and are decoded as `low + (q +
+    32767) * step`; q = -32768 stands for a value that is not finite. Returns `low`, `step` and the text `q`.
     """
     is_finite = np.isfinite(values)
     low, high = (float(values[is_finite].min()), float(values[is_finite].max())) if is_finite.any() else (0.0, 0.0)
@@ -110,5 +114,5 @@ def encode_values(values: Array) -> dict[str, Any]:
 
 
 def encode_times(t: Array) -> str:
-    """Encode times [s] as base64 of little-endian doubles."""
+    """Encode times [s] as base64 text of little-endian doubles, for the script of the page."""
     return b64encode(np.ascontiguousarray(t, dtype="<f8").tobytes()).decode()

@@ -1,4 +1,4 @@
-"""Render and write the pages; each is one HTML file that loads nothing from outside."""
+"""Render pages from templates and write them; each page is one HTML file that loads nothing from outside."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 @cache
 def _environment(package: str) -> jinja2.Environment:
-    """Build the environment for the templates of a package, which may use those of this package."""
+    """Build the jinja2 environment for the templates of a package, which may include those of this package."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -48,10 +48,11 @@ def _environment(package: str) -> jinja2.Environment:
 def render(
     template: str, *, package: str = _PACKAGE, chart_data: Any = None, scripts: Sequence[str] = (), **context: Any
 ) -> str:
-    """Render a template of a package with `context`.
+    """Render the template called `template` as the text of a page, with the values `context`.
 
-    `scripts`: files of the package that the page runs; `chart_data`: plain JSON values of charts, whose scripts are
-    then added. Control characters, which may come from names and descriptions in files, are replaced.
+    `package`: package of the template; `scripts`: files of it with scripts that the page runs; `chart_data`: plain
+    JSON values of charts, for which the scripts that draw them are added, None for none. Control characters, which
+    may come from names and descriptions in files, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -60,7 +61,7 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file of `package`, else of this package, as text that templates do not escape."""
+    """Read a file of `package`, or of this package if it is not there, as text that templates do not escape."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -68,14 +69,14 @@ def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
 
 
 def _script_hash(code: str) -> Markup:
-    """Compute the hash of a script for a content security policy."""
+    """Compute the hash of a script, by which a page's content security policy allows it."""
     from markupsafe import Markup
 
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
 
 
 def _script_json(value: Any) -> Markup:
-    """Format plain JSON values for an element `script`, with <, > and & escaped."""
+    """Format plain values as JSON inside an HTML element `script`, with <, > and & escaped."""
     from markupsafe import Markup
 
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
@@ -83,7 +84,10 @@ def _script_json(value: Any) -> Markup:
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
-    """Convert the path of a page, or with `card` of its picture, to a Path; raise InputError for another suffix."""
+    """Convert the path of a page to a Path, and check its suffix; raise InputError for any other suffix.
+
+    A page ends in .html, .htm or .pdf, and if `card` is True, also in .png, its picture.
+    """
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
@@ -105,7 +109,7 @@ def write(path: str | os.PathLike[str], page: str) -> Path:
 
 
 def _installed_version() -> str:
-    """Return the version of the installed package for a page's foot."""
+    """Return the version of the installed package, which is shown at the foot of a page."""
     try:
         return metadata.version("sealscope")
     except metadata.PackageNotFoundError:

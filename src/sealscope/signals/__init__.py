@@ -1,5 +1,5 @@
-"""Wavelet details and windowed RMS, of whole recordings and of live blocks.
+"""Wavelet details and RMS over sliding windows, of complete recordings and of live signals.
 
-`details.details` transforms a recording's channel, `streams.DetailStream` the same channel block by block;
-`windows.windowed_rms` and `windows.RmsStream` are the same pair for the RMS of the details.
+`details.details` transforms a complete signal, and `streams.DetailStream` a live signal block by block.
+`windows.windowed_rms` and `windows.RmsStream` compute the RMS of the details in the same two ways.
 """

@@ -31,10 +31,18 @@ Edge = Literal["symmetric", "periodic", "reflect", "constant", "zero", "smooth",
 
 @dataclass(frozen=True, eq=False)
 class Details:
-    """The details of one signal, each level with the signal's length and unit.
+    """The wavelet details of one signal; each level has the signal's length and unit.
 
-    `values`: (levels, n), row 0 is d_1; `approximation`: (n,), the rest below the deepest level; `edges`: (levels, 2),
-    how many samples at the beginning and end of each level depend on padding. ``details[3]`` is d_3.
+    ``details[3]`` is d_3.
+
+    Attributes
+    ----------
+    values : array, (levels, n)
+        The details; row 0 is d_1.
+    approximation : array, (n,)
+        The part of the signal below the deepest level.
+    edges : array, (levels, 2)
+        Number of samples at the beginning and at the end of each level that depend on padding.
     """
 
     values: Array
@@ -43,35 +51,44 @@ class Details:
 
     @property
     def levels(self) -> int:
-        """The number of levels."""
+        """Number of levels."""
         return int(self.values.shape[0])
 
     def __getitem__(self, level: int) -> Array:
-        """Return the detail of a level, (n,), including the samples at either end that depend on padding."""
+        """Return the detail of a level, (n,), including the samples at both ends that depend on padding.
+
+        Raises InputError if there is no such level; the first one is 1.
+        """
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
         return np.asarray(self.values[level - 1])
 
     def product(self) -> Array:
-        """Compute the sample product d_3 d_4, (n,) [unit^2], edges included: the thesis's d3d4."""
+        """Compute the product d_3 d_4 sample by sample, (n,) [unit^2], the thesis's d3d4.
+
+        The samples at both ends that depend on padding are included.
+        """
         return self[3] * self[4]
 
     def quantities(self) -> Array:
-        """Stack d1..d4 [unit] and d3d4 [unit^2] of details to level 4, (5, n), edges included (`QUANTITIES`)."""
+        """Stack d1, d2, d3, d4 [unit] and d3d4 [unit^2] as the rows of an array (5, n), for details with four levels.
+
+        The samples at both ends that depend on padding are included.
+        """
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of samples that do not depend on padding at a level; None: at any level."""
+        """Return the slice of samples that do not depend on padding at a level; None stands for all levels."""
         before, after = self.edges[(level or self.levels) - 1]
         return slice(int(before), self.values.shape[1] - int(after))
 
 
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
-    """Count the samples at the beginning and end of each level that depend on padding, (levels, 2).
+    """Count the samples at the beginning and at the end of each level that depend on padding, (levels, 2).
 
-    Stationary: the filters' reach. Decimated: from sample ``2^j ceil(2 before_j / 2^j) - before_j`` on, where the first
-    coefficient without padding begins. Reconstructed: analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to
-    both sides.
+    The stationary transform has the filters' reach. The decimated one depends on padding up to sample ``2^j ceil(2
+    before_j / 2^j) - before_j``, where the first coefficient without padding begins. In the reconstructed one
+    analysis and synthesis together reach ``(L - 1)(2^j - 1)`` to both sides, with L taps.
     """
     _check_choice(transform, Transform, "transform")
     stationary = reach(wavelet, levels)
@@ -86,7 +103,10 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute the length of the shortest signal with a sample free of padding in each level; 226 for db8 to level 4."""
+    """Compute the length of the shortest signal that has a sample independent of padding in each level.
+
+    It is 226 for db8 to level 4.
+    """
     return int(edge_samples(wavelet, levels, transform)[-1].sum()) + 1
 
 
@@ -98,15 +118,15 @@ def details(
     transform: Transform = "stationary",
     edge: Edge = "symmetric",
 ) -> Details:
-    """Compute the wavelet details d_1 .. d_levels of `signal`, (n,), all at its length and on its time base.
+    """Compute the wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 
-    ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, a_j the same with h (stationary; `reach` gives
-    the support of each level). `edge`: how the signal is padded beyond its ends; reports omit the samples that depend
-    on it (`Details.inside`).
+    The stationary details are ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, and a_j is the
+    same with h in place of g (`reach` gives the support of each level). `edge` is the way in which the signal is
+    padded beyond its ends; `Details.inside` excludes the samples that depend on it.
 
-    Alignment, that of PyWavelets: the energy of an event is 5, 7, 9 and 13 samples early in db8's d_1 .. d_4 (5 in
-    every decimated level, 0 in every reconstructed one). Delay: a causal system knows d_j of sample n at sample
-    ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
+    The alignment is that of PyWavelets: the energy of an event appears 5, 7, 9 and 13 samples early in db8's d_1 ..
+    d_4 (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at
+    sample ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
     Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, and for an
     unknown wavelet, transform or edge. Source: "Understanding Effect and Diagnosis of Internal Leakage in Hydrostatic
@@ -129,12 +149,15 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares of the `QUANTITIES` between consecutive samples `bounds`, (len(bounds) - 1, 5)."""
+    """Compute the mean square of each of the five `QUANTITIES` between consecutive sample numbers, (k, 5).
+
+    `bounds` (k + 1,) are the sample numbers at which segments begin and end.
+    """
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
-    """Compute the means of rows (r, n) between consecutive samples `bounds`, (r, len(bounds) - 1)."""
+    """Compute the means (r, k) of rows of `values` (r, n) between consecutive sample numbers `bounds` (k + 1,)."""
     edges = np.asarray(bounds)
     sums = np.add.reduceat(values, edges[:-1], axis=1)
     sums[:, -1] = values[:, edges[-2] : edges[-1]].sum(axis=1)  # reduceat sums to the end of the row
@@ -142,14 +165,17 @@ def segment_means(values: Array, bounds: ArrayLike) -> Array:
 
 
 def _check_choice(value: object, choices: Any, name: str) -> None:
-    """Raise InputError unless `value` is one of the `choices` of a Literal."""
+    """Check that `value` is one of the values of the Literal type `choices`; raise InputError otherwise.
+
+    `name` is the name of the argument in the error message.
+    """
     allowed = get_args(choices)
     if value not in allowed:
         raise InputError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
 
 
 def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute (details (levels, n), approximation (n,)) by the a trous transform."""
+    """Compute stationary details (levels, n) and approximation (n,) of a signal by the a trous transform."""
     import pywt
 
     before, after = (int(samples) for samples in reach(wavelet.name, levels)[-1])
@@ -162,14 +188,17 @@ def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute (details (levels, n), approximation (n,)) by Mallat's transform, each coefficient repeated."""
+    """Compute decimated details (levels, n) and approximation (n,) of a signal by Mallat's transform.
+
+    Each coefficient is repeated to the length of the signal.
+    """
     import pywt
 
     approximation, *deepest_first = pywt.wavedec(x, wavelet, mode=edge, level=levels)
     before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]  # by level, from 0
 
     def hold_coefficients(coefficients: Array, level: int) -> Array:
-        """Repeat each coefficient 2^level times and remove the padding."""
+        """Repeat each coefficient of a level 2^level times, and remove the padding."""
         # coefficient o is the stationary detail at sample 2^j o - before_j
         return np.repeat(coefficients, 2**level)[before[level] : before[level] + x.size]
 
@@ -180,13 +209,16 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
 
 
 def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute (details (levels, n), approximation (n,)) by inverting the transform one level at a time."""
+    """Compute reconstructed details (levels, n) and approximation (n,) of a signal.
+
+    The transform is inverted with the coefficients of one level at a time.
+    """
     import pywt
 
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
     def reconstruct_level(index: int) -> Array:
-        """Invert the transform with all coefficients but those at `index` set to zero."""
+        """Invert the transform with all coefficients set to zero except those at `index`."""
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
         return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
 

@@ -1,4 +1,4 @@
-"""A wavelet's filters and their reach in each level, and checks of numeric arguments."""
+"""The filters of a wavelet and their reach in each level, and checks of numeric arguments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_LEVELS = 12
 
 @cache
 def discrete_wavelet(name: str) -> Any:
-    """Load PyWavelets' discrete wavelet with this name; raise InputError for an unknown one."""
+    """Load the discrete wavelet of PyWavelets with this name; raise InputError if there is none."""
     import pywt
 
     if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
@@ -31,27 +31,28 @@ def discrete_wavelet(name: str) -> Any:
 
 
 def decomposition_filters(wavelet: str = "db8") -> tuple[Array, Array]:
-    """Return the low-pass and high-pass taps h, g of the analysis, in the order of a causal convolution.
+    """Return the low-pass filter h and the high-pass filter g that split a signal, each (taps,).
 
-    ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, the same with g for d_j. Each of shape (taps,); for an orthogonal
-    wavelet both have unit l2 norm. Source: Daubechies, Ten Lectures on Wavelets (1992), Table 6.1, in PyWavelets.
+    The taps are in the order of a causal convolution: ``a_j[n] = sum_k h[k] a_(j-1)[n - 2^(j-1) k]``, and the same
+    with g for d_j. For an orthogonal wavelet both filters have unit l2 norm. Source: Daubechies, Ten Lectures on
+    Wavelets (1992), Table 6.1, in PyWavelets.
     """
     filters = discrete_wavelet(wavelet)
     return np.array(filters.dec_lo, dtype=np.float64), np.array(filters.dec_hi, dtype=np.float64)
 
 
 def require_levels(levels: int) -> int:
-    """Convert `levels` to an int from 1 to MAX_LEVELS; raise InputError for anything else."""
+    """Return `levels` as an int if it is a whole number from 1 to 12 (`MAX_LEVELS`); raise InputError otherwise."""
     if isinstance(levels, bool) or not isinstance(levels, (int, np.integer)) or not 1 <= levels <= MAX_LEVELS:
         raise InputError(f"levels must be a whole number from 1 to {MAX_LEVELS}, got {levels!r}")
     return int(levels)
 
 
 def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
-    """Count the samples before and after a sample that its detail depends on, in each level, (levels, 2).
+    """Count for each level the samples before and after a sample that influence its detail, (levels, 2).
 
-    ``before_j = (L/2 - 1)(2^j - 1)``, ``after_j = (L/2)(2^j - 1)`` with L taps, PyWavelets' alignment. For db8: 7, 21,
-    49, 105 before and 8, 24, 56, 120 after.
+    ``before_j = (L/2 - 1)(2^j - 1)`` and ``after_j = (L/2)(2^j - 1)`` with L taps, in the alignment of PyWavelets.
+    For db8: 7, 21, 49, 105 before and 8, 24, 56, 120 after.
     """
     half_length = int(discrete_wavelet(wavelet).dec_len) // 2
     total_dilation = 2 ** np.arange(1, require_levels(levels) + 1, dtype=np.int64) - 1  # of this level and those above
@@ -59,7 +60,11 @@ def reach(wavelet: str = "db8", levels: int = 4) -> IntArray:
 
 
 def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = None) -> Array:
-    """Convert `values` to doubles; raise InputError unless they are real, finite and of `ndim` dimensions, if given."""
+    """Convert `values` to an array of doubles; raise InputError unless they are real and finite.
+
+    If `ndim` is given, the array must have this number of dimensions; otherwise it must have at least one. `name`
+    names the values in the error message.
+    """
     try:
         array = np.asarray(values)
         if np.iscomplexobj(array) or array.dtype.kind in "SUMm":
@@ -82,7 +87,10 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
 
 
 def require_positive_int(value: object, name: str, unit: str = "") -> int:
-    """Convert `value` to an int; raise InputError unless it is a whole number of 1 or more."""
+    """Return `value` as an int if it is a whole number of 1 or more; raise InputError otherwise.
+
+    `name` and `unit` name the value in the error message.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
     return int(value)

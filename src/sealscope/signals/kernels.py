@@ -1,8 +1,8 @@
-"""Compiled a trous filters over many signals: eight to a vector register, with a fixed order of summation.
+"""Compiled wavelet filters for many live signals, of which eight share a vector register.
 
-Each output sums its taps in the same order, whether it is computed with seven neighbours or alone, so that blocks of
-any size give identical results. Products and sums may be contracted (see `physics.lanes`): the values agree with
-`details.details`, by PyWavelets, to rounding.
+Each output sums its taps in the same order, whether it is computed together with seven neighbours or alone. Blocks of
+any size therefore give identical results. Products and sums may be contracted (see `physics.lanes`): the values agree
+with `details.details`, by PyWavelets, to rounding.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ CHUNK = 64
 def filter_rows(
     rows: Array, first: int, stride: int, dilation: int, taps: Array, tap: int, n_taps: int, out: Array, to: int, n: int
 ) -> None:
-    """Filter eight signals: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
+    """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
-    i < n, k < n_taps. The second axis of `rows`, `taps` and `out` holds the signals; eight outputs are computed at a
-    time.
+    i runs from 0 to n - 1, and k from 0 to n_taps - 1. The second axis of `rows`, `taps` and `out` holds the eight
+    signals. Eight outputs are computed at a time.
     """
     i = 0
     while i + 8 <= n:
@@ -61,12 +61,13 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Compute the wavelet details of `n` new rows of one channel, a group of WIDTH signals.
+    """Compute the wavelet details of `n` new samples of one channel for a group of eight signals (WIDTH).
 
-    `low`, `high` (taps, WIDTH): low-pass and high-pass filter. `buffers` holds for each level of the channel a buffer
-    of `capacity` rows, stacked from row `start` on; the new rows begin at row `first` of the first buffer. High-pass
-    filtering a level's buffer gives its detail, low-pass filtering fills the next buffer. Shallow levels are delayed
-    like the deepest, which aligns all levels of a row of `details` (levels, CHUNK, WIDTH) to one sample.
+    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters. `buffers` has a buffer of `capacity` rows
+    for each level of the channel, stacked from row `start` on; the new samples begin at row `first` of the first
+    buffer. High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills the next buffer.
+    Shallow levels are delayed like the deepest one, so that all levels in a row of `details` (levels, CHUNK, WIDTH)
+    belong to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -80,9 +81,9 @@ def split_levels(
 
 @contracted
 def move_history(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
-    """Move the last `history` of the `fill` rows in use to the front of each of a channel's buffers.
+    """Move the last `history` of the `fill` used rows to the front of each buffer of one channel.
 
-    `start`: row of the channel's first buffer; each has `capacity` rows.
+    The channel's first buffer begins at row `start`, and each buffer has `capacity` rows.
     """
     for level in range(levels):
         row = start + level * capacity
@@ -102,11 +103,12 @@ def advance_details(
     details: Array,
     out: Array,
 ) -> int:
-    """Filter `block` (channels, actuators, n) into `out` (channels, actuators, levels, n); return the new fill.
+    """Compute the wavelet details of the next block of all signals, and return the new fill of the buffers.
 
-    `groups`: first and last + 1 of the groups of lanes to filter; `buffers`: (groups, channels, levels, capacity,
-    WIDTH), whose first `fill` rows of the capacity are in use; the last `history` of them are inputs of later outputs;
-    `details`: (levels, CHUNK, WIDTH), workspace.
+    `block` (channels, actuators, n) are the samples, and `out` (channels, actuators, levels, n) receives the details.
+    `groups` are the first and the last + 1 of the groups of eight signals to filter. `buffers` (groups, channels,
+    levels, capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`
+    and `high` (taps, WIDTH) are the filters, and `details` (levels, CHUNK, WIDTH) is a work array.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]

@@ -1,8 +1,8 @@
 """Stationary wavelet details of live signals, block by block and in bounded memory.
 
 One call filters a block of all signals and allocates nothing but views. Eight signals share a vector register
-(`kernels`), so that small blocks cost little more than large ones. Results depend only on the samples, not on how they
-were divided into blocks.
+(`kernels`), so that small blocks cost little more than large ones. Results depend only on the samples, not on how
+they were divided into blocks.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 class DetailStream:
     """Stationary wavelet details of live signals, block by block.
 
-    The streaming counterpart of ``details(..., transform="stationary")``, equal to it to rounding. A causal filter
-    knows level j of a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with
-    the delay of the deepest one, so that a column has the levels of one sample: column i since the beginning is the
-    detail of sample ``i - delay``. The first `settling` columns depend on the zeros before the beginning; the next
-    column is that of sample `first`.
+    The results equal those of ``details(..., transform="stationary")`` to rounding. A causal filter knows level j of
+    a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with the delay of
+    the deepest one, so that a column has all levels of one sample: column i, counted from the beginning of the
+    stream, is the detail of sample ``i - delay``. The first `settling` columns depend on the zeros before the
+    beginning. The next column is that of sample `first`.
 
     Parameters
     ----------
@@ -104,11 +104,11 @@ class DetailStream:
         Parameters
         ----------
         block : array_like
-            Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) affects its own signal
-            alone, for `settling` columns after it.
+            Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) affects only its own
+            signal, and that for `settling` columns after it.
         out : ndarray, optional
-            C-contiguous doubles in the shape of the result, to be written into. For a block of C-contiguous doubles
-            nothing else is allocated.
+            Array to write the result into: C-contiguous doubles in the shape of the result. If the block is of
+            C-contiguous doubles, too, no other memory is allocated.
 
         Returns
         -------
@@ -144,7 +144,11 @@ class DetailStream:
         target = out.reshape(*self._shape_2d, self.levels, n)
 
         def filter_part(part: tuple[int, int], work: Array) -> int:
-            """Filter the block for one part of the groups, in one thread."""
+            """Filter the block for a part of the groups of eight signals, in one thread.
+
+            `part` are the first and the last + 1 group, and `work` is the thread's work array. Returns the new fill
+            of the buffers.
+            """
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
         run = map if len(self._parts) == 1 else self._pool.map
@@ -154,13 +158,16 @@ class DetailStream:
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
-        """Pool of threads, one for each part."""
+        """Pool with one thread for each part of the signals."""
         from concurrent.futures import ThreadPoolExecutor
 
         return ThreadPoolExecutor(len(self._parts))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the stream: settings, number of samples, and the `history` of the filters."""
+        """Return the state of the stream as plain values and arrays, from which `from_state` continues.
+
+        `history` holds the last inputs of the filters.
+        """
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
         return {
             "channels": self.channels,
@@ -172,7 +179,10 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Continue the stream of a `state_dict` with identical results; raise InputError for an invalid state."""
+        """Make a stream that continues from a saved `state_dict`, with identical results.
+
+        Raises InputError if it is not valid.
+        """
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels
         stream = cls(table, levels, wavelet=wavelet, threads=threads)
@@ -187,7 +197,10 @@ class DetailStream:
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> Array:
-    """Make an array of zeros that begins at a cache line (64 bytes), so that no row of 8 doubles crosses two."""
+    """Make an array of zeros that begins at a cache line of 64 bytes.
+
+    No row of 8 doubles is then divided between two cache lines.
+    """
     values = np.zeros(math.prod(shape) + 8)  # 8 doubles of 8 bytes are one cache line
     skip = -(values.ctypes.data // 8) % 8
     return values[skip : skip + math.prod(shape)].reshape(shape)

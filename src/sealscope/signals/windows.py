@@ -1,9 +1,9 @@
 """RMS over sliding windows, of a complete series and of a stream, with identical results.
 
 The windows lie over the coefficients of the transformed signal (by default 1000 samples, 500 apart: "Understanding
-Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over pieces
-of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts nothing, so
-that long or drifting series lose no precision.
+Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over
+pieces of gcd(size, step) samples, and each window adds its pieces in order. Unlike a running sum, this subtracts
+nothing, so that long or drifting series lose no precision.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ WINDOW_STEP = 500
 
 
 class WindowedRms(NamedTuple):
-    """RMS of sliding windows.
+    """RMS of sliding windows over a series.
 
-    `ends` (w,): number of the sample just after each window; `rms` (..., w), in the series' unit. A window of `size`
-    samples covers ends - size .. ends - 1; its centre is at ``(ends - size / 2) / rate`` seconds.
+    `rms` (..., w) are the values in the series' unit, and `ends` (w,) the number of the sample just after each
+    window. A window of `size` samples covers the samples ends - size .. ends - 1; its centre is at ``(ends - size /
+    2) / rate`` seconds.
     """
 
     ends: IntArray
@@ -35,9 +36,10 @@ class WindowedRms(NamedTuple):
 
 
 def rms(series: ArrayLike) -> Any:
-    """Compute ``sqrt(mean(x^2))`` over the last axis [unit of x]; a float for a single series, (...,) for several.
+    """Compute the root mean square ``sqrt(mean(x^2))`` over the last axis of an array (..., n), in its unit.
 
-    Raises InputError for an empty series or one that is not finite.
+    Returns a float for a single series, and an array (...,) for several. Raises InputError for an empty series or one
+    that is not finite.
     """
     x = require_finite(series, "series")
     if x.shape[-1] == 0:
@@ -49,11 +51,11 @@ def rms(series: ArrayLike) -> Any:
 def windowed_rms(
     series: ArrayLike | Details, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, first: int = 0
 ) -> WindowedRms:
-    """Compute the RMS of windows of `size` samples, every `step` samples, over the last axis of (..., n).
+    """Compute the RMS of a series (..., n) in windows of `size` samples that begin every `step` samples.
 
-    `first`: sample number of the first value, which is added to `ends`. For `Details`, all levels are used, samples
-    that depend on padding are left out, and `ends` are sample numbers of the signal. A series shorter than `size` gives
-    no window.
+    `first` is the number of the first sample, which is added to `ends` of the result. For `Details`, all levels are
+    used, samples that depend on padding are left out, and `ends` are sample numbers of the signal. A series shorter
+    than `size` gives no window.
 
     Raises InputError for a series that is not finite, and for a size or a step below 1.
     """
@@ -64,15 +66,15 @@ def windowed_rms(
 
 
 class RmsStream:
-    """RMS over sliding windows of live series: identical to `windowed_rms`, from blocks of any size.
+    """RMS over sliding windows of live series; identical to `windowed_rms`, for blocks of any size.
 
-    After a `DetailStream` use its `settling` as `skip` and its `first`: the windows are then those of
-    ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
+    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`: the windows are then
+    those of ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
 
     Parameters
     ----------
     size, step : int
-        Samples of a window, and from one window to the next.
+        Number of samples in a window, and from the start of one window to that of the next.
     skip : int, default 0
         Number of values to omit at the beginning of the stream.
     first : int, default 0
@@ -110,17 +112,17 @@ class RmsStream:
         Parameters
         ----------
         block : array_like
-            Values (..., n); the leading axes are those of the first block.
+            Values (..., n); the leading axes must have the same lengths in all blocks.
 
         Returns
         -------
         WindowedRms
-            `ends` (w,), the sample one past each window's last, and `rms` (..., w).
+            `ends` (w,), the number of the sample just after each window, and `rms` (..., w).
 
         Raises
         ------
         InputError
-            When the leading axes differ from the first block's.
+            If the leading axes differ from those of the first block.
         """
         x = np.asarray(block, dtype=np.float64)
         if x.ndim == 0:
@@ -149,7 +151,7 @@ class RmsStream:
         return WindowedRms(ends, values)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the stream as numbers and arrays; `from_state` continues from it."""
+        """Return the state of the stream as numbers and arrays, from which `from_state` continues."""
         return {
             "size": self.size,
             "step": self.step,
@@ -162,7 +164,7 @@ class RmsStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Continue the stream of a `state_dict`; raise InputError for an invalid state."""
+        """Make a stream that continues from a saved `state_dict`; raise InputError if it is not valid."""
         size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
         stream = cls(size, step, skip=require_count(state, "skip"))
         stream._next_end, stream._n_unused = require_count(state, "next_end"), require_count(state, "ahead")
@@ -177,14 +179,18 @@ class RmsStream:
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Compute the sum of squares of each complete piece, (..., n // piece), by pairwise summation."""
+    """Compute the sum of squares of each complete piece of `piece` samples of `x` (..., n), (..., n // piece)."""
     n_pieces = x.shape[-1] // piece
     in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
     return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """Compute the RMS of each complete window from its pieces' sums of squares (..., pieces), added in order."""
+    """Compute the RMS of each complete window from the sums of squares of its pieces.
+
+    `sums` (..., pieces) are added in order. `size` and `step` are the samples of a window and from one window to the
+    next. Returns (..., windows).
+    """
     piece = math.gcd(size, step)
     per_window, per_step = size // piece, step // piece  # pieces
     n_windows = max(0, (sums.shape[-1] - per_window) // per_step + 1)

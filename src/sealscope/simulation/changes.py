@@ -1,8 +1,8 @@
 """Changes of machine and instruments within a run.
 
-An `Effect` changes one number of the compiled laws or one parameter of an instrument over time; a `Hold` repeats a
-reading. Drifts (here) and faults (`faults`) list their effects; the solver takes numbers as constant within short
-blocks.
+An `Effect` changes one number of the compiled laws or one parameter of an instrument over time; a `Hold` makes a
+sensor repeat a reading. Drifts (in this module) and faults (in `faults`) are lists of effects. The solver takes the
+machine's numbers as constant within short blocks of time.
 """
 
 from __future__ import annotations
@@ -52,8 +52,9 @@ class Effect:
 
     `field`: name of a number in `RigNumbers`, or dotted name of an instrument's parameter; `change(t)`: addend (if
     `additive`) or factor at times t [s]. Several effects on one parameter give (value + sum of addends) x product of
-    factors. `max_change`: largest change of it within a block of constant parameters; `breakpoints`: times [s] of
-    its jumps and changes of slope; `min_block` [s]: shortest block.
+    factors. The solver takes parameters as constant within blocks of time: `max_change` is the largest change of
+    `change` within a block, `min_block` [s] the shortest block, `breakpoints` are the times [s] at which `change`
+    jumps or changes its slope.
     """
 
     field: str
@@ -65,12 +66,15 @@ class Effect:
 
     @property
     def changes_instrument(self) -> bool:
-        """True if the effect changes an instrument, False if the machine."""
+        """True if the effect changes an instrument, False if it changes the machine."""
         return self.field.startswith("sensors.")
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute the parameter `field` at times t [s] from its value in the rig and all `effects` on that field."""
+    """Compute the parameter `field` at times t [s] from its value in the rig.
+
+    `effects`: all changes within the run; those of other parameters are ignored.
+    """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
         if effect.field == field:
@@ -79,21 +83,22 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute the model parameters that the effects change, by name, at times t (n,) [s].
+    """Compute all model parameters that the effects change, at times t (n,) [s].
 
-    `base`: the model's parameters without effects.
+    Returns an array (n,) by name of the parameter. `base`: the model's parameters without effects.
     """
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
 def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
-    """Divide a run into n blocks of constant parameters; return their bounds (n + 1,) as output indices.
+    """Divide a run into blocks within which the solver takes all parameters as constant; return their bounds.
 
-    `n_out`: number of outputs, at `rate` [Hz].
+    The run has `n_out` outputs at `rate` [Hz]. The bounds (blocks + 1,) are indices of outputs, from 0 to `n_out`.
 
-    A block is at most `LONGEST_BLOCK` long, and so short (but not below an effect's `min_block`) that no effect changes
-    by more than its `max_change`. Breakpoints fall on bounds, to within one output interval at `rate` [Hz].
+    A block is at most `LONGEST_BLOCK` long, and short enough that no effect changes by more than its `max_change`
+    within it, but not shorter than the effect's `min_block`. Breakpoints of effects fall on bounds, to within one
+    output interval.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -113,10 +118,11 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the parameter sets for which the solver's step must be short enough.
+    """Collect the sets of model parameters for which the solver's step must be short enough.
 
-    These are `base`, and the parameters just before and after each breakpoint of a fast effect, such as a valve that
-    switches (`min_block` below `SHORTEST_BLOCK`). All other effects change the parameters too little.
+    These are `base`, the parameters without effects, and those just before and after each breakpoint of a fast
+    effect, such as a valve that switches (`min_block` below `SHORTEST_BLOCK`). All other effects change the
+    parameters too little to matter.
     """
     fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
@@ -127,14 +133,15 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
 
 
 class Schedule:
-    """The model's parameters over a run: `bounds` (n + 1,) of blocks as output indices, and `numbers` of each block.
+    """The model's parameters over a run, block by block.
 
-    The blocks are those of `block_bounds`, merged where neighbours have equal parameters. Within a block a parameter
-    has its value at the middle.
+    `bounds` (n + 1,): bounds of the n blocks as output indices; `numbers`: the parameters in each block. The blocks
+    are those of `block_bounds`, merged where neighbours have equal parameters. Within a block a parameter has the
+    value that it has at the block's middle.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
-        """Apply the effects to the parameters `base`, for `n_out` outputs at `rate` [Hz]."""
+        """Apply `effects` to the model parameters `base`, for a run of `n_out` outputs at `rate` [Hz]."""
         self.bounds = block_bounds(effects, n_out, rate)
         self.numbers = [base]
         if not effects:
@@ -155,7 +162,7 @@ class Schedule:
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
-        """Yield the parts (start, stop, parameters) of the outputs first <= k < last, split at block bounds."""
+        """Yield (start, stop, parameters) for the outputs first <= k < last, divided where the parameters change."""
         k = int(np.searchsorted(self.bounds, first, side="right")) - 1
         while first < last:
             stop = min(int(self.bounds[k + 1]), last)
@@ -165,7 +172,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Hold:
-    """A stuck channel: from `start` to `stop` [s] it repeats its reading at `start`."""
+    """A span of time in which a channel is stuck: from `start` to `stop` [s] it repeats its reading at `start`."""
 
     channel: str
     start: float
@@ -174,17 +181,20 @@ class Hold:
 
 @dataclass(frozen=True)
 class Readings:
-    """All changes of the instruments within a run; none by default."""
+    """All changes of the instruments within a run: changed parameters, and spans in which a channel is stuck."""
 
     effects: tuple[Effect, ...] = ()
     holds: tuple[Hold, ...] = ()
 
     def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute a parameter of an instrument at times t [s] from its value in the rig."""
+        """Compute an instrument's parameter, given by its dotted name, at times t [s] from its value in the rig."""
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Apply the holds of a channel to its readings (n,) at times t [s]."""
+        """Repeat one reading over each span in which the channel is stuck.
+
+        `values` (n,): readings of the channel at times `t` (n,) [s].
+        """
         for hold in self.holds:
             samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
             if hold.channel == channel and samples.size:
@@ -194,14 +204,14 @@ class Readings:
 
 
 class Shape(Protocol):
-    """Change of a drifting parameter since the start of the run, relative or in the parameter's SI unit."""
+    """The course of a drift: the change of a parameter since the start of the run, relative or in its SI unit."""
 
     def value_at(self, t: Array) -> Array:
-        """Compute the change at times t [s] (any shape); 0 at t = 0."""
+        """Compute the change at times t [s], for an array t of any shape; it is 0 at t = 0."""
         ...
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] of its jumps and changes of slope."""
+        """Return the times [s] at which the change jumps or changes its slope."""
         ...
 
 
@@ -209,8 +219,9 @@ class Shape(Protocol):
 class Wander:
     """A smooth random walk over `duration` T [s]: slope t / T + sum of w_k sin((k - 1/2) pi t / T), k = 1, 2, ...
 
-    With w_k normal of standard deviation 1/(k - 1/2) this is the Karhunen-Loeve expansion of the Wiener process (Loeve,
-    Probability Theory, 1955, section 34.5), truncated: with six terms the shortest period is T/2.75.
+    `weights` are the w_k. If they are normal with standard deviations 1/(k - 1/2), this is the Karhunen-Loeve
+    expansion of the Wiener process (Loeve, Probability Theory, 1955, section 34.5), truncated: with six terms the
+    shortest period is T/2.75.
     """
 
     weights: tuple[float, ...]
@@ -222,7 +233,7 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the change at times t [s]."""
+        """Compute the walk's value, that is the drift's change, at times t [s]."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)
         if self.weights:  # next term by sin(a + phase) = 2 cos(phase) sin(a) - sin(a - phase)
@@ -238,23 +249,23 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the path to a range `size` (highest less lowest value); return a constant path unchanged."""
+        """Scale the walk so that its highest minus its lowest value is `size`; return a constant walk unchanged."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self
 
     def times(self, factor: float) -> Wander:
-        """Multiply the path by `factor`."""
+        """Multiply the walk by `factor`."""
         return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
 
     def plus(self, other: Wander) -> Wander:
-        """Add another path of the same duration."""
+        """Add another walk over the same duration."""
         pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
 
 def linear_path(size: float, duration: float) -> Wander:
-    """Make a linear change of `size` over `duration` [s], with the same slope afterwards."""
+    """Make the course of a drift that changes by `size` over `duration` [s], and continues with the same slope."""
     return Wander((), duration, size)
 
 
@@ -263,9 +274,10 @@ _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
 def is_absolute_drift(parameter: str) -> bool:
-    """Return True for a parameter that drifts in its own unit, because its value may be 0.
+    """Return True for a parameter that drifts by an amount in its own unit, because its value may be 0.
 
-    These are the offset, gain and scale errors of instruments, and the load `F_l`.
+    These are the offset, gain and scale errors of instruments, and the load `F_l`; all other parameters drift
+    relatively.
     """
     return parameter.rpartition(".")[2] in ("offset", "gain_error", "scale_error", *_ABSOLUTE_MAX_CHANGES)
 
@@ -274,10 +286,10 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    `parameter`: bare or dotted name of a number of motor, pump, lines, cylinder, friction, oil or make-up, of a
-    sensor's noise, hum, offset, gain or scale error, or `friction` for all friction forces together. Offsets, gain and
-    scale errors and the load `F_l` drift in absolute terms, all others relatively. Raises InputError for any other
-    parameter.
+    `parameter`: bare or dotted name of a parameter of motor, pump, lines, cylinder, friction, oil or make-up; of a
+    sensor's noise, hum, offset, gain or scale error; or `friction` for all friction forces together. `absolute` must
+    be True for offsets, gain and scale errors and the load `F_l`, False for all others. Raises InputError for any
+    other parameter.
     """
 
     parameter: str
@@ -300,7 +312,7 @@ class ParameterDrift:
         return f"{self.parameter} drifts"
 
     def _is_instrument(self) -> bool:
-        """Return True if the parameter is an instrument's and can drift."""
+        """Return True if the parameter belongs to an instrument and can drift."""
         return self.parameter.startswith("sensors.") and self.parameter.rpartition(".")[2] in _INSTRUMENT_SYMBOLS
 
     def check(self, t: Array) -> None:
@@ -309,11 +321,11 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the effects of the drift on the machine or its instruments."""
+        """Build the changes of the machine's numbers or of an instrument's parameter that the drift causes."""
         breakpoints = self.shape.breakpoints()
 
         def build_effect(field: str, power: float) -> Effect:
-            """Build the effect on one model parameter, which is proportional to a `power` of the drifting one."""
+            """Build the effect on the model parameter `field`, proportional to a power of the drifting parameter."""
             if self.absolute:
                 max_change = _ABSOLUTE_MAX_CHANGES.get(field, math.inf)
                 return Effect(field, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
@@ -327,9 +339,10 @@ class ParameterDrift:
 
 @cache
 def model_parameters_derived_from(parameter: str) -> tuple[tuple[str, float], ...]:
-    """Return (name, exponent) of each model parameter that is proportional to a power of a rig parameter.
+    """List the model parameters that are proportional to a power of a rig parameter, as (name, exponent).
 
-    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter depends on it.
+    `parameter`: dotted name, or a group such as `friction`. Returns () if no model parameter depends on it, or if it
+    cannot drift.
     """
     from sealscope.physics.rig import NUMBERS
 

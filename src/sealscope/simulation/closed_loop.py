@@ -1,4 +1,4 @@
-"""A controller around the rig: it samples the measurements, and its voltage is constant between its samples."""
+"""A controller around the rig: it samples measurements, and its voltage is constant from one sample to the next."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the fewest solver outputs per recorded sample with an output at each controller sample.
+    """Find the fewest solver outputs per recorded sample for which every controller sample falls on an output.
 
-    `rate`, `controller_rate` [Hz]: sampling rates of recording and controller; `min_outputs`: least result. Raises
-    InputError if no number of outputs suits both rates.
+    `rate`, `controller_rate` [Hz]: sampling rates of recording and controller; `min_outputs`: lower limit of the
+    result. Raises InputError if no number of outputs suits both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate
@@ -35,16 +35,19 @@ def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) ->
 
 
 class Feedback:
-    """A controller in feedback with the rig over a run; the solver calls it through a `Loop`.
+    """A controller in feedback with the rig over a run, which the solver calls through its `loop`.
 
-    It measures position and angle in whole counts of the rig's encoders, and pressures with the transducers' noise,
-    drawn from `seed`. A controller in machine code (`compiled`) is called directly, one in Python through C.
+    The controller measures position and angle in whole counts of the rig's encoders, and pressures with the
+    transducers' noise. A controller in machine code (`compiled`) is called directly, one in Python through C.
     """
 
     def __init__(
         self, rig: Rig, target: Position, controller: Controller, *, duration: float, rate: float, seed: int
     ) -> None:
-        """Prepare a run of `duration` [s], with solver outputs at `rate` [Hz]."""
+        """Prepare a run of `duration` [s] on `rig` in which `controller` follows `target`.
+
+        `rate` [Hz]: rate of the solver's outputs; `seed`: seed of the noise in the measured pressures.
+        """
         self._controller = controller
         self._spacing = round(rate / controller.rate)
         samples = round(duration * rate) // self._spacing + 1
@@ -66,7 +69,7 @@ class Feedback:
         self.restart()
 
     def restart(self) -> None:
-        """Reset controller and loop to the start of the run."""
+        """Reset the controller, its memory and its outputs to the start of the run."""
         controller, samples = self._controller, len(self._inputs)
         measured = np.empty(len(Measured._fields))
         self._law = start_law(controller)
@@ -83,7 +86,11 @@ class Feedback:
         )
 
     def raise_failure(self) -> None:
-        """Raise the exception of a controller in Python, or else SimulationFailed for a voltage that is not finite."""
+        """Raise the exception that stopped the controller.
+
+        It is the controller's own exception if it is written in Python, else SimulationFailed for a voltage that is
+        not finite.
+        """
         reraise_python_error(self._law)
         t = self._inputs[self.loop.counters[SAMPLED], 0]
         raise SimulationFailed(
@@ -91,11 +98,14 @@ class Feedback:
         )
 
     def volts(self, outputs: int) -> Array:
-        """Return the voltages [V] at the first `outputs` outputs of the solver."""
+        """Return the controller's voltage [V] at the first `outputs` solver outputs."""
         return np.asarray(self.loop.volts[np.arange(outputs) // self._spacing])
 
     def compensated_flow(self, outputs: int) -> Array | None:
-        """Return the compensated leakage flow [m^3/s] at the first `outputs` outputs; None if none is reported."""
+        """Return the leakage flow [m^3/s] that the controller compensates, at the first `outputs` solver outputs.
+
+        Returns None if the controller reports none.
+        """
         if not self.loop.counters[REPORTED]:
             return None
         return np.asarray(self.loop.compensated[np.arange(outputs) // self._spacing])

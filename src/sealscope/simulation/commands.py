@@ -21,10 +21,10 @@ def format_number(value: float) -> str:
 
 
 class Command(Protocol):
-    """A command: volts as a function of time, and its text, which `parse_command` reads."""
+    """A command to the servo drive: a voltage over time. Its `str` is the text that `parse_command` reads."""
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s] (any shape); 0 before t = 0."""
+        """Compute the voltage u [V] at times t >= 0 [s], for an array t of any shape."""
         ...
 
     def __str__(self) -> str: ...
@@ -32,7 +32,7 @@ class Command(Protocol):
 
 @dataclass(frozen=True)
 class Sine:
-    """u = offset + amplitude sin(omega t + phase); `omega` [rad/s]."""
+    """The command u = offset + amplitude sin(omega t + phase) [V]; `omega` [rad/s], `phase` [rad]."""
 
     amplitude: float
     omega: float
@@ -40,7 +40,7 @@ class Sine:
     offset: float = 0.0
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the sine's voltage u [V] at times t [s]."""
         return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
 
     def __str__(self) -> str:
@@ -53,7 +53,7 @@ class Sine:
 
 @dataclass(frozen=True)
 class MultiSine:
-    """Sum of two or more sines; only the last one may have an offset."""
+    """A command that is the sum of two or more sines, of which only the last may have an offset."""
 
     parts: tuple[Sine, ...]
 
@@ -62,7 +62,7 @@ class MultiSine:
             raise InputError(f"a multi-sine must be of two sines or more, an offset in the last alone, got {self}")
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V], the sum of all sines, at times t [s]."""
         return np.asarray(sum(sine.volts(t) for sine in self.parts))
 
     def __str__(self) -> str:
@@ -71,7 +71,11 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """Periodic trapezoid: u rises from 0 to `level` [V] within `rise` [s], and falls half a `period` [s] later."""
+    """A periodic command between 0 and `level` [V].
+
+    It rises within `rise` [s] at the beginning of each `period` [s], and falls within the same time half a period
+    later.
+    """
 
     level: float
     rise: float
@@ -84,7 +88,7 @@ class Trapezoid:
             )
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V] of the trapezoid at times t [s]."""
         time_in_period = np.mod(np.maximum(t, 0.0), self.period)
         rise, fall = time_in_period / self.rise, (time_in_period - 0.5 * self.period) / self.rise  # completed fractions
         return np.asarray(self.level * (np.clip(rise, 0.0, 1.0) - np.clip(fall, 0.0, 1.0)))
@@ -96,7 +100,10 @@ class Trapezoid:
 
 @dataclass(frozen=True)
 class Alternating:
-    """A sequence of sines that repeats; each part (periods, sine) starts at zero and lasts whole periods."""
+    """A command of several sines in turn, repeated without end.
+
+    `parts`: (periods, sine) of each part, which lasts this whole number of the sine's periods and starts at zero.
+    """
 
     parts: tuple[tuple[int, Sine], ...]
 
@@ -106,7 +113,7 @@ class Alternating:
                 raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V] of the sine whose turn it is at times t [s]; 0 before t = 0."""
         lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
         ends = np.cumsum(lengths)
         time_in_cycle = np.mod(t, ends[-1])
@@ -122,10 +129,10 @@ class Alternating:
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A signal that is linear between points, and constant before the first and after the last.
+    """A signal over time that is linear between points, and constant before the first and after the last.
 
-    `t`, `y`: (n,) non-decreasing times [s] and values; two points at one time are a jump. `words`: text of the
-    signal, such as "step 5 at 1 s". Polylines are equal if points and text are.
+    `t` (n,): times [s], which never decrease; `y` (n,): values at these times. Two points at one time are a jump.
+    `words`: text of the signal, such as "step 5 at 1 s". Two polylines are equal if their points and texts are.
     """
 
     t: Array
@@ -133,19 +140,22 @@ class Polyline:
     words: str
 
     def value_at(self, t: Array) -> Array:
-        """Compute the values at times t [s] (any shape)."""
+        """Compute the signal's values at times t [s], for an array t of any shape."""
         return np.interp(t, self.t, self.y)
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the signal's values as voltages u [V] at times t [s]."""
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the slope changes or the value jumps; () for a table of 1000 points or more."""
+        """Return the times [s] at which the slope changes or the value jumps.
+
+        A table of 1000 points or more has too many of them, and returns ().
+        """
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] at which the signal starts to rise above 0; infinity if it never does."""
+        """Find the time [s] at which the signal begins to rise above 0; infinity if it never does."""
         if not np.any(self.y > 0):
             return math.inf
         first_positive = int(np.argmax(self.y > 0))
@@ -153,7 +163,7 @@ class Polyline:
 
     @property
     def rise(self) -> tuple[float, float] | None:
-        """Begin and end [s] of the rise, if the signal is one linear rise from 0 to 1; else None."""
+        """Begin and end [s] of the rise if the signal is one linear rise or jump from 0 to 1, else None."""
         return (float(self.t[0]), float(self.t[1])) if self.y.tolist() == [0.0, 1.0] else None
 
     def __eq__(self, other: object) -> bool:
@@ -178,9 +188,10 @@ def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
 
 
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
-    """Make the polyline through the points of a table, called `what` in messages.
+    """Make the polyline through the points of a table: times `t` (n,) [s] and values `y` (n,).
 
-    Raises InputError if the times fall, a number is not finite, or the sizes differ.
+    `what`: name of the table in error messages. Raises InputError if the times fall, a number is not finite, or the
+    sizes differ.
     """
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
         raise InputError(f"{what} must have one value for each time, and its times must rise")
@@ -204,9 +215,9 @@ def ramp(level: float, start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True)
 class Chirp:
-    """Sine with a frequency that changes linearly from f_0 to f_1 [Hz] over `duration` T [s], and stays at f_1.
+    """A sine whose frequency changes linearly from f_0 to f_1 [Hz] over `duration` T [s], and then stays at f_1.
 
-    u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))) up to T.
+    u = amplitude sin(2 pi (f_0 t + (f_1 - f_0) t^2 / (2 T))) [V] up to t = T.
     """
 
     amplitude: float
@@ -219,7 +230,7 @@ class Chirp:
             raise InputError(f"a chirp must have frequencies >= 0 Hz and a duration > 0 s, got {self}")
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V] of the chirp at times t [s]."""
         sweep_time = np.minimum(t, self.duration)
         cycles = self.f_0 * sweep_time + (self.f_1 - self.f_0) * sweep_time**2 / (2.0 * self.duration)
         return self.amplitude * np.sin(2.0 * np.pi * (cycles + self.f_1 * (t - sweep_time)))
@@ -235,10 +246,10 @@ GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x
 
 @dataclass(frozen=True)
 class PseudoRandom:
-    """Pseudo-random binary command: +amplitude or -amplitude, drawn anew every `hold` [s] from `seed`.
+    """A pseudo-random binary command: +amplitude or -amplitude [V], drawn anew every `hold` [s] from `seed`.
 
-    The sign of slot k is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), computed directly,
-    without the earlier states.
+    The sign in the k-th interval is a bit of SplitMix64 at its k-th state (Steele, Lea, Flood, OOPSLA 2014), which is
+    computed directly, without the earlier states.
     """
 
     amplitude: float
@@ -250,7 +261,7 @@ class PseudoRandom:
             raise InputError(f"a pseudo-random command must hold each value for > 0 s, got {self.hold:g} s")
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V] of the pseudo-random command at times t [s]; 0 before t = 0."""
         slot = np.clip(np.floor(t / self.hold), 0.0, 2.0**63).astype(np.uint64)
         start = np.random.SeedSequence(self.seed).generate_state(1, np.uint64)
         state = start + (slot + np.uint64(1)) * np.uint64(GOLDEN)
@@ -265,16 +276,20 @@ class PseudoRandom:
 
 
 def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
-    """Make the polyline through the samples of a recorded signal; `origin` names it in messages and texts."""
+    """Make the polyline through the samples of a recorded signal, `u` (n,) at the times `t` (n,) [s].
+
+    `origin` names the signal in error messages and in the polyline's text. Raises InputError for fewer than two
+    samples or for two samples at one time.
+    """
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
     return replace(polyline_from_table(t, u, f"a recorded signal ({origin})"), words=f"file {origin}")
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command of a recording's channel `u`, with the first sample at t = 0.
+    """Make a command of the channel `u` [V] of a recording, shifted so that its first sample is at t = 0.
 
-    `origin` names the recording in messages and texts.
+    `origin` names the recording in error messages and in the command's text.
     """
     return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
@@ -284,7 +299,10 @@ _CHECK_CHUNK = 1_000_000
 
 
 def check_command(command: Command, t: Array, limit: float) -> None:
-    """Check that the command is within +-`limit` [V] at the times `t` [s]; raise InputError otherwise, or for NaN."""
+    """Check that a command is within +-`limit` [V] at the times `t` [s].
+
+    Raises InputError, with the first voltage and time at which it is not; NaN is not within the limit.
+    """
     for start in range(0, t.size, _CHECK_CHUNK):
         part = t[start : start + _CHECK_CHUNK]
         u = command.volts(part)
@@ -327,12 +345,15 @@ _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
 
 
 def parse_seconds(text: str | None) -> float:
-    """Parse a time [s] that matches `TIME`; 0 for None."""
+    """Parse a time in seconds from a text such as "90", "90 s" or "1.5[min]" (`TIME`); return 0 for None."""
     return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 
 def _parse_number(text: str | None, default: float) -> float:
-    """Parse a number of a command, `default` for None; raise InputError if it is not finite."""
+    """Parse a number in the text of a command; return `default` for None.
+
+    Raises InputError if the number is not finite.
+    """
     if text is None:
         return default
     value = float(text.replace(" ", ""))
@@ -360,7 +381,10 @@ _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*
 
 
 def _parse_sines(text: str) -> Sine | MultiSine | None:
-    """Parse a sine or a sum of sines, with an offset after the last; return None for any other text."""
+    """Parse a sine such as "3 sin(4t)", or a sum of sines; an offset may follow the last.
+
+    Returns None for any other text.
+    """
     parts: list[Sine] = []
     end = 0
     while (match := _SINES.match(text, end)) is not None and (match[1] or not parts):
@@ -376,7 +400,10 @@ def _parse_sines(text: str) -> Sine | MultiSine | None:
 
 
 def parse_command(text: str) -> Command:
-    """Parse a command; raise InputError, which lists the forms, if the text has none of them."""
+    """Parse the text of a command, such as "3 sin(4t)", "step 5 at 1 s" or "file LOG" (channel u of a recording).
+
+    Raises InputError, which lists all forms, if the text has none of them.
+    """
     stripped = text.strip()
     if stripped.lower().startswith("file "):
         from sealscope.recordings import read

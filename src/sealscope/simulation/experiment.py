@@ -40,9 +40,10 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Return the stated method, or choose it for `auto`: implicit-explicit for a rig with throttles, else explicit.
+    """Choose the integration method of a rig: the stated one, or for `auto` the one that suits the rig.
 
-    Raises InputError for a method that does not suit the rig.
+    That is the implicit-explicit method (imex) for a rig with throttles, else the explicit one (rk4). Raises
+    InputError for a method that does not suit the rig.
     """
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
@@ -58,7 +59,10 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
 
 
 def check_target(target: Position, t: Array, half_stroke: float) -> None:
-    """Check that a target is within +-`half_stroke` [m] at the times `t` [s]; raise InputError otherwise."""
+    """Check that a position target stays within the stroke, +-`half_stroke` [m], at the times `t` [s].
+
+    Raises InputError otherwise.
+    """
     x = np.broadcast_to(target.value_at(t), t.shape)
     is_outside = ~(np.abs(x) <= half_stroke)
     if is_outside.any():
@@ -70,7 +74,7 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 
 
 def check_circuit(rig: Rig) -> None:
-    """Check that a single-rod cylinder in a closed circuit has valves for the oil that its rod displaces.
+    """Check that a single-rod cylinder in a closed circuit has valves through which its rod can displace oil.
 
     Raises InputError otherwise.
     """
@@ -94,12 +98,12 @@ class Experiment:
     Parameters
     ----------
     rig, command, duration, leaks, seed, x_0, method, step, allow_unresolved, faults, drifts, error, load, controller :
-        The arguments of `of` once they are read: numbers in SI units; leaks, faults and drifts as tuples of objects.
+        The arguments of `of` after parsing: numbers in SI units; leaks, faults and drifts as tuples of objects.
 
     Raises
     ------
     InputError
-        Where a number is out of its range, or parts do not fit together.
+        A number is out of its range, or the inputs do not fit together.
 
     Examples
     --------
@@ -177,7 +181,7 @@ class Experiment:
         Returns
         -------
         Experiment
-            With all texts parsed; InputError for an argument that breaks a rule.
+            The experiment, with all texts parsed. An argument that breaks a rule raises InputError.
 
         Examples
         --------
@@ -233,27 +237,30 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command as changed by duty faults; InputError for a target."""
+        """The voltage command, changed by any faults of the duty; raises InputError for a position target."""
         if isinstance(self.command, Position):
             raise InputError(f"what a controller sends is known after its run only, got {self.command}")
         return self._with_duty_changes(self.command)
 
     @property
     def target(self) -> Position | None:
-        """The controller's target as changed by duty faults; None for a voltage command."""
+        """The position target, changed by any faults of the duty; None for a voltage command."""
         if not isinstance(self.command, Position):
             return None
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Apply the changes of amplitude and frequency that faults of the kind `duty` make to a command."""
+        """Change a command's amplitude and frequency by the faults of the duty."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
 
     @property
     def active_controller(self) -> Controller | None:
-        """The controller that follows the target, as stated or PositionPI for the rig; None for a command."""
+        """The controller that follows the position target: the stated one, else a PI controller for the rig.
+
+        None if the experiment has a voltage command.
+        """
         if not isinstance(self.command, Position):
             return None
         from sealscope.control import PositionPI
@@ -261,18 +268,19 @@ class Experiment:
         return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
-        """Collect the changes of the machine within the run."""
+        """Collect the effects of drifts and faults on the machine within the run, without its instruments."""
         return tuple(effect for effect in self._all_effects() if not effect.changes_instrument)
 
     def _all_effects(self) -> tuple[Effect, ...]:
-        """Collect the changes of machine and instruments by drifts and faults."""
+        """Collect the effects of all drifts and faults on machine and instruments within the run."""
         drift_effects = [effect for drift in self.drifts for effect in drift.effects()]
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Divide the openings of laminar leaks by the oil's relative viscosity: warmer oil leaks more.
+        """Divide the openings of laminar leaks by the oil's relative viscosity over time: warmer oil leaks more.
 
-        The leaks' coefficients hold at the rig's viscosity. Without a fault of the oil the leaks are unchanged.
+        The leaks' coefficients hold at the viscosity of the rig's oil temperature. Without a fault of the oil's
+        temperature the leaks are returned unchanged.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -288,13 +296,16 @@ class Experiment:
         return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
 
     def readings(self) -> Readings:
-        """Collect the changes of the instruments within the run."""
+        """Collect the effects of drifts and faults on the instruments within the run.
+
+        They include the time spans in which a sensor is stuck.
+        """
         effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
         return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
     @property
     def error_allowed(self) -> float:
-        """Largest rms error [Pa] of a pressure for the choice of the solver's step, as stated or the default."""
+        """Largest rms error [Pa] of a pressure by which the solver's step is chosen, stated or by default."""
         return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property
@@ -307,15 +318,15 @@ class Experiment:
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
-        """Compute the time [s] at which the first leak opens; None if none opens within the run."""
+        """Compute the time [s] at which the first leak opens; None if no leak opens within the run."""
         onsets = [leak.opening.onset() for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
         onsets = [onset for onset in onsets if onset < self.duration]
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Describe the experiment by plain values, without its leaks, faults and drifts.
+        """Describe the experiment by plain values that a recording may contain.
 
-        A diagnosis must find those by itself.
+        Leaks, faults and drifts are left out, because a diagnosis must find them by itself.
         """
         overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
@@ -331,7 +342,7 @@ class Experiment:
         }
 
     def key(self) -> str:
-        """Compute a hash of the experiment; equal experiments have equal keys."""
+        """Compute a hash of the experiment as 16 hexadecimal digits; equal experiments have equal keys."""
         values = {name: repr(value) for name, value in self.rig.present_values().items()}
         inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
         inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
@@ -343,10 +354,10 @@ class Experiment:
 
 
 def identity_values(value: Any) -> Any:
-    """Convert a command, leak or other object to plain values that identify it.
+    """Convert a command, leak or other object to plain values that are equal only for equal objects.
 
-    Objects with equal plain values are equal in all their numbers: an array becomes a hash of its bytes, a dataclass
-    the list of its fields' values, any other object its `repr`.
+    An array becomes a hash of its bytes, a dataclass a list of its name and its fields' values, any other object its
+    `repr`.
     """
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
@@ -360,8 +371,8 @@ def _parse_several(
 ) -> tuple[_Kind, ...]:
     """Parse an argument that states one or several leaks or faults.
 
-    The argument is a text, an object of `kind`, or an iterable of these; None gives an empty tuple. Raises InputError
-    for anything else; `name` names the argument in its message.
+    The argument is a text, an object of the class `kind`, or an iterable of these; None gives an empty tuple. `parse`
+    parses one text, `name` is the argument's name in messages. Raises InputError for anything else.
     """
     items = [] if argument is None else [argument] if isinstance(argument, (str, kind)) else argument
     if not isinstance(items, Iterable):

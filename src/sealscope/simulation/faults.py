@@ -57,15 +57,15 @@ _PATTERNS = {
 
 
 def _parse_number(text: str | None) -> float:
-    """Convert the text of a number, whose sign may be followed by a blank; return 0 for None."""
+    """Convert a text such as "3", "-1.5" or "+ 20" to a number; return 0 for None."""
     return float((text or "0").replace(" ", ""))
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """One kind of fault, an entry of `faults.toml`: the pattern of its text, and its effects.
+    """One kind of fault as an entry of `faults.toml` describes it: the pattern of its text, and its effects.
 
-    The head of that file explains the keys.
+    The comment at the head of that file explains the fields.
     """
 
     name: str
@@ -87,11 +87,11 @@ class FaultRow:
 
     @property
     def is_sensor_fault(self) -> bool:
-        """True for a fault of a sensor."""
+        """True for a fault of a sensor, False for one of the machine or its duty."""
         return self.kind.startswith("sensor")
 
     def parse(self, text: str) -> Fault | None:
-        """Parse a text as a fault of this kind; return None if it does not match."""
+        """Parse a text such as "pump leak x3 from 90 s" as a fault of this kind; return None if it is not one."""
         pattern = self.pattern.format(**_PATTERNS).replace(" ", r"\s+") + _WHEN[self.when]
         match = re.fullmatch(pattern, text, re.IGNORECASE)
         if match is None:
@@ -104,7 +104,10 @@ class FaultRow:
         return Fault(self.name, self._parse_value(groups), channel_or_side, parse_opening(groups), frequency_factor)
 
     def _parse_value(self, groups: Groups) -> float:
-        """Parse a fault's value from the groups of its match: a size in SI units, a factor or a fraction."""
+        """Read the size of a fault from the named groups of its matched text.
+
+        The result is a size in SI units, a factor, or a fraction, whichever the text states.
+        """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
             return parse_quantity(groups["size"] or "", unit, name=self.what)
@@ -117,10 +120,12 @@ class FaultRow:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault other than a leak across the piston; `name` is that of its row in `FAULTS`.
+    """A fault of machine, sensor or duty other than a leak across the piston.
 
-    `value`: a factor, or an addend in SI units; `at`: the side or the channel; `opening`: extent of the fault over
-    time; `frequency_factor`: on the frequency of a duty. `str` gives the text that `parse_fault` reads.
+    `name`: name of its kind, a key of `FAULTS`; `value`: a factor on the faulty parameter, or an addend in SI units;
+    `at`: side (A or B) or channel that is faulty, "" if there is nothing to choose; `opening`: extent of the fault
+    over time, 0 (healthy) to 1 (full size); `frequency_factor`: factor on the frequency of the duty. `str` gives the
+    text that `parse_fault` reads.
     """
 
     name: str
@@ -130,7 +135,10 @@ class Fault:
     frequency_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check channel or side, value, frequency factor and opening against the limits of the kind of fault."""
+        """Check side or channel, value, frequency factor and opening against the rules for this kind of fault.
+
+        Raises InputError if one of them breaks a rule.
+        """
         row = self.row
         if row.is_sensor_fault and self.at not in GAIN_PARAMETERS:
             raise InputError(f"a faulty sensor must be one of {', '.join(GAIN_PARAMETERS)}, got {self.at!r}")
@@ -146,12 +154,12 @@ class Fault:
 
     @property
     def row(self) -> FaultRow:
-        """The table's row of this kind of fault."""
+        """The entry of `faults.toml` that describes this kind of fault."""
         return FAULTS[self.name]
 
     @property
     def kind(self) -> str:
-        """Name of the class of the fault in tables and confusion matrices, such as "pump leakage"."""
+        """Name under which tables and confusion matrices count the fault, such as "pump leakage"."""
         return self.row.kind
 
     def onset(self) -> float:
@@ -159,7 +167,10 @@ class Fault:
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Build the fault's effects on the machine or a sensor; raise InputError if this rig cannot have the fault."""
+        """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
+
+        Raises InputError if this rig cannot have the fault.
+        """
         row = self.row
         if row.needs is not None:
             pattern, rule = row.needs
@@ -187,18 +198,18 @@ class Fault:
         )
 
     def holds(self) -> tuple[Hold, ...]:
-        """List the spans over which a stuck sensor repeats its reading; empty for any other fault."""
+        """List the time spans over which a stuck sensor repeats its reading; empty for any other fault."""
         if self.name != "sensor stuck":
             return ()
         stop = math.inf if self.opening.y[-1] > 0 else float(self.opening.t[-1])
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:
-        """Apply a duty fault to a command; any other fault returns it unchanged."""
+        """Change a command's amplitude and frequency by a fault of the duty; any other fault returns it unchanged."""
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build the function of times [s] that gives the oil's dynamic viscosity relative to the rig's.
+        """Build a function of times [s] that computes the oil's dynamic viscosity relative to the rig's.
 
         Returns None unless this is a fault of the oil's temperature.
         """
@@ -210,7 +221,10 @@ class Fault:
         rig_nu = float(kinematic_viscosity(np.asarray(oil.T_oil), oil.nu_40, oil.nu_100))
 
         def dynamic_viscosity_ratio(t: Array) -> Array:
-            """Compute the dynamic viscosity (kinematic viscosity times density) relative to the rig's."""
+            """Compute the oil's dynamic viscosity at times t [s] over that at the rig's oil temperature.
+
+            Dynamic viscosity is kinematic viscosity times density.
+            """
             T = self._oil_temperature(rig, t)
             nu_ratio = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / rig_nu
             return np.asarray(nu_ratio * thermal_density_ratio(T, oil.T_oil, oil.alpha))
@@ -218,11 +232,11 @@ class Fault:
         return dynamic_viscosity_ratio
 
     def _oil_temperature(self, rig: Rig, t: Array) -> Array:
-        """Compute the oil's temperature [K] at times t [s] under a fault of the oil."""
+        """Compute the oil's temperature [K] at times t [s] under this fault of the oil's temperature."""
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
     def __str__(self) -> str:
-        """Format the text that `parse_fault` reads."""
+        """Format the fault as the text that `parse_fault` reads."""
         words = self.row.words
         if self.name == "duty":
             changes_frequency = self.frequency_factor != 1.0
@@ -237,16 +251,19 @@ class Fault:
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """A command whose amplitude and frequency a duty fault changes, with a continuous phase.
+    """A command whose amplitude and frequency a fault of the duty changes, without a jump of its phase.
 
-    `before`: the original command; `change`: the duty fault.
+    `before`: the original command; `change`: the fault.
     """
 
     before: Command
     change: Fault
 
     def original_time(self, t: Array) -> Array:
-        """Compute the time [s] at which the original command is evaluated: t + (factor - 1) integral of opening."""
+        """Compute the times [s] at which the original command is evaluated, so that its frequency appears changed.
+
+        They are t + (factor - 1) times the integral of the fault's opening up to t, with the factor on the frequency.
+        """
         start, stop = self.change.opening.rise or (math.inf, math.inf)
         opening_integral = np.maximum(t - start, 0.0)
         if stop > start:
@@ -255,7 +272,7 @@ class ChangedDuty:
         return np.asarray(t + (self.change.frequency_factor - 1.0) * opening_integral)
 
     def volts(self, t: Array) -> Array:
-        """Compute u [V] at times t [s]."""
+        """Compute the voltage u [V] of the changed command at times t [s]."""
         amplitude_factor = 1.0 + (self.change.value - 1.0) * self.change.opening.value_at(t)
         return np.asarray(amplitude_factor * self.before.volts(self.original_time(t)))
 
@@ -264,9 +281,9 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of a shut-off valve on the throttle in its line.
+    """Build the effects of moving a shut-off valve: changes of the flow coefficients of the throttle in its line.
 
-    Raises InputError for a rig without lines.
+    Raises InputError for a rig without throttles in its lines.
     """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
@@ -279,7 +296,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
     def build_effect(name: str, c_open: float) -> Effect:
-        """Build the effect on one throttle coefficient, `c_open` with an open valve."""
+        """Build the effect on the throttle coefficient `name`, which is `c_open` with a fully open valve."""
         c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:
@@ -297,9 +314,10 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
 
 def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of a changing oil temperature on viscosity, density, bulk modulus and all that depend on them.
+    """Build the effects of a changing oil temperature on viscosity, density, bulk modulus and what depends on them.
 
-    Conductances of laminar gaps go with 1/viscosity, filter resistances and viscous friction with the viscosity.
+    The conductances of laminar gaps are proportional to 1/viscosity, filter resistances and viscous friction to the
+    viscosity.
     """
     from sealscope.physics.fluid import thermal_density_ratio, thermal_stiffness_ratio
 
@@ -307,7 +325,7 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     assert viscosity is not None
 
     def density_power(power: float) -> Callable[[Array], Array]:
-        """Build the function of times [s] that gives the density relative to the rig's, raised to a power."""
+        """Build the function of times [s] that computes the oil's density over the rig's, raised to `power`."""
         alpha = rig.fluid.alpha
         return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 
@@ -332,10 +350,10 @@ FAULTS: Mapping[str, FaultRow] = {
 
 
 def parse_fault(text: str) -> Fault | None:
-    """Parse a fault; return None for ``none``.
+    """Parse the text of a fault, such as "pump leak x3 from 90 s"; return None for ``none``.
 
-    The flow stated for a rod seal is that at the charge pressure. Operations of the rig, such as `circulation`, are
-    stated in the same way. Raises InputError, which lists the forms, if the text has none of them.
+    The flow stated for a leaking rod seal is that at the charge pressure. Operations of the rig, such as
+    `circulation`, are stated in the same way. Raises InputError, which lists the forms, if the text has none of them.
     """
     stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):

@@ -1,4 +1,4 @@
-"""The instruments: from a simulated run to the readings of the rig's sensors and data acquisition (thesis, ch. 2.4)."""
+"""The instruments: from a simulated run to readings of the rig's sensors and data acquisition (thesis, ch. 2.4)."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ _CUTOFF_FRACTION = 0.9  # cut-off (-6 dB) over the Nyquist frequency
 
 
 class Outputs(Protocol):
-    """Outputs of a run by name, such as a `Trajectory`."""
+    """The simulated outputs of a run, available by name, such as a `Trajectory`."""
 
     def __getitem__(self, name: str) -> Array:
-        """Return the values of an output over time."""
+        """Return the values of the output `name` over time."""
         ...
 
 
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
-    """Compute the taps of the anti-alias filter, (2 FILTER_REACH factor + 1,).
+    """Compute the coefficients of the anti-alias filter, (2 FILTER_REACH factor + 1,).
 
-    A Kaiser-windowed sinc of unit gain. `factor`: the signal's rate over the recording's; `delay`: lag of the filter, a
-    fraction of the interval between taps. A filter without delay has zero phase; for `factor` 1 and no delay it is a
-    single tap of 1.
+    The filter is a Kaiser-windowed sinc of unit gain. `factor`: the signal's rate over the recording's; `delay`: lag
+    of the filter as a fraction of the signal's sampling interval, 0 for zero phase. For `factor` 1 without a delay it
+    is a single coefficient of 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -48,10 +48,11 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """Filter `values` against aliasing (`anti_alias_taps`), and keep every `factor`-th one, `n` in all.
+    """Filter a signal against aliasing (`anti_alias_taps`), and take `n` samples of it, one in `factor` values.
 
-    `values` must extend FILTER_REACH samples of the lower rate beyond the last one; before the first they are constant.
-    `delay` >= 0 in samples of `values`, whole or not: each sample is taken from that much earlier.
+    `values` must continue for FILTER_REACH samples after the last one; before the beginning they are taken as
+    constant. `delay` >= 0, in intervals of `values` and not necessarily whole: each sample is the signal that much
+    earlier.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -66,9 +67,10 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 
 
 def filter_first_order(values: Array, lag: float, rate: float) -> Array:
-    """Filter a signal at `rate` [Hz] by a first-order transducer, lag dy/dt + y = signal; `lag` [s], 0: none.
+    """Compute the output y of a first-order transducer for a signal at `rate` [Hz]: lag dy/dt + y = signal.
 
-    Exact for a signal that is linear between its values and constant before the first.
+    `lag` [s]: time constant; for 0 the signal is returned unchanged. The result is exact for a signal that is linear
+    between its values and constant before the first.
     """
     if lag == 0.0:
         return values
@@ -82,10 +84,11 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Sample `values` with a clock that jitters.
+    """Sample a signal with a clock that jitters.
 
-    `sample(values)`: returns the samples (n,) of a clock without jitter; `lateness` (n,): delay of each sample, -1 .. 1
-    intervals of `values`; None: no jitter. Values are interpolated by a parabola through three of them.
+    `sample(values)` takes the samples (n,) of a signal with a clock that does not jitter; `lateness` (n,): delay of
+    each sample, -1 .. 1 intervals of `values`, or None for no jitter. The signal is interpolated by a parabola
+    through three of its values.
     """
     center = sample(values)
     if lateness is None:
@@ -95,14 +98,14 @@ def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness
 
 
 def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
-    """Compute the sensitivity [V/Pa] of a pressure transducer: its voltage span over its range."""
+    """Compute the sensitivity [V/Pa] of a pressure transducer: the range of its voltage over that of its pressure."""
     return (daq.sensor_volts_hi - daq.sensor_volts_lo) / (sensor.range_hi - sensor.range_lo)
 
 
 def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Compute the pressure [Pa] as read back from the analog-digital converter, in steps of `daq.step` [V].
+    """Compute the pressure [Pa] that is read back from the analog-digital converter, whose step is `daq.step` [V].
 
-    The transducer saturates at its range.
+    The transducer saturates at the ends of its range.
     """
     sensitivity, saturated = volts_per_pascal(sensor, daq), np.clip(pressure, sensor.range_lo, sensor.range_hi)
     volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity
@@ -122,8 +125,9 @@ def read_pressure(
 ) -> Array:
     """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
-    In this order: gain, offset, drift, hum, noise of the channel and `common_noise` [Pa], saturation, conversion, stuck
-    and lost samples. `parameter(symbol, value)` returns the sensor's parameter over time from its `value` in the rig.
+    Applied in this order: gain; offset, drift, hum, noise of the channel and `common_noise` [Pa], added; saturation;
+    conversion to digits; stuck samples, which repeat a reading; and lost samples, which are NaN. `parameter(symbol,
+    value)` returns a parameter of the sensor over time from its `value` in the rig.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -142,7 +146,10 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a hum of amplitude 1, with random phases."""
+    """Compute the harmonics 2 to `HUM_HARMONICS` of a mains hum of amplitude 1 at times t [s], with random phases.
+
+    Each harmonic is `sensor.hum_harmonics` times as large as the one before.
+    """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
     cycles = sensor.hum_frequency * np.outer(orders, t) + phases[:, None]
@@ -150,20 +157,21 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
 
 
 def _quantize(values: Array, resolution: float) -> Array:
-    """Round values down to multiples of the resolution; 0 leaves them unchanged."""
+    """Round values down to multiples of an encoder's resolution; a resolution of 0 leaves them unchanged."""
     return values if resolution == 0 else np.floor(values / resolution) * resolution
 
 
 def record(
     rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
 ) -> Recording:
-    """Record a trajectory with the rig's instruments.
+    """Record a simulated run with the rig's instruments.
 
-    `trajectory` has `factor` outputs a sample and is FILTER_REACH samples longer than the recording; `u`: (n,) command
-    [V] at the samples; `readings`: changes of the instruments within the run. Analog channels (pressures, flow meter)
-    pass the anti-alias filter, encoders are read at the instant; the clock of all but the command may jitter. Each
-    channel has a random stream of its own from `seed`, so that its noise does not depend on other channels' settings.
-    The motor of a valve-controlled rig, which drives the supply, has no encoder: its angle and speed are not recorded.
+    `trajectory` has `factor` outputs per sample and continues for FILTER_REACH samples after the end of the
+    recording; `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run. The analog
+    channels (pressures, flow meter) pass the anti-alias filter; the encoders are read at the instant. The clock of
+    all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so that its
+    noise does not depend on the settings of other channels. The motor of a valve-controlled rig, which drives the
+    supply, has no encoder: its angle and speed are not recorded.
     """
     n = u.size
     rate = rig.daq.sample_rate
@@ -176,7 +184,10 @@ def record(
     readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
-        """Build the function that takes a sensor parameter's symbol and rig value, and returns it over time."""
+        """Build the function that computes a parameter of the channel's sensor over time.
+
+        It takes the parameter's symbol and its value in the rig.
+        """
         return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
 
     jitter_steps = None
@@ -184,9 +195,11 @@ def record(
         jitter_steps = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
 
     def read_instantly(values: Array) -> Array:
+        """Read a signal at the samples without a filter, as an encoder does."""
         return sample_with_jitter(lambda signal: signal[at_samples], values, jitter_steps)
 
     def read_filtered(values: Array, delay: float = 0.0) -> Array:
+        """Read a signal at the samples behind the anti-alias filter, `delay` intervals of the signal late."""
         return sample_with_jitter(lambda signal: decimate(signal, factor, n, delay), values, jitter_steps)
 
     angle_resolution = 2.0 * np.pi / sensors.theta.counts

@@ -1,7 +1,7 @@
-"""Integrate the rig over an experiment: inputs at the nodes of the steps, choice of the step, and checks.
+"""Integrate the rig over an experiment: compute its inputs, choose the solver's step, and check the result.
 
-The step is stated, or chosen by an error. In both cases short windows of the run are integrated at half the step, too,
-and the run is refused if the results differ by more than the tolerances.
+The step is stated, or chosen so that an error is small enough. In both cases short windows of the run are integrated
+at half the step, too, and the run is refused if the results differ by more than the tolerances.
 """
 
 from __future__ import annotations
@@ -54,11 +54,12 @@ _OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Result of an integration: (n,) times [s] and (n, 21) outputs in the order of `sealscope.physics.state.OUTPUTS`.
+    """Result of an integration: times `t` (n,) [s] and outputs `rows` (n, 21) in the order of `OUTPUTS`.
 
-    `step` [s]; `error`: estimated rms error [Pa] of the pressures, NaN if it was not checked. Under a controller:
-    `volts` (n,), its voltages [V], and `compensated` (n,), the leakage flow [m^3/s] that it compensates, None if it
-    reports none; without a controller both are None.
+    `OUTPUTS` are the names in `physics.state`, by which `trajectory[name]` gives one output (n,). `method`: rk4 or
+    imex; `step` [s]: the solver's step; `error`: estimated rms error [Pa] of the pressures, NaN if it was not
+    checked. Under a controller, `volts` (n,) are its voltages [V] and `compensated` (n,) is the leakage flow [m^3/s]
+    that it compensates, None if it reports none; without a controller both are None.
     """
 
     t: Array
@@ -76,30 +77,34 @@ class Trajectory:
 
 
 class RunInputs:
-    """Inputs of a run over time: the voltage command, and the sums G and C over all leaks.
+    """Inputs of a run over time: the voltage command, and the leakage coefficients G and C summed over all leaks.
 
     Under a position target the command is 0, because the controller sets the voltage (`Feedback`).
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Take the experiment's command, and `leaks` with known coefficients in place of its leaks."""
+        """Take the command from `experiment`, and the leaks from `leaks`, whose coefficients are known."""
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the voltage is that of the controller (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Compute command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s]."""
+        """Compute command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s].
+
+        `start` (steps,): beginnings of the solver's steps; `offsets` (nodes,): times within a step. Each result is
+        (steps, nodes). Raises InputError for a command beyond its limit.
+        """
         t = start[:, None] + offsets
         return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
 
     def max_leakage(self, t: Array) -> tuple[float, float]:
-        """Compute the maxima of total G [m^3/(s Pa)] and of total C [m^3/(s Pa^0.5)] over the times t [s]."""
+        """Compute the largest total G [m^3/(s Pa)] and the largest total C [m^3/(s Pa^0.5)] at the times t [s]."""
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
     def _leakage(self, t: Array) -> tuple[Array, Array]:
-        """Compute the total G [m^3/(s Pa)] and total C [m^3/(s Pa^0.5)] of all leaks at times t [s]."""
+        """Compute G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], summed over all leaks, at times t [s]."""
         G, C = np.zeros(t.shape), np.zeros(t.shape)
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
@@ -109,10 +114,10 @@ class RunInputs:
         return G, C
 
     def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Check that the command u(t) [V] stays within the limit during the run, and clip it after the end.
+        """Check that the command `u` [V] at times `t` [s] stays within its limit during the run, and clip it after.
 
-        Raises InputError for a command beyond the limit. After the end only the look-ahead of the anti-alias filter
-        reads the command.
+        Raises InputError for a command beyond the limit. After the end of the run the command only lets the solver
+        continue as far as the anti-alias filter looks ahead.
         """
         if np.abs(u).max(initial=0.0) <= self._limit:
             return u
@@ -121,9 +126,10 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the number of solver outputs per recorded sample.
+    """Compute the number of solver outputs per recorded sample that an experiment needs.
 
-    The anti-alias filter needs a minimum (`oversampling_of`); every sample of a controller must fall on an output.
+    The anti-alias filter needs a minimum (`oversampling_of`), and every sample of a controller must fall on an
+    output.
     """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
@@ -132,15 +138,16 @@ def oversampling(experiment: Experiment) -> int:
 
 
 def oversampling_of(rate: float, step: float) -> int:
-    """Compute the outputs per sample for the anti-alias filter: 4, or the steps in a sample if fewer.
+    """Compute the number of solver outputs per recorded sample that the anti-alias filter needs.
 
-    `rate` [Hz]: sampling rate of the recording; `step` [s]: longest step of the solver.
+    It is 4, or the number of solver steps in a sample if that is smaller. `rate` [Hz]: sampling rate of the
+    recording; `step` [s]: longest step of the solver.
     """
     return min(_OVERSAMPLING, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Compute the fewest solver steps of at most `step` [s] between two outputs at `rate` [Hz]."""
+    """Compute the number of solver steps, each at most `step` [s] long, between two outputs at `rate` [Hz]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
@@ -153,11 +160,11 @@ def integrate_run(
     duration: float | None = None,
     progress: Progress | None = None,
 ) -> Trajectory:
-    """Integrate an experiment, with outputs at the rate that its instruments need.
+    """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
 
-    `leaks`, all with coefficients, replace those of the experiment. `step` [s], `error` [Pa] and `duration` [s] replace
-    the experiment's unless None; the error of a `step` stated here is not checked. The default duration includes the
-    anti-alias filter's reach.
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s], `error` [Pa] and `duration` [s]
+    replace the experiment's unless None; the error of a `step` stated here is not checked. The default duration is
+    that of the recording plus the reach of the anti-alias filter. `progress` is called with the time reached [s].
     """
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
@@ -183,12 +190,12 @@ def integrate_run(
 
 
 def _without_mean_leaks(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace each leak with a stated mean flow by one of coefficient 0, where the search starts."""
+    """Give each leak whose mean flow is stated the coefficient 0, where the search for its coefficient starts."""
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the coefficients that give the leaks' stated mean flows; return the leaks with them."""
+    """Find the leakage coefficients that give the stated mean flows; return the leaks with their coefficients."""
     if not any(leak.mean for leak in experiment.leaks):
         return _without_mean_leaks(experiment.leaks)
     return run_with_sized_leaks(experiment)[0]
@@ -199,12 +206,12 @@ def run_with_sized_leaks(
     progress: Callable[[str, float], None] | None = None,
     report_time: Callable[[float], None] | None = None,
 ) -> tuple[tuple[Leak, ...], Trajectory]:
-    """Find the coefficients of the experiment's leaks; return the sized leaks and their run.
+    """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    `progress(task, fraction)` is called while leaks are sized, `report_time(t)` with the time reached [s] if there are
-    none to size.
+    The coefficients are found by repeated simulation (`size_leaks`). `progress(task, fraction)` is called during this
+    search, `report_time(t)` with the time reached [s] if there is nothing to search for.
 
-    Raises InputError for a leak larger than the pump's mean |Q_1| or never open within the run; SimulationFailed
+    Raises InputError for a leak larger than the pump's mean flow |Q_1| or never open within the run; SimulationFailed
     if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
@@ -214,9 +221,9 @@ def run_with_sized_leaks(
     is_first_run = True
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate leaks with coefficients (n,).
+        """Simulate the leaks with `coefficients` (n,), and measure each leak's mean flow per unit coefficient (n,).
 
-        Returns each leak's mean flow per unit coefficient (n,), and (leaks, run).
+        Also returns a pair of the leaks with these coefficients and the trajectory.
         """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
@@ -260,18 +267,21 @@ def integrate(
     load: Force | None = None,
     feedback: Feedback | None = None,
 ) -> Trajectory:
-    """Integrate from standstill over `duration` [s], with outputs at `rate` [Hz].
+    """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    The step is the stated `step` [s], rounded down to a divisor of the output interval; or, if None, the longest, from
-    `LONGEST_STEP` down to 1/`MAX_STEP_REFINEMENT` of it, that passes the check: in short windows (`comparison_windows`)
-    half the step changes no pressure by more than `error` [Pa rms] and no detail's RMS by more than 0.1 %
-    (`StepErrorCheck`). The shortest step is taken even if it fails. `error` None omits the check of a stated step.
-    `effects`: changes of the rig's numbers within the run (`Schedule`); `load`: in addition to the rig's own;
-    `feedback`: a controller whose voltage replaces that of `inputs`; `progress` is called with the time reached [s].
+    `inputs`: command and leakage; `x_0` [m]: position at the start; `load`: in addition to the rig's own; `feedback`:
+    a controller whose voltage replaces the command; `effects`: changes of the rig's numbers within the run
+    (`Schedule`); `progress` is called with the time reached [s].
 
-    Raises InputError for a step or an error that is not positive; SimulationFailed if the step cannot resolve the rig,
-    the leak or an end stop that was hit, if a stated step fails the check, if a pressure falls below vacuum, or if a
-    state is not finite. `allow_unresolved` permits all of these but the last.
+    A stated `step` [s] is rounded down to a divisor of the output interval. If it is None, the longest step that
+    passes a check is taken, from `LONGEST_STEP` down to 1/`MAX_STEP_REFINEMENT` of it; the shortest is taken even if
+    it fails. The check integrates short windows of the run (`comparison_windows`) at half the step as well: no
+    pressure may change by more than `error` [Pa rms], and the RMS of no wavelet detail by more than 0.1 %
+    (`StepErrorCheck`). `error` None omits the check of a stated step.
+
+    Raises InputError for a step or an error that is not positive; SimulationFailed if the step cannot resolve the
+    rig, the leak or an end stop that was hit, if a stated step fails the check, if a pressure falls below vacuum, or
+    if a state is not finite. `allow_unresolved` permits all of these but the last.
     """
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
@@ -340,7 +350,10 @@ def integrate(
 
 @dataclass
 class _Integration:
-    """The integration of one run; `euler`: eq. (4.2) as printed (`rk4_step`); `reached` [s]: time last reported."""
+    """The integration of one run with its inputs and settings.
+
+    `euler`: True if eq. (4.2) is taken as printed (`rk4_step`); `reached` [s]: time last reported to `progress`.
+    """
 
     inputs: RunInputs
     schedule: Schedule
@@ -354,15 +367,20 @@ class _Integration:
     reached: float = 0.0
 
     def refuse_unresolved(self, n_steps: int) -> None:
-        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig."""
+        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig.
+
+        Leaks are not considered. Does nothing if the run may be unresolved.
+        """
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
                 refuse_unresolved(p, 1.0 / (self.rate * n_steps), self.method)
 
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
-        """Integrate the state `y` (14,) in place from output `start` to `stop`; write output k to rows[k - origin].
+        """Integrate the state `y` (14,) in place from output `start` to output `stop`; write the outputs to `rows`.
 
-        `n_steps`: number of steps from one output to the next.
+        Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next. Raises
+        SimulationFailed if a state is not finite or, unless the run may be unresolved, if the step is too long for a
+        leak or an end stop or if a pressure is below vacuum.
         """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
@@ -400,10 +418,11 @@ class _Integration:
                 self.progress(self.reached)
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Check the outputs `rows` (n, 21), integrated with steps of h [s]; rows[0] is output `first` of the run.
+        """Check outputs that were integrated with steps of h [s].
 
-        Raises SimulationFailed if one is not finite or, unless the run may be unresolved, if a pressure is below vacuum
-        or the step is too long for an end stop that was hit.
+        `rows` (n, 21): the outputs, of which the first has the index `first` in the run. Raises SimulationFailed if
+        one is not finite or, unless the run may be unresolved, if a pressure is below vacuum or the step is too long
+        for an end stop that was hit.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
@@ -429,15 +448,18 @@ class _Integration:
 
 
 def refuse_long(h: float, limit: float, what: str) -> None:
-    """Raise SimulationFailed if the step h [s] is longer than `limit` [s]; `what`: the part of the rig to resolve."""
+    """Raise SimulationFailed if the solver's step h [s] is longer than `limit` [s].
+
+    `what`: the part of the rig that needs this limit, for the message.
+    """
     if h > limit * (1.0 + 1e-9):
         raise SimulationFailed(f"step must be <= {limit:.2g} s to resolve {what}, got {h:.3g} s; take a smaller step")
 
 
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
-    """Raise SimulationFailed if steps of h [s] are too long for the rig, apart from its leaks.
+    """Raise SimulationFailed if solver steps of h [s] are too long to resolve a rig without its leaks.
 
-    `method`: rk4 or imex.
+    `p`: the rig's numbers; `method`: rk4 or imex.
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -453,7 +475,7 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 
 
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
-    """Choose the time windows in which the solver's step is checked, each as output indices (start, stop).
+    """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
     `n_out`: number of outputs of the run; `rate` [Hz]: their rate.
     """
@@ -470,11 +492,11 @@ class StepErrorCheck:
     """Comparison of a run at one solver step with the same run at half that step, window by window.
 
     `pressure_error` [Pa]: largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`:
-    largest relative difference of a wavelet detail's RMS so far.
+    largest relative difference of the RMS of a wavelet detail so far.
     """
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
-        """Begin a comparison of outputs at `rate` [Hz], with a `tolerance` [Pa rms] for pressures."""
+        """Begin a comparison of outputs at `rate` [Hz]; `tolerance` [Pa rms]: allowed difference of a pressure."""
         self._tolerance = tolerance
         self._every = max(1, round(rate / rig.daq.sample_rate))
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
@@ -483,10 +505,11 @@ class StepErrorCheck:
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
-        """Compare one more window; return the largest ratio of an error to its tolerance.
+        """Compare the two runs in one more window; return the largest ratio of an error to its tolerance.
 
-        `coarse`, `fine`: (n, 4) p_A, p_B, p_1, p_2 [Pa] at the two steps. Pressures are compared within the window, the
-        RMS of db8's d_1 .. d_4 in both chambers over all windows so far, at the recording's rate and with its noise.
+        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The pressures are compared
+        within the window. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared over all windows
+        so far, at the recording's rate and with its noise added.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -502,16 +525,16 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe the quantity whose error is largest relative to its tolerance, and the tolerance."""
+        """Describe in words the error that is largest relative to its tolerance, and this tolerance."""
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE
         return f"the RMS of a detail by {error:.3g} %, which must be <= {tolerance:.3g} %"
 
     def _add_detail_squares(self, coarse: Array, fine: Array) -> None:
-        """Add the squared wavelet details of a window to the sums.
+        """Add the squared wavelet details of both runs in a window to the sums over all windows.
 
-        The ends of the window, where the filters reach beyond it, are left out.
+        Samples near the ends of the window, where the wavelet's filters reach beyond it, are left out.
         """
         import pywt
 

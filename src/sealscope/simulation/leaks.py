@@ -33,7 +33,11 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 
 
 def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
-    """Make an opening that rises from 0 to 1 within `ramp` [s] from `start` [s] on, and falls again from `stop` on."""
+    """Make the opening of a leak or fault that begins at `start` and ends at `stop` [s].
+
+    It rises from 0 to 1 within `ramp` [s] from `start` on, and falls back to 0 within `ramp` from `stop` on. Raises
+    InputError if the times do not fit together.
+    """
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")
     if not stop >= start + ramp:
@@ -47,7 +51,10 @@ def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) 
 
 
 def growing_opening(start: float, stop: float) -> Polyline:
-    """Make an opening that rises linearly from 0 at `start` to 1 at `stop` [s] and stays there."""
+    """Make the opening of a leak or fault that grows linearly from 0 at `start` to 1 at `stop` [s].
+
+    It stays at 1 afterwards. Raises InputError unless `stop` is after `start`.
+    """
     if not stop > start:
         raise InputError(f"a growing leak must stop growing after it starts, got {start:g} s to {stop:g} s")
     words = f"growing from {format_number(start)} s to {format_number(stop)} s"
@@ -56,9 +63,9 @@ def growing_opening(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """Opening of a laminar leak in oil of changing viscosity: `opening` divided by the relative viscosity.
+    """The opening of a laminar leak in oil of changing viscosity: `opening` divided by the oil's relative viscosity.
 
-    `viscosity(t)`: the oil's viscosity at times t [s] relative to the rig's.
+    `viscosity(t)`: the oil's viscosity at times t [s], relative to the one that the leak's coefficient assumes.
     """
 
     opening: Opening
@@ -66,7 +73,7 @@ class Thinned:
     rise: ClassVar[None] = None
 
     def value_at(self, t: Array) -> Array:
-        """Compute the opening divided by the relative viscosity at times t [s]."""
+        """Compute the opening at times t [s], divided by the oil's relative viscosity."""
         return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:
@@ -83,11 +90,12 @@ Opening: TypeAlias = Polyline | Thinned
 
 @dataclass(frozen=True)
 class Leak:
-    """A leak across the piston.
+    """A leak across the piston, from chamber A to B.
 
-    `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C [m^3/(s
-    Pa^0.5)] (needle valve). Its size at full opening is either `coefficient` (G or C), or `mean` [m^3/s], the mean of
-    abs(Q_L) over the run; `sizing` then finds the coefficient.
+    `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C
+    [m^3/(s Pa^0.5)] (needle valve). The size at full opening is stated either as `coefficient` (G or C) or as `mean`
+    [m^3/s], the mean |Q| while the leak is open (`sizing.mean_while_open`), for which `sizing` then finds the
+    coefficient. `opening`: how far the leak is open over time, 0 to 1.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
@@ -107,14 +115,17 @@ class Leak:
             raise InputError(f"openings of a leak must be in 0..1, got {self.opening}")
 
     def __str__(self) -> str:
-        """Format the text that `parse_leak` reads."""
+        """Format the leak as the text that `parse_leak` reads."""
         if self.mean is not None:
             return f"{self.mean / LITRE_PER_MINUTE:g} L/min {self.law} {self.opening}"
         return f"{'G' if self.law == 'laminar' else 'C'} = {self.coefficient:g} {self.opening}"
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening from the times in a match's groups (such as of `WHEN`); without times it is open from t = 0."""
+    """Build the opening of a leak or fault from the times in the named groups of a match, such as of `WHEN`.
+
+    Without times it is fully open from t = 0 on.
+    """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))
     until = groups.get("until")
@@ -126,10 +137,10 @@ def parse_opening(groups: Groups) -> Polyline:
 
 
 def parse_leak(text: str) -> Leak | None:
-    """Parse a leak; return None for ``none``.
+    """Parse the text of a leak across the piston, such as "0.0042 L/min from 90 s"; return None for ``none``.
 
-    The file of ``table FILE`` has the columns `t [s]` and `q_leak [L/min]`, the mean flow at each time. Raises
-    InputError, which lists the forms, if the text has none of them.
+    ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`, the mean flow at each time. Raises
+    InputError, which lists all forms, if the text has none of them.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):

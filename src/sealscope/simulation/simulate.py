@@ -50,8 +50,8 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 class Truth:
     """The true leaks, faults, drifts and noise-free outputs of a run, which its recording does not contain.
 
-    `outputs`: values at the samples `t` [s]. Of the leaks across the piston, `onset_s` is the time at which the first
-    one opens, None if none does, and `mean_leak_lpm` the sum of their mean flows while open.
+    `onset_s`: time [s] at which the first leak across the piston opens, None if none does; `mean_leak_lpm`: sum of
+    the leaks' mean flows while open [L/min]; `outputs`: outputs by name at the samples' times `t` [s].
     """
 
     leaks: tuple[Leak, ...]
@@ -65,9 +65,10 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """Change of one quantity when the solver's step is halved.
+    """The change of one quantity of a run when the solver's step is halved.
 
-    `difference` and `tolerance` are in `unit`; a `tolerance` of None sets no limit.
+    `name`: the quantity; `difference` and `tolerance`, the largest difference allowed, are in `unit`. A `tolerance`
+    of None sets no limit.
     """
 
     name: str
@@ -77,15 +78,15 @@ class Difference:
 
     @property
     def resolved(self) -> bool:
-        """True if the difference is within its tolerance."""
+        """True if the difference is within its tolerance, or if there is no tolerance."""
         return self.tolerance is None or self.difference <= self.tolerance
 
 
 @dataclass(frozen=True)
 class Proof:
-    """Comparison of an experiment at a solver step and at half of it.
+    """Comparison of an experiment's run at a solver step with its run at half that step.
 
-    `step`, `halved` [s]: both steps; `differences`: the change of each quantity.
+    `step`, `halved` [s]: both steps; `method`: rk4 or imex; `differences`: the change of each quantity.
     """
 
     method: str
@@ -95,7 +96,7 @@ class Proof:
 
     @property
     def resolved(self) -> bool:
-        """True if every difference is within its tolerance."""
+        """True if every difference between the two runs is within its tolerance."""
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
@@ -108,21 +109,21 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the difference that is largest relative to its tolerance."""
+        """Find the quantity whose difference between the two runs is largest relative to its tolerance."""
         limited_rows = [row for row in self.differences if row.tolerance]
         return max(limited_rows, key=lambda row: row.difference / (row.tolerance or math.inf))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, its truth, and the proof if one was requested."""
+    """A simulated experiment: the recording, the truth about it, and the proof of its step if one was requested."""
 
     recording: Recording
     truth: Truth
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Describe the run in lines of text: solver and step, leaks, other faults, and mean flows."""
+        """Describe the run in lines of text: solver and step, leaks, other faults, and the mean flows."""
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
         lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
@@ -165,9 +166,10 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
 
     def make_reporter(task: str) -> Callable[[float], None]:
-        """Build the function that reports the progress of a task from the simulated time [s]."""
+        """Build the function that reports the progress of `task`, called with the simulated time reached [s]."""
 
         def report(time: float) -> None:
+            """Report the completed fraction of the task at the simulated `time` [s]."""
             if progress is not None:
                 progress(task, min(1.0, time / experiment.duration))
 
@@ -220,7 +222,8 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
     """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
-    With a servo valve the first two are those of the supply.
+    `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). Returns arrays by the names P_electric, P_hydraulic and
+    P_mechanical. In a rig with a servo valve the first two are those of the motor and pump that feed the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
@@ -235,7 +238,11 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 
 
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
-    """Compare two trajectories of an experiment: rms difference of each channel, and change of each detail's RMS."""
+    """Compute the differences between two runs of an experiment, one at a solver step and one at a shorter step.
+
+    There is one difference for the rms of each state and pressure, and one for the RMS of each wavelet detail of p_A
+    and p_B, noise included.
+    """
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms
 
@@ -289,10 +296,11 @@ def prove(experiment: Experiment, progress: Progress | None = None) -> Proof:
 
 
 def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
-    """Write the truth of a run as JSON, without its outputs.
+    """Write the truth about a run as JSON, without its outputs.
 
-    It contains leaks with their coefficients, onset [s], mean leak while open [L/min], other faults with their onsets
-    [s], and for each drift its range and its change from start to end, in per cent or in the SI unit.
+    The file contains the leaks with their coefficients, the onset [s], the mean leak while open [L/min], the other
+    faults with their onsets [s], and for each drift its range and its change from start to end, in per cent or in the
+    SI unit.
     """
     tree: dict[str, Any] = {
         "onset_s": truth.onset_s,
@@ -314,9 +322,9 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Describe a drift over the times t [s] by its range and its change from start to end.
+    """Describe a drift over the times t [s] by its range (maximum minus minimum) and its change from start to end.
 
-    Relative drifts are in per cent, absolute ones in the SI unit.
+    Relative drifts are in per cent, absolute ones in the parameter's SI unit.
     """
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])

@@ -22,7 +22,10 @@ _MIN_SLOPE = 0.1
 
 
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
-    """Compute |Q_L| [m^3/s] of a leak at times t [s] under `dp` = p_A - p_B [Pa]; an orifice is linear below `dp_0`."""
+    """Compute the flow |Q_L| [m^3/s] of a leak at times t [s] under `dp` = p_A - p_B [Pa].
+
+    The flow of an orifice is linear in dp below about `dp_0` [Pa].
+    """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
     coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)  # G or C
@@ -33,9 +36,10 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Compute a leak's mean flow [m^3/s], referred to full opening; 0 if the leak never opens.
+    """Compute the mean flow [m^3/s] of a leak while it is open, referred to full opening.
 
-    `flow` (n,): |Q_L| [m^3/s] at times t (n,) [s]. Its sum is divided by the sum of the opening.
+    It is the sum of `flow` (n,), |Q_L| [m^3/s] at times `t` (n,) [s], over the sum of the leak's opening; 0 if the
+    leak never opens.
     """
     opening = leak.opening.value_at(t)
     opening_sum = float(opening.sum())
@@ -43,11 +47,12 @@ def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
 
 
 def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[float, float]) -> float:
-    """Compute the next leakage coefficient to try, by a secant on logarithmic scales.
+    """Compute the next leakage coefficient to try in the search for a stated mean flow.
 
-    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs; if the
-    coefficient is 0, the flow is that of a coefficient of 1. The secant's slope is limited to 0.1 .. 1, a leak's range,
-    and is 1 if the runs are too close.
+    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs. A run
+    of coefficient 0 states the flow that a coefficient of 1 would have under its pressures. The next coefficient is
+    on the line through both runs on logarithmic scales, whose slope is limited to 0.1 .. 1, the range that leaks
+    have; it is taken as 1 if the two coefficients are too close.
     """
     (c_0, q_0), (c_1, q_1) = previous, latest
     if c_1 == 0.0:
@@ -64,13 +69,13 @@ def size_leaks(
     measure: Callable[[Array], tuple[Array, T]],
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Array, T]:
-    """Find the leakage coefficients (n,) that give the leaks' stated mean flows.
+    """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
-    `coefficients`: first values, which stay for leaks without a stated mean; `measure(coefficients)` runs the rig and
-    returns each mean flow per unit coefficient (n,), and any other result. Returns the coefficients and that other
-    result of their run. A small leak's flow is proportional to its coefficient, because friction sets the pressure
-    difference; a large leak's flow grows less, and its coefficient follows a secant (`next_coefficient`). Raises
-    SimulationFailed if the search does not converge.
+    `coefficients`: values to start from; they stay for leaks without a stated mean. `measure(coefficients)` simulates
+    the rig and returns each leak's mean flow per unit coefficient (n,), and any other result of the run. Returns the
+    coefficients, and this other result for them. A small leak's flow is proportional to its coefficient, because
+    friction sets the pressure difference; a large leak's flow grows less, so that its coefficient is found step by
+    step (`next_coefficient`). Raises SimulationFailed if the search does not converge.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

@@ -40,13 +40,16 @@ Breakpoints = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Position:
-    """A position target x = signal(t) [m] from mid-stroke, which a controller follows; `words`: its text."""
+    """A target for the piston's position over time, which a controller follows.
+
+    x = signal(t) [m], from mid-stroke; `words`: text of the signal.
+    """
 
     signal: Command
     words: str
 
     def value_at(self, t: Array) -> Array:
-        """Compute the target [m] at times t [s]."""
+        """Compute the target position [m] at times t [s]."""
         return self.signal.volts(t)
 
     def __str__(self) -> str:
@@ -57,8 +60,8 @@ class Position:
 class Force:
     """An additional load on the piston against +x: F = signal(t) + f(x) + g(v) [N].
 
-    `words`: text of the load; `over_x`, `over_v`: the piecewise linear f over position [m] and g over velocity [m/s] of
-    the piston.
+    `words`: text of the load; `over_x`, `over_v`: the piecewise linear functions f of the piston's position x [m] and
+    g of its velocity v [m/s], as breakpoints; () for none.
     """
 
     signal: Command
@@ -67,11 +70,14 @@ class Force:
     over_v: Breakpoints = ()
 
     def value_at(self, t: Array) -> Array:
-        """Compute signal(t), the part of the force [N] that depends on time t [s] alone."""
+        """Compute the part of the load [N] that depends on time alone, at times t [s]."""
         return self.signal.volts(t)
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the breakpoints over x and over v for `piecewise_linear_force`; None if the load depends on neither."""
+        """Build the load's breakpoints over position and over velocity as two arrays for `piecewise_linear_force`.
+
+        Returns None if the load depends on time alone.
+        """
         if not (self.over_x or self.over_v):
             return None
         x, v = (np.array(breakpoints or ((0.0, 0.0),), dtype=np.float64) for breakpoints in (self.over_x, self.over_v))
@@ -82,7 +88,10 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the compiled model's parameters of a rig under an additional load; None: without one."""
+    """Build the numbers of a rig for the compiled model, including a load in addition to the rig's own.
+
+    `load`: the additional load, None for none.
+    """
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
@@ -91,9 +100,9 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the state (14,) at t = 0 with the piston at standstill at x [m].
+    """Compute the state (14,) at t = 0 with the piston at rest at `x` [m].
 
-    `load`: additional load, None for none.
+    `load`: load in addition to the rig's own, None for none.
     """
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
@@ -116,9 +125,10 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
 
 
 def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
-    """Parse a signal, written as a command with units; `units` maps each allowed unit to its factor to SI units.
+    """Parse a signal over time that is written like a command but with units, such as "step 100 mm at 1 s".
 
-    `what`: name of the quantity in messages. Raises InputError for another form or a missing unit.
+    `units`: allowed units, each with its factor to SI units; `what`: name of the quantity in messages. Raises
+    InputError for a missing unit or another form.
     """
     names = "|".join(sorted(units, key=len, reverse=True))
     number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({names})\b\]?")
@@ -137,10 +147,10 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
 
 
 def parse_position(text: str) -> Position | None:
-    """Parse a target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
+    """Parse a position target such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
 
-    The words are those of `parse_command`, with a length in mm, cm or m; ``position file LOG`` is the channel x of a
-    recording. Return None if the text does not begin with ``position``.
+    The signal is written as in `parse_command`, with lengths in mm, cm or m; ``position file LOG`` takes the channel
+    x of a recording. Returns None if the text does not begin with ``position``.
     """
     words = normalize_blanks(text, "command")
     if not words.lower().startswith("position "):
@@ -158,22 +168,23 @@ def parse_position(text: str) -> Position | None:
 
 
 def command_or_target(text: str) -> Command | Position:
-    """Parse a position target, or else a command for the drive."""
+    """Parse a text as a position target if it begins with ``position``, else as a command for the drive."""
     return parse_position(text) or parse_command(text)
 
 
 class _Column(NamedTuple):
-    """A column of a table: its position in the row, and its unit as written."""
+    """A column of a table: its index in the row, and its unit as the heading states it."""
 
     position: int
     unit: str
 
 
 def _read_force(path: str, words: str) -> Force:
-    """Read a load from a text table: column ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``, in any unit.
+    """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]`` and ``v [m/s]``.
 
-    The load is linear between the rows and constant beyond them. With a column of times, columns of x and v are
-    ignored, and the first time becomes t = 0.
+    Other units are converted; `words`: text of the load. The load is linear between the rows and constant beyond
+    them. If there is a column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises
+    InputError for any other table.
     """
     with open_regular(path, "a recorded load") as file:
         head = file.readline(4096).decode("utf-8-sig", "replace")
@@ -211,14 +222,15 @@ _NO_FORCE = Sine(0.0, 0.0)
 
 
 def _unit_pattern(units: Mapping[str, float]) -> str:
-    """Build the regular expression that matches any of the units, with or without their blanks."""
+    """Build the regular expression that matches any of the units; blanks within a unit may be left out."""
     return "|".join(re.escape(unit).replace("\\ ", r"\s*") for unit in sorted(units, key=len, reverse=True))
 
 
 def _term_pattern(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
-    """Compile the pattern of a load's term over x or v (`letter`), such as ``- 5 kN/mm over x from 50 mm``.
+    """Compile the pattern of one term of a load, such as ``- 5 kN/mm over x from 50 mm``.
 
-    Groups: sign, slope, unit of slope, start, unit of start. `slopes`, `places`: units of slope and start.
+    `letter`: x or v, over which the term is; `slopes`, `places`: allowed units of slope and start. The groups are
+    sign, slope, its unit, start, and its unit.
     """
     start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(places)})\b\]?)?"
     return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_unit_pattern(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
@@ -228,11 +240,11 @@ _TERM_UNITS = {"x": (_STIFFNESSES, _LENGTHS), "v": (_DAMPINGS, _SPEEDS)}
 
 
 def parse_force(text: str) -> Force:
-    """Parse a load such as ``2 kN``, ``500 N sin(2t) + 100 N``, ``step 2 kN at 3 s`` in the words of `parse_command`.
+    """Parse the text of a load, such as ``2 kN``, ``500 N sin(2t) + 100 N`` or ``step 2 kN at 3 s``.
 
-    Terms over the piston's position or velocity may be added: ``200 N/mm over x``, ``5 kN/mm over x from 50 mm`` (0
-    below 50 mm), ``2 kN s/m over v``. ``file LOAD.csv`` is a table of ``F [N]`` over ``t [s]``, ``x [m]`` or
-    ``v [m/s]``.
+    A signal over time is written as in `parse_command`. Terms over the piston's position or velocity may be added:
+    ``200 N/mm over x``, ``5 kN/mm over x from 50 mm`` (0 below 50 mm), ``2 kN s/m over v``. ``file LOAD.csv`` is a
+    table of ``F [N]`` over ``t [s]``, ``x [m]`` or ``v [m/s]``.
     """
     words = normalize_blanks(text, "load")
     if words.lower().startswith("file "):
@@ -255,5 +267,5 @@ def parse_force(text: str) -> Force:
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Find the key of `units` that equals `unit` apart from blanks."""
+    """Find the key of `units` that equals the text `unit` apart from blanks."""
     return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

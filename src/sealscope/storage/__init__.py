@@ -1,1 +1,1 @@
-"""Files and folders of results: opened safely, written atomically, without links out of a folder."""
+"""Store results in files and folders: open them safely, write them atomically, refuse links out of a folder."""

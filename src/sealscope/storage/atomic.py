@@ -1,4 +1,4 @@
-"""Write files atomically: a file has its old or its new content, never a part of it."""
+"""Write files atomically: at any time a file has either its old or its new content, complete."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _MAX_AGE = 86_400.0
 
 
 def _machine_hash() -> str:
-    """Return a short hash of this machine's name."""
+    """Return the first 6 hexadecimal digits of the SHA-256 of this computer's name."""
     return sha256(platform.node().encode()).hexdigest()[:6]
 
 
 def check_folder(file: Path) -> None:
-    """Raise InputError if the folder of a file to write does not exist."""
+    """Check that the folder of a file to write exists; raise InputError otherwise."""
     if not file.parent.is_dir():
         raise InputError(f"the folder of a file to write must exist, got {file.parent} ({file})")
 
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary file, which replaces `path` if the block succeeds.
+    """Write a file atomically: yield the path of a temporary file, which replaces `path` if the block succeeds.
 
-    The temporary file is in the folder of `path`, and is removed if the block fails. File and folder are synced to the
-    disk, and a power loss leaves either the old or the new file. A replaced file keeps its mode. Raises InputError if
-    the folder does not exist or cannot be written.
+    The temporary file is in the folder of `path`, and is removed if the block fails. File and folder are synced to
+    the disk, so that a power loss leaves either the old or the new file. A replaced file keeps its permissions.
+    Raises InputError if the folder does not exist or cannot be written.
     """
     target = Path(path)
     try:
@@ -65,7 +65,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _file_mode(target: Path) -> int:
-    """Return the permission bits of `target`, or those of a new file if it does not exist."""
+    """Return the permission bits of the file `target`, or those of a new file if it does not exist."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -74,7 +74,7 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Sync a file, or the names in a folder, to the disk; `flags`: to open it."""
+    """Write a file, or the names in a folder, to the disk; `flags` are those of `os.open`."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
@@ -85,8 +85,9 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    `target`: name of the file that they were to become; None: any file, in subfolders too. A file is removed if its
-    process ran on this machine and has ended, others after a day. Links to folders are not followed.
+    If `target` is given, only the temporary files of the file with this name are removed, else those of any file, in
+    subfolders, too. A file is removed if its process ran on this computer and has ended, and otherwise after a day.
+    Links to folders are not followed.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
         match = _TEMPORARY.fullmatch(path.name)
@@ -99,7 +100,7 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Test whether a process of this machine runs; True if unknown."""
+    """Test whether a process of this computer is running; True if unknown."""
     if os.name == "nt":  # signal 0 would end the process
         return True
     try:

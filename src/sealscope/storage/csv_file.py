@@ -1,4 +1,4 @@
-"""Write tables as CSV files, atomically and safe for spreadsheets."""
+"""Write tables as CSV files, atomically and safe to open in a spreadsheet."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _FORMULA_BEGINNINGS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+
 
 
 def guard_cell(value: Any) -> Any:
-    """Escape a text that a spreadsheet would read as a formula or a terminal would obey; numbers stay.
+    """Escape a text that a spreadsheet would execute like a formula, or a terminal like a command.
 
-    Names and comments may come from outside. A text that begins like a formula gets an apostrophe; unprintable
-    characters are escaped.
+    Other values are returned unchanged. Names and comments may come from other people's files. A text that begins
+    like a formula gets an apostrophe in front. Unprintable characters are escaped.
     """
     if not isinstance(value, str):
         return value
@@ -29,7 +29,11 @@ def guard_cell(value: Any) -> Any:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write `rows`, column -> value, as CSV, texts escaped (`guard_cell`); raise ValueError for an unknown column."""
+    """Write rows, each a mapping from column to value, as a CSV file with the given columns.
+
+    Texts are escaped with `guard_cell`. Raises ValueError if a row has another column, and InputError if the file
+    cannot be written.
+    """
     with (
         atomic_write(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,

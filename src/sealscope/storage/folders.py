@@ -1,4 +1,4 @@
-"""Folders of results: create, list and lock them; links out of them are refused."""
+"""Create, list and lock folders of results; links that lead out of them are refused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents unless they exist; raise InputError if it cannot be created."""
+    """Create a folder and its parents if they do not exist; raise InputError if it cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -23,7 +23,7 @@ def make_folder(folder: Path) -> None:
 
 
 def make_inner_folder(folder: Path, *names: str) -> Path:
-    """Create the nested folders `names` within `folder`, which may come from outside; return the innermost.
+    """Create the nested folders `names` within `folder`, which may come from others; return the innermost one.
 
     Raises InputError if one cannot be created, or is a link.
     """
@@ -37,9 +37,9 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield the files among `paths` that are in `folder`; log links out of it and skip them.
+    """Yield those of `paths` that are files in `folder`; skip links that lead out of it, with a logged warning.
 
-    The folder may come from outside. Links within it are followed, and it may itself be a link.
+    The folder may come from others. Links that stay within it are followed, and the folder may itself be a link.
     """
     root = folder.resolve()
     for path in paths:
@@ -54,16 +54,17 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Split a name into its texts and numbers, as a sort key by which day_2 comes before day_10."""
+    """Split a name into texts and numbers, as a sort key that puts day_2 before day_10."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 
 @contextmanager
 def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
-    """Hold a lock file while the block runs; the lock also ends with the process.
+    """Hold the lock `file` against other processes while the block runs; the lock also ends with the process.
 
-    `busy`: message of the InputError if another process holds the lock for longer than `wait` [s]; None: wait without
-    limit. The file is created if necessary, and never emptied. Raises InputError if it is a link or cannot be created.
+    If another process holds the lock for longer than `wait` [s], an InputError with the message `busy` is raised; if
+    `busy` is None, there is no limit. The file is created if necessary, and never emptied. Raises InputError if it is
+    a link or cannot be created.
     """
     from filelock import FileLock, Timeout
 

@@ -1,4 +1,4 @@
-"""Open files from outside without waiting for pipes or following links out of a folder of results."""
+"""Open files that come from others, without waiting for pipes or following links out of a folder of results."""
 
 from __future__ import annotations
 
@@ -23,21 +23,24 @@ _KINDS = (
 
 
 def is_file_path(text: str | os.PathLike[str]) -> bool:
-    """Test whether a text is the path of a file; False if it is too long or has characters that paths cannot have."""
+    """Test whether a text is the path of an existing file; False also if it cannot be a path at all."""
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
 
 
 def special_kind(mode: int) -> str | None:
-    """Name the kind of a file with this `st_mode`; None for a regular file."""
+    """Return the kind of a file that is not regular, such as "a folder", from its `st_mode`.
+
+    The result is None for a regular file.
+    """
     return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
 
 
 def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
-    """Open a regular file for reading.
+    """Open a regular file for reading, in binary mode.
 
-    `what`: the file in errors, such as "a recording". Raises InputError for a folder, pipe, socket or device, and for
-    an empty file. Files in /proc, whose reading may never end, are refused as empty, too. Raises OSError if it cannot
-    be opened.
+    `what` names the file in error messages, such as "a recording". Raises InputError for a folder, pipe, socket or
+    device, and for an empty file. Files in /proc, whose reading may never end, are refused as empty, too. Raises
+    OSError if the file cannot be opened.
     """
     opened = _open_checked(path, what, "rb", _NO_WAITING)
     if not os.fstat(opened.fileno()).st_size:
@@ -47,10 +50,10 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 
 
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
-    """Open a file in a folder of results that may come from outside: `rb` to read, `ab+` to append or create.
+    """Open a file in a folder of results that may come from others: mode `rb` to read, `ab+` to append or create.
 
-    Raises InputError for a link, for other files that are not regular and, to write, for a file with several hard
-    links; OSError if it cannot be opened.
+    `what` names the file in error messages. Raises InputError for a link, for other files that are not regular and,
+    when writing, for a file with several hard links. Raises OSError if it cannot be opened.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")
@@ -58,7 +61,10 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a file with the system's flags `extra_flags`; raise InputError unless it is a regular file."""
+    """Open a file with additional flags of `os.open`; raise InputError unless it is a regular file.
+
+    A file to write must not have several hard links.
+    """
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:
         descriptor = os.open(
@@ -78,9 +84,10 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
 
 @contextmanager
 def raising_unreadable(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
-    """Convert any error of a damaged file in the block to an UnreadableFile of one line; the original is logged.
+    """Convert any error that a damaged file causes in the block to an UnreadableFile of one line.
 
-    `what` ("a rig") and `place` appear in the message. MissingExtra and UnreadableFile pass unchanged.
+    `what`, such as "a rig", and the path `place` appear in the message. MissingExtra and UnreadableFile are not
+    changed. Unexpected errors are also logged.
     """
     try:
         yield

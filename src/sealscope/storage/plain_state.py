@@ -20,7 +20,7 @@ _MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to its shape and bytes (little endian, base64).
+    """Convert an array of numbers to a mapping of its shape and its bytes (little endian, base64).
 
     The columns of a structured array become the last axis, without names.
     """
@@ -29,18 +29,24 @@ def plain_array(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a structured array of floats to an array with the columns as last axis."""
+    """Convert a structured array of floats to a plain array whose last axis holds the columns.
+
+    A plain array is returned unchanged.
+    """
     names = values.dtype.names
     return values if names is None else values.view(float).reshape(*values.shape, len(names))
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
-    """Convert a dataclass of plain values to a mapping; lists are copied, as they may grow."""
+    """Convert a dataclass whose fields are plain values to a dict.
+
+    Lists are copied, as the original ones may grow.
+    """
     return {name: list(value) if isinstance(value, list) else value for name, value in vars(values).items()}
 
 
 def restore(kind: type[_T], state: Any, name: str) -> _T:
-    """Restore a part of a saved state as the dataclass `kind`; raise InputError if it does not fit."""
+    """Convert a part of a saved state to the type `kind`; raise InputError, with its `name`, if it does not fit."""
     try:
         return convert_type(kind, state)
     except ValueError as error:
@@ -50,7 +56,7 @@ def restore(kind: type[_T], state: Any, name: str) -> _T:
 def restore_array(value: Any, name: str) -> NDArray[np.float64]:
     """Restore an array from the mapping that `plain_array` made.
 
-    Raises InputError with `name` for any other value.
+    Raises InputError, with its `name`, for other values.
     """
     try:
         shape = tuple(int(size) for size in value["shape"])
@@ -63,10 +69,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the entry `name` of a saved state.
-
-    Raises InputError if it is missing or not of the type `kind`.
-    """
+    """Return the entry `name` of a saved state; raise InputError if it is missing or not of the type `kind`."""
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -76,9 +79,9 @@ def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
 
 
 def require_count(state: Any, name: str) -> int:
-    """Return the entry `name` of a saved state, a whole number >= 0.
+    """Return the entry `name` of a saved state, which must be a whole number of 0 or more.
 
-    Raises InputError for any other value.
+    Raises InputError otherwise.
     """
     value = require_part(state, name, object)
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
@@ -87,10 +90,7 @@ def require_count(state: Any, name: str) -> int:
 
 
 def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the entry `name` of a saved state as an array of this shape.
-
-    Raises InputError if it does not fit.
-    """
+    """Return the entry `name` of a saved state as an array of this shape; raise InputError if it does not fit."""
     try:
         values = np.asarray(require_part(state, name, object))
         if values.size and values.dtype.kind not in "fi":
@@ -103,16 +103,16 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 
 
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Convert the named attributes of `owner` to plain values, which `restore_attributes` reads.
+    """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a `state`. Numbers that are not finite
-    become null.
+    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a method `state`. Numbers that are not
+    finite become None. Keys of the result are the names without leading underscores.
     """
     return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Convert one attribute to a plain value."""
+    """Convert one attribute to a plain value (`save_attributes`)."""
     if callable(getattr(value, "state", None)):
         return value.state()
     if is_dataclass(value):
@@ -127,10 +127,12 @@ def _to_plain_value(value: Any) -> Any:
 def restore_attributes(
     owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
-    """Set attributes of `owner` to the values from `save_attributes`; null leaves an attribute unchanged.
+    """Set the attributes of `owner` called `names` to the values that `save_attributes` saved.
 
-    `kinds`: types of attributes that may be None or of another type. Raises InputError if one is missing or differs
-    from the present one in type, or in the shape of an array except for empty axes.
+    None leaves an attribute unchanged that is a number or None. `kinds` gives the types of attributes that may be
+    None or may have another type than the present value. Raises InputError if an attribute is missing in `state`, or
+    differs from the present value in type or in the shape of an array; axes that are empty at present may have any
+    length.
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)

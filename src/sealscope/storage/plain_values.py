@@ -1,4 +1,4 @@
-"""Plain values from outside: JSON with finite numbers, and conversion to expected types."""
+"""Read plain values from others: parse JSON with finite numbers only, and convert values to expected types."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ MAX_WHOLE = 2**53
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse a JSON text; raise ValueError for other texts and for numbers out of range.
+    """Parse a JSON text; raise ValueError if it is not valid, or has a number that is too large or not finite.
 
-    Numbers must be finite, and whole numbers at most 2^53.
+    Whole numbers may be at most 2^53.
     """
     try:
         return json.loads(text, parse_float=_parse_finite, parse_int=_parse_whole, parse_constant=_parse_finite)
@@ -30,7 +30,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _parse_finite(text: str) -> float:
-    """Parse a finite number; raise ValueError otherwise."""
+    """Parse a number; raise ValueError if it is not finite."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"a number must be finite, got {text[:40]}")
@@ -38,7 +38,7 @@ def _parse_finite(text: str) -> float:
 
 
 def _parse_whole(text: str) -> int:
-    """Parse a whole number of at most 2^53; raise ValueError otherwise."""
+    """Parse a whole number; raise ValueError if its size exceeds 2^53."""
     if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # the time of int grows with the square
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
@@ -46,17 +46,17 @@ def _parse_whole(text: str) -> int:
 
 @cache
 def _type_adapter(kind: Any) -> Any:
-    """Make pydantic's validator of a type; it is cached, as this takes long."""
+    """Make pydantic's validator for a type; it is cached, as this takes long."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
 
 
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
-    """Convert plain values to the dataclass or model `kind`; raise ValueError if they do not fit.
+    """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    The error is one line and names no file. `entry_name`: entry of `value` -> its name in the error; `context`: passed
-    to the validators of `kind`.
+    The error is one line and names no file. `entry_name` converts an entry of `value` to its name in the error.
+    `context` is passed to the validators of `kind`.
     """
     from pydantic import ValidationError
 
@@ -74,10 +74,10 @@ _PLAIN_RULES = {
 
 
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format pydantic's first error as "ENTRY must be ..., got ...".
+    """Format the first error of pydantic as one line, "ENTRY must be ..., got ...".
 
-    Unknown entries come before other errors. `entry_name`: entry ("" for the whole value) -> its name; `unit`: appended
-    to the rule.
+    Unknown entries come before other errors. `entry_name` converts an entry ("" for the whole value) to its name in
+    the text. `unit` is appended to the rule.
     """
     errors = error.errors(include_url=False)
     first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
@@ -93,7 +93,10 @@ def format_error(error: ValidationError, entry_name: Callable[[str], str] = str,
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a value for JSON: dataclasses and named tuples to dicts, tuples to lists, non-finite numbers to None."""
+    """Convert a value to plain values for JSON, at any depth.
+
+    Dataclasses and named tuples become dicts, tuples become lists, and numbers that are not finite become None.
+    """
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Store the rows of finished jobs in a folder: each is on the disk before the next, so that a run can be resumed."""
+"""Store the results of jobs as rows of a file, each on the disk before the next, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _MAX_LINE = 10_000_000
 
 
 class StoredRow(Protocol):
-    """A row that can be stored, with an `id` and plain JSON values."""
+    """The result of a job that can be stored: it has an `id` and converts to plain JSON values."""
 
     @property
     def id(self) -> str:
-        """Name of the job, by which a later row replaces an earlier one."""
+        """Name of the job; a later row of the same job replaces an earlier one."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain JSON values."""
+        """Return the row as plain values for JSON."""
 
 
 Row = TypeVar("Row", bound=StoredRow)
@@ -37,10 +37,11 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Read the rows of a folder, id -> its last row; a truncated last line is ignored.
+    """Read the rows that were stored in a folder, and return the last row of each job by its id.
 
-    `row_of`: makes a row of a line's JSON value, or None for a row to be ignored; `what`: the folder's name in errors.
-    Raises UnreadableFile for a line that is no row, with its place.
+    `row_of` makes a row from the JSON value of a line, or None for a line to ignore, and `parse` parses a line.
+    `what` names the folder in errors. A last line that was cut off is ignored, and a missing file has no rows. Raises
+    UnreadableFile, with the place, for a line that is not a row.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -66,10 +67,10 @@ def read_rows(
 
 
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
-    """Append each row to the file in a folder when its job ends, then yield the row.
+    """Append each row to the file in a folder as soon as its job ends, then yield the row.
 
-    `rows` is closed at the end; `what`: the folder in errors. Raises ValueError for a row with a number that is not
-    finite, unless `allow_nan`.
+    `rows` is closed at the end, and `what` names the folder in errors. Raises ValueError for a row with a number that
+    is not finite, unless `allow_nan`, and InputError if the file cannot be written.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
@@ -89,7 +90,11 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
 
 @contextmanager
 def lock_rows(folder: Path, what: str) -> Iterator[None]:
-    """Lock a folder's rows while the block runs, or until the process ends; raise InputError if they are locked."""
+    """Lock the rows of a folder against other processes while the block runs, and remove old temporary files.
+
+    The lock also ends with the process. Raises InputError if another process holds it; `what` names the folder in the
+    message.
+    """
     busy = f"{what} must be run by one process at a time, got another at work ({folder})"
     with folders.lock_file(folder / LOCK, busy):
         remove_temporaries(folder)

@@ -1,4 +1,4 @@
-"""Read TOML: files from outside, with limits and errors of one line, and a package's priors."""
+"""Read TOML files: those that come from others, with limits and errors of one line, and the priors of a package."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(
 
 
 def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Read the tables of the TOML file `path`; `what` ("a rig file") and `place` name it in errors.
+    """Read the TOML file at `path`; `what` ("a rig file") and `place` name it in error messages.
 
-    Raises InputError if it cannot be read, is larger than `max_size` [bytes], is not UTF-8 or not TOML, or has a whole
-    number over 2^53 or a key with more than 30 dots.
+    Raises InputError if it cannot be read, is larger than `max_size` [bytes], is not UTF-8 or not TOML, has a whole
+    number over 2^53 or a key with more than 30 dots, or would take too much memory.
     """
     try:
         with open_regular(path, what) as file:
@@ -45,7 +45,7 @@ def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> di
 
 
 def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Parse the bytes of a TOML file; errors and limits as in `read_toml`."""
+    """Parse the bytes of a TOML file; arguments, errors and limits are those of `read_toml`."""
     if len(data) > max_size:
         raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
@@ -68,7 +68,7 @@ def read_model(
 ) -> _T:
     """Convert the tables of a TOML file to the model or dataclass `kind` (`plain_values.convert_type`).
 
-    Raises InputError that names the entry, the rule, the value and the `place`.
+    Raises InputError, with the `place`, if a value does not fit; the message names the entry, the rule and the value.
     """
     try:
         return convert_type(kind, tree, entry_name, context)
@@ -78,9 +78,10 @@ def read_model(
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class PriorTable:
-    """A frozen table of priors; a subclass annotates its keys, with a default for each optional one.
+    """A table of priors that cannot be changed.
 
-    Type checkers treat it as a frozen dataclass, whose creation at import would take ten times longer.
+    A subclass annotates its keys, and gives a default for each optional one. Type checkers treat it as a frozen
+    dataclass. A real dataclass would take ten times longer to create at import.
     """
 
     def __init__(self, **values: Any) -> None:
@@ -91,10 +92,11 @@ class PriorTable:
 
 
 def read_priors(package: str, kind: type[_T]) -> _T:
-    """Read a package's `priors.toml` as the `PriorTable` of its tables.
+    """Read the `priors.toml` of a package, as an object of the class `kind`.
 
-    A field of `kind` is a `PriorTable` or mapping with numbers and tuples as values. Each row of the file has value,
-    unit and source. Raises InputError that names file, table, key and rule.
+    The fields of `kind` are the tables of the file. Each is a `PriorTable` or a mapping, with numbers and tuples as
+    values. Each row of the file must have value, unit and source. Raises InputError that names file, table, key and
+    rule.
     """
     place = f"{package.replace('.', '/')}/priors.toml"
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
@@ -104,7 +106,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert the rows of a table to the type `kind`, a `PriorTable` or a mapping."""
+    """Convert the rows of a table to the type `kind`, a `PriorTable` or a mapping; `place` names it in errors."""
     is_mapping, optional = get_origin(kind) is not None, tuple[str, ...]()
     if is_mapping:
         names, value_kind = get_args(kind)
@@ -118,7 +120,7 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
 
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Parse the value of a row {value, unit, source} to `kind`: an int, a tuple of numbers, or else a float."""
+    """Return the value of a row {value, unit, source} as `kind`: an int, a tuple of numbers, or else a float."""
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
     if get_origin(kind) is tuple:
@@ -138,7 +140,10 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 
 
 def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Raise InputError unless the keys of a table are `names`; `optional` ones may be absent."""
+    """Check that the keys of a table are `names`, of which `optional` ones may be absent.
+
+    Raises InputError otherwise.
+    """
     for name in rows:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")
@@ -148,7 +153,7 @@ def _check_keys(rows: Collection[str], names: Collection[str], optional: Collect
 
 
 def _estimate_memory(text: str) -> int:
-    """Estimate an upper limit of the memory [bytes] that a parsed TOML text takes, without parsing it."""
+    """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed."""
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
         if line.lstrip().startswith("[["):  # an element of an array of tables
@@ -162,7 +167,10 @@ def _estimate_memory(text: str) -> int:
 
 
 def _check_whole_numbers(value: Any) -> None:
-    """Raise ValueError for a whole number over 2^53 in a value, or in its tables and arrays."""
+    """Check that no whole number in a value, or in its tables and arrays, exceeds 2^53.
+
+    Raises ValueError otherwise.
+    """
     if isinstance(value, int) and abs(value) > MAX_WHOLE:
         raise ValueError("a whole number must be at most 2^53 in size")
     for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():

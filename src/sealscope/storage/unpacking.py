@@ -1,4 +1,4 @@
-"""Limits on the unpacked size of a packed file, checked before memory or disk is used."""
+"""Limit the size that a packed file may unpack to, before it uses memory or disk."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _MIN_LIMIT, _MAX_EXPANSION = 2**26, 200
 
 
 def max_unpacked_size(path: Path) -> int:
-    """Compute the largest size [bytes] that a packed file may unpack to.
+    """Compute the largest size [bytes] that the packed file at `path` may unpack to.
 
-    It is 200 times the size on the disk, without the holes of a sparse file, but at least 64 MiB and at most 8 GiB.
-    Logs shrink to a tenth, those of constant channels to a hundredth.
+    It is 200 times the size on the disk, but at least 64 MiB and at most 8 GiB. The holes of a sparse file do not
+    count as size on the disk. Logs usually shrink to a tenth, and logs of constant channels to a hundredth.
     """
     status = path.stat()
     disk_bytes = 512 * getattr(status, "st_blocks", 0)  # 0 where the file system does not say
@@ -24,7 +24,10 @@ def max_unpacked_size(path: Path) -> int:
 
 
 def check_unpacked(size: int, max_bytes: int, place: str | Path) -> None:
-    """Raise UnreadableFile if a file unpacks to more than `max_bytes` bytes (`max_unpacked_size`)."""
+    """Check that an unpacked `size` is at most `max_bytes` (`max_unpacked_size`); raise UnreadableFile otherwise.
+
+    `place` is the path of the file in the message.
+    """
     if size > max_bytes:
         raise UnreadableFile(
             f"a packed file must unpack to at most {max_bytes} bytes, got {size} or more: unpack it, or export it as "

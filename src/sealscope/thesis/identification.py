@@ -44,12 +44,12 @@ def noise_free_mean_squares(
     x_0: float = 0.0,
     values: Mapping[str, float | str] | None = None,
 ) -> Array:
-    """Simulate a condition and compute the mean squares of its wavelet details, without noise.
+    """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
-    Returns those of d1..d4 [psi^2] and d3d4 [psi^4] as (chambers, 5). The pressures are sampled at the rig's rate
-    behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as text, sized on the rig;
-    `values`: parameters that override those of the condition; `x_0` [m]: start of the piston. Raises the errors of the
-    simulation.
+    Returns those of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are sampled at the
+    rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as text, for which
+    the rig's leakage coefficient is found; `x_0` [m]: start of the piston; `values`: parameters that override those
+    of the test. Raises the errors of the simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -62,9 +62,10 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute the log RMS of d1..d4, d3d4, (..., 5), with noise of standard deviation `sigma` [psi].
+    """Compute the logarithm of the RMS of d1..d4 and d3d4, (..., 5), of pressures with white noise.
 
-    `squares`: noise-free mean squares, (..., 5).
+    `squares` (..., 5): mean squares of these wavelet details without noise; `sigma` [psi]: standard deviation of the
+    noise. The formulas are in the module's docstring.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -74,9 +75,9 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 
 def pressure_noise(rig: Rig, chamber: str) -> float:
-    """Compute the standard deviation [psi] of the noise in a sample of a chamber's pressure.
+    """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
 
-    The variances of the sensor's noise, of the common noise and of the quantisation, step^2/12, add up.
+    It combines the noise of the sensor, the noise common to all sensors, and the quantisation of variance step^2/12.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -84,7 +85,11 @@ def pressure_noise(rig: Rig, chamber: str) -> float:
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
-    """Compute log(simulated/measured) of the leak-free RMS of every test, (tests, 2, 5), at the rig's rate."""
+    """Compare the rig's simulated leak-free RMS with the measured one in every test of Appendix C.
+
+    Returns log(simulated/measured) as (tests, chambers, 5) for the wavelet details d1..d4 and d3d4. The rig is
+    simulated at its own sampling rate.
+    """
     group_squares = {}
     for command, closed_pct in groups():  # the number and the level have no effect
         condition = Condition(0, command, closed_pct, mean_leak_lpm=0.0, level="")
@@ -100,10 +105,11 @@ class Hypothesis:
     """A possible difference between the real rig and the identified one.
 
     The identified model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C, however, d3 of
-    p_A falls with the leak while d4 of p_B rises. `overrides`: parameters in both halves of a test; `factors`: factors
-    of parameters in both halves; `leaking_factors`: further factors in the half with the leak; `x_0`, `x_0_leaking`
-    [m]: start of the piston in the two halves; `extra_closing_B`: fraction by which throttle B is closed further than
-    A; `gain_B`: gain of the pressure sensor B; `law`: law of the leak.
+    p_A falls with the leak while d4 of p_B rises. `overrides`: parameters in both halves of a test; `factors`:
+    factors of parameters in both halves; `leaking_factors`: further factors in the half with the leak; `x_0`,
+    `x_0_leaking` [m]: start of the piston in the half without and in the half with the leak; `extra_closing_B`:
+    fraction by which throttle B is closed further than A; `gain_B`: gain of the pressure sensor B; `law`: law of the
+    leak.
     """
 
     name: str
@@ -124,7 +130,10 @@ HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hy
 def predicted_sheet(
     rig: Rig, hypothesis: Hypothesis = HYPOTHESES[0], conditions: tuple[Condition, ...] = APPENDIX_C
 ) -> DataSheet:
-    """Simulate the tests without and with their leaks on the rig under a hypothesis; return the data sheet [psi]."""
+    """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
+
+    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, that of d3d4 in psi^2.
+    """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
@@ -146,12 +155,12 @@ def predicted_sheet(
 
 
 def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    """Multiply parameters of a rig by factors."""
+    """Multiply parameters of a rig by factors, given by the parameter's name; return the new rig."""
     return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the parameters in which the identified rig differs from the thesis's."""
+    """Tabulate the parameters in which the identified rig differs from the thesis's rig, with their sources."""
     fitted, thesis_rows = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
@@ -163,7 +172,10 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the ratio of simulated to measured leak-free RMS: geometric means over all tests and by condition."""
+    """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail.
+
+    Returns two tables: geometric means over all tests of Appendix C, and over the tests of each operating condition.
+    """
     assert context.sheet is not None
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
     columns = [(c, q, residuals[:, k, j]) for k, c in enumerate(CHAMBERS) for j, q in enumerate(QUANTITIES)]
@@ -182,9 +194,10 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Compare each hypothesis with the sheet: leak-free RMS, mean change with the leak, and its sign.
+    """Tabulate how well the rig under each hypothesis agrees with the measured data sheet.
 
-    A sign is right if the change with the leak has the sign of the sheet's change in the same test.
+    The columns are the ratio of the leak-free RMS, the mean change with the leak, and the number of tests in which
+    the change has the sign of the measured change. A quick reproduction simulates only the first two hypotheses.
     """
     assert context.sheet is not None
     sheet = context.sheet
@@ -195,6 +208,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     heads += [f"{c} {q} sign right [of 41]" for c, q in level_columns]
 
     def signs(sheet: DataSheet, c: str, q: str) -> Array:
+        """Return the sign of the change with the leak in each test of a data sheet, (tests,)."""
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
     measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in change_columns]

@@ -39,11 +39,11 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 
 @dataclass(frozen=True)
 class Condition:
-    """One test of Appendix C; `number` counts the rows from 1, in the order printed.
+    """The inputs of one test of Appendix C; `number` counts the tests from 1, in the order printed.
 
-    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak [L/min]
-    after the bypass valve was opened; `level`: position of the needle, which does not determine the leak (10 to
-    16 mL/min for "large", 4 to 14 for "extra-small").
+    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak
+    [L/min] after the bypass valve was opened; `level`: position of the bypass's needle valve, which does not
+    determine the leak (10 to 16 mL/min for "large", 4 to 14 for "extra-small").
     """
 
     number: int
@@ -54,15 +54,15 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Operating condition (command, closing [%]), which several tests repeat."""
+        """Operating condition (command, closing [%]) of the test, which other tests may have, too."""
         return self.command, self.closed_pct
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Return the rig's parameters for a test, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+    """Return the rig parameters of a test by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
-    Both throttles are closed equally. If they are fully open, `line.orifices` is left as the rig has it: absent in the
-    thesis's model (section 4.2.1), present in a rig that includes the open valves.
+    Both throttles are closed equally. If they are fully open, `line.orifices` is left as the rig has it: absent in
+    the thesis's model (section 4.2.1), present in a rig that includes the open valves.
     """
     closed = condition.closed_pct / 100.0
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
@@ -72,7 +72,7 @@ def experiment_values(condition: Condition) -> dict[str, str | float]:
 
 
 def _read_conditions() -> Iterator[Condition]:
-    """Yield the tests of `appendix_c.csv`."""
+    """Read the inputs of the tests of Appendix C from `appendix_c.csv`, one by one."""
     _, *lines = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
     for number, (command, closed_pct, leak, level) in enumerate(csv.reader(lines), 1):
         yield Condition(number, command, float(closed_pct), float(leak), level)
@@ -84,12 +84,12 @@ APPENDIX_C: tuple[Condition, ...] = tuple(_read_conditions())
 
 
 def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
-    """List the distinct operating conditions (command, closing [%]) in order of first appearance."""
+    """List the distinct operating conditions (command, closing [%]) of some tests, in order of first appearance."""
     return tuple(dict.fromkeys(condition.group for condition in conditions))
 
 
 def mean_leaks() -> Array:
-    """Return the mean leak of each test [L/min], (n,)."""
+    """Return the mean leak [L/min] of each test of Appendix C, (tests,)."""
     return np.array([row.mean_leak_lpm for row in APPENDIX_C])
 
 
@@ -97,8 +97,8 @@ def mean_leaks() -> Array:
 class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
-    `rms[chamber][quantity]`: RMS without and with the leak, (tests, 2), for the chambers "p_A" and "p_B" and the
-    details `QUANTITIES`; the rows are in the order of `APPENDIX_C`.
+    `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chambers "p_A" and "p_B" and the
+    wavelet details `QUANTITIES`; the tests are in the order of `APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
@@ -109,15 +109,19 @@ class DataSheet:
         return len(self.rms["p_A"]["d3"])
 
     def log_change(self, chamber: str, quantity: str) -> Array:
-        """Compute log(RMS with leak / RMS without) of each test, (tests,)."""
+        """Compute log(RMS with the leak / RMS without it) of a wavelet detail in each test, (tests,).
+
+        `chamber`: "p_A" or "p_B"; `quantity`: the detail, such as "d3".
+        """
         pairs = self.rms[chamber][quantity]
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find the folder of the sheet: `folder`, else the environment variable SEALSCOPE_SHEET, else `./data`.
+    """Find the folder of the measured data sheet.
 
-    Returns None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
+    It is `folder`, else the folder that the environment variable SEALSCOPE_SHEET names, else `./data`. Returns None
+    if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
     """
     named_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
     candidate = Path(named_folder if named_folder is not None else "data")
@@ -130,10 +134,10 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
 
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
-    """Read the sheet in `folder`; return it with a SHA-256 of its bytes.
+    """Read the measured data sheet in `folder`; return it with a SHA-256 of its files.
 
     Raises UnreadableFile if a file cannot be read, and InputError if a column or a row is missing, a value is not a
-    positive number, or a row is not the test of `APPENDIX_C` with its number.
+    positive number, or a row does not state the inputs of the test with its number in `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -162,7 +166,10 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 
 
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
-    """Parse a column of row `number` as a number; raise InputError unless it is > 0, or 0 if `allow_zero`."""
+    """Parse the number in a column of a row of the data sheet.
+
+    `number`: the row's number, for messages. Raises InputError unless the value is > 0, or >= 0 if `allow_zero`.
+    """
     try:
         value = float(row[column] or "nan")
     except ValueError:
@@ -174,7 +181,10 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    """Check that a row of the sheet states command, closing, leak and level of a test; raise InputError otherwise."""
+    """Check that a row of the data sheet states the command, closing, leak and level of a test.
+
+    Raises InputError otherwise.
+    """
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)
     command = f"{amplitude:g} sin({'' if omega == 1 else f'{omega:g}'}t)"

@@ -11,7 +11,10 @@ from sealscope.recordings.recording import Array
 
 
 class SineFit(NamedTuple):
-    """Complex `amplitudes` (k,) of the sines, `slope` [unit/s] and the `residual` of the signal (n,)."""
+    """Result of `sine_fit`: the sines' complex `amplitudes` (k,), and what remains of the signal beside them.
+
+    `slope` [unit/s]: linear trend of the signal; `residual` (n,): the signal minus constant, trend and sines.
+    """
 
     amplitudes: NDArray[np.complex128]
     slope: float
@@ -19,7 +22,11 @@ class SineFit(NamedTuple):
 
 
 def sine_fit(t: Array, values: Array, *omegas: float) -> SineFit:
-    """Fit ``values = c + slope t + sum Re(a_k exp(i omega_k t)) + residual`` by least squares; omega_k [rad/s]."""
+    """Fit a constant, a linear trend and sines of known frequencies to a signal by least squares.
+
+    ``values = c + slope t + sum Re(a_k exp(i omega_k t)) + residual``, with `values` (n,) at the times `t` (n,) [s]
+    and the angular frequencies `omegas` [rad/s].
+    """
     phases = np.outer(t, omegas)
     basis = np.column_stack([np.ones(t.size), t - t.mean(), np.cos(phases), np.sin(phases)])
     fitted = np.linalg.lstsq(basis, values, rcond=None)[0]

@@ -1,1 +1,1 @@
-"""Cases: one record each, from its name and seed to the row of its scores."""
+"""Cases: the single records of a campaign, from their inputs and seeds to the row with their results."""

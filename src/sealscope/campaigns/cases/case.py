@@ -1,4 +1,4 @@
-"""The cases of a plan: one record each, with a name and seeds that derive from its content."""
+"""The cases of a plan, one for each record to simulate, with an id and seeds that are computed from its inputs."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ _NOT_IN_ROWS = (
 class CaseInputs:
     """The inputs of one record of a campaign.
 
-    `use`: `calibrate` or `judge` (`RecordGroup`); `leak_lpm`: mean flow [L/min] of the leak from the plan's onset on, 0
-    for none, with its `law`; `fault`: another fault as text, "" for none; `levels`: factor -> level; `replicate`:
-    number of the record within its cell, which is one combination of levels.
+    `use`: `calibrate` if the record sets thresholds, `judge` if verdicts are given on it; `leak_lpm` [L/min]: mean
+    flow of the leak after the plan's onset, 0 for none; `law`: relation of the leak's flow and pressure; `fault`:
+    another fault as text, "" for none; `levels`: value (level) of each factor of the plan; `replicate`: number of the
+    record among those with the same levels.
     """
 
     id: str
@@ -55,27 +56,34 @@ class CaseInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignCase(CaseInputs):
-    """One record to simulate and judge; `id` and the seeds are hashes of its inputs and those shared by the plan."""
+    """One record to simulate and judge.
+
+    `id` and the seeds are computed from a hash of the record's inputs and of those that all records of the plan
+    share.
+    """
 
     machine_seed: int
     noise_seed: int
 
 
 def digest(value: Any) -> str:
-    """Compute the SHA-256 (hex) of a value's JSON text; objects that JSON cannot hold enter by their `repr`."""
+    """Compute the SHA-256 hash (hex) of a value's JSON text; objects without a JSON form are written by `repr`."""
     text = json.dumps(value, sort_keys=True, ensure_ascii=True, allow_nan=False, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def profile_key(name: str) -> str:
-    """Compute a digest of a bench profile's content, independent of the path of its file."""
+    """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn.
+
+    It does not depend on the path of the profile's file.
+    """
     profile = load_profile(name)
     # `seeds` names the profile whose draws this one shares
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
 
 
 def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
-    """Collect the inputs that all cases of a plan share: rig, bench, length, onset and base seed."""
+    """Collect the inputs that all records of a plan share: hashes of rig and profile, length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",
@@ -86,9 +94,9 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 
 
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Hash the families and controller files that are levels of a plan: factor -> level -> digest.
+    """Compute hashes of the families and of the controllers' files that are levels of a plan, by factor and level.
 
-    A case's id depends on those of its levels only, so that edits to others leave its stored row valid.
+    The id of a case depends on the hashes of its own levels only: its stored row stays valid when others are edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
@@ -100,7 +108,10 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 
 
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
-    """List all cases of a plan; the records of each group go in turn to the cells, the combinations of levels."""
+    """List all cases of a plan, one for each record.
+
+    The records of each group are dealt in turn to the combinations of the factors' levels.
+    """
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = shared_inputs(plan)
     digests_by_factor = _level_digests(plan)
@@ -129,9 +140,9 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
 
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
-    """Order the cases so that each kind (use, leak, law, fault) is spread evenly.
+    """Order the cases to spread each kind, that is those of one use, leak, law and fault, evenly over the list.
 
-    A campaign that is ended early then has each kind in its planned proportion.
+    A campaign that is ended early then has each kind in nearly its planned proportion.
     """
     kinds = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
     n_total, n_listed = Counter(kinds), Counter[Any]()
@@ -143,7 +154,7 @@ def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
 
 
 def iter_sources() -> Iterator[Path]:
-    """Yield the package's files that a row may depend on."""
+    """Yield the package's source files on which the result of a record may depend."""
     for path in sorted(_PACKAGE.rglob("*")):
         name = path.relative_to(_PACKAGE).as_posix()
         if path.suffix in (".py", ".toml") and not f"{name}/".startswith(tuple(f"{part}/" for part in _NOT_IN_ROWS)):
@@ -151,12 +162,15 @@ def iter_sources() -> Iterator[Path]:
 
 
 def code_key() -> str:
-    """Compute a hash of the sources that a row depends on; only rows with the same hash are combined."""
+    """Compute a hash (16 hex digits) of the source files on which the result of a record may depend.
+
+    Only results with the same hash are combined in a campaign.
+    """
     return files_digest(iter_sources())[:16]
 
 
 def files_digest(paths: Iterable[Path]) -> str:
-    """Compute the SHA-256 of the names and contents of files of the package."""
+    """Compute the SHA-256 hash (hex) of the names and contents of files of this package."""
     sha = hashlib.sha256()
     for path in paths:
         sha.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0")

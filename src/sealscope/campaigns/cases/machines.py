@@ -1,4 +1,4 @@
-"""Build a case's experiment: the machine drawn from the bench, the case's duty, and a leak sized on that machine."""
+"""Build the experiment of a case: a machine drawn from a profile, its duty, and a leak of the planned mean flow."""
 
 from __future__ import annotations
 
@@ -20,14 +20,18 @@ from sealscope.simulation.leaks import Leak, opening_from
 from sealscope.simulation.targets_and_loads import command_or_target, parse_force
 from sealscope.units import LITRE_PER_MINUTE
 
-#: Length [s] of the run that sizes a leak on its machine; two periods of the slowest of the thesis's commands.
+#: Length [s] of the run in which a leak's coefficient is found; two periods of the slowest of the thesis's commands.
 SIZING_SECONDS = 13.0
-#: Command of a plan without bench and without commands: the thesis's.
+#: Command of a plan without profile and without commands: that of the thesis.
 USUAL = Sine(3.0, 4.0)
 
 
 def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
-    """Build the case's leaks, which open at the plan's onset; their size is a mean flow, not yet a coefficient."""
+    """Build the leaks of a case, which open at the plan's onset.
+
+    Their size is the planned mean flow; the coefficient that gives it is not yet known. A `mixture` gives two leaks
+    with half of the flow each. Returns () for a case without a leak.
+    """
     if not case.leak_lpm:
         return ()
     laws: tuple[Any, ...] = ("laminar", "orifice") if case.law == "mixture" else (case.law,)
@@ -36,10 +40,11 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case; the coefficient of its leak remains to be solved for the mean flow.
+    """Build the experiment of a case with a leak that is stated as a mean flow, without its coefficient.
 
-    The machine is drawn from the plan's profile by the case's seed, or is the plan's rig if there is no profile. The
-    levels of the case override parameters, command, controller and load. `profile`: the plan's, if already loaded.
+    The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig if there is no
+    profile. The levels of the case replace its parameters, command, controller and load. `profile`: the plan's
+    profile, if it is already loaded.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))
@@ -69,18 +74,21 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
 
 
 def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
-    """Build the experiment of a case with the coefficients of its leaks solved for their mean flow."""
+    """Build the experiment of a case, with the leak coefficients that give the planned mean flow."""
     experiment = experiment_with_flow_leak(plan, case)
     return replace(experiment, leaks=size_leaks_on_short_run(experiment))
 
 
 def _expand_names(values: Mapping[str, str | float]) -> dict[str, str | float]:
-    """Replace short parameter names by full ones; a later entry for the same parameter overrides an earlier one."""
+    """Replace short parameter names by full ones; of two entries for the same parameter the later one counts."""
     return {resolve_name(name, declared_names()): value for name, value in values.items()}
 
 
 def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Shorten an experiment to `SIZING_SECONDS` with leaks open from the start, to solve for their coefficients."""
+    """Shorten an experiment to `SIZING_SECONDS`, with its leaks open from the start.
+
+    In this short run the coefficients that give the planned mean flows of the leaks are found.
+    """
     return replace(
         experiment,
         duration=min(experiment.duration, SIZING_SECONDS),
@@ -89,9 +97,10 @@ def sizing_experiment(experiment: Experiment) -> Experiment:
 
 
 def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
-    """Solve the leak coefficients that give the planned mean flows over a short run (`sizing_experiment`).
+    """Find the coefficients of an experiment's leaks that give their planned mean flows; return the leaks with them.
 
-    Solving on the whole record would simulate it two or three times. The row states the record's true mean flow.
+    They are found in a short run (`sizing_experiment`), because on the whole record it would have to be simulated two
+    or three times. The true mean flow of the record may differ a little; it is stated in the record's row.
     """
     if not experiment.leaks:
         return ()

@@ -1,4 +1,4 @@
-"""Rows from recordings of real machines, judged by the same detectors as simulated records."""
+"""Judge recordings of real machines with the same detectors as simulated records; each gives a row of results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files, numeric_sort_key
 
-#: In a stroke of one direction |mean| of p_A - p_B exceeds this fraction of its RMS.
+#: In a stroke of one direction, |mean| of p_A - p_B exceeds this fraction of the RMS of p_A - p_B.
 _MIN_ONE_SIDEDNESS = 0.5
 _log = logging.getLogger(__name__)
 #: Called with the numbers of records done, of all records, and of failed ones.
@@ -31,7 +31,10 @@ ProgressCallback = Callable[[int, int, int], None]
 
 
 def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
-    """Yield each file of the plan's sets with its set; raise InputError for a set without files."""
+    """Yield each file of a plan of recordings, with the set to which it belongs.
+
+    `folder`: folder in which the files are searched. Raises InputError if a set has no files.
+    """
     for recordings in plan.sets:
         files = iter_inner_files(folder, folder.glob(recordings.files))
         paths = sorted(files, key=lambda path: numeric_sort_key(path.name))
@@ -42,9 +45,11 @@ def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet
 
 
 def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
-    """Judge each recording of a plan and return the rows in the order of their ids.
+    """Judge each recording of a plan in a folder, and return the rows with the results in the order of their ids.
 
-    A recording that cannot be judged gets a row with its error. Raises InputError if a file is in two sets.
+    A recording that cannot be judged gives a row with its error. `progress`: called after each recording with the
+    numbers of recordings done, of all, and of failed ones. Raises InputError if a file is in two sets, or a set has
+    no files.
     """
     files = list(_iter_files(plan, folder))
     for path, count in Counter(path for _, path in files).items():
@@ -60,7 +65,11 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as a stroke `out` or `in` by the mean of p_A - p_B over its RMS; `both` if neither."""
+    """Classify a recording as a stroke "out" or "in" by the mean of p_A - p_B, or else as "both".
+
+    It is a stroke of one direction if |mean| exceeds the fraction `_MIN_ONE_SIDEDNESS` of the RMS of p_A - p_B; "out"
+    means that p_A is higher.
+    """
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]
@@ -69,7 +78,11 @@ def _stroke_direction(recording: Recording) -> str:
 
 
 def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    """Read and judge one file; `name` is its path within the folder, from which the row's id derives."""
+    """Read and judge one recording, and return the row with its results, or with the error that prevented them.
+
+    `recordings`: set to which it belongs; `name`: its path within the folder, from which the id of the row is
+    computed.
+    """
     levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}
     make_row = partial(
         CaseRow,

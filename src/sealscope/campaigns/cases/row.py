@@ -1,4 +1,4 @@
-"""The row of a case: scores, and the statements of each detector."""
+"""The row of a record: its inputs, and the scores and statements of each detector on it."""
 
 from __future__ import annotations
 
@@ -19,15 +19,20 @@ from sealscope.storage.plain_values import convert_type
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: Factor of recordings: the direction of the piston's stroke.
 STROKE = "stroke"
-#: Cause that a detector names if its channels cannot distinguish two -> those two.
+#: By the cause that a detector names if its channels cannot distinguish two causes: those two.
 _AMBIGUOUS_CAUSES = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
-#: detector -> (score, None for `cannot tell`; onset [s], None if it finds none)
+#: By detector: its score, None for `cannot tell`, and the onset [s] that it estimates, None for none.
 Scores = Mapping[str, tuple[float | None, float | None]]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """Part of a detector's evidence that a row stores, with None for numbers that are not finite."""
+    """The statement of a detector on a record: the fields of its evidence that the record's row stores.
+
+    `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: numbers that were compared; `onset_s` [s]:
+    time at which the leak began; `leak_lpm` [L/min]: flow of the leak; `onset_interval_s`, `leak_interval_lpm`:
+    confidence intervals of both; `cause`: named cause. A number is None if it is not stated or not finite.
+    """
 
     verdict: Verdict
     score: float | None = None
@@ -40,7 +45,7 @@ class Statement:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence | Statement) -> Statement:
-        """Copy the stored fields of evidence, with None for numbers that are not finite."""
+        """Copy the fields of this class from a detector's evidence, with None for numbers that are not finite."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
             numbers = value if isinstance(value, tuple) else (value,)
@@ -51,7 +56,7 @@ class Statement:
 
 @cache
 def expected_cause(fault: str) -> str:
-    """Return the cause that a detector should name for a fault, or the fault's text if no cause is defined for it."""
+    """Find the cause that a detector should name for a fault; return the fault's text if none is defined."""
     try:
         parsed = parse_fault(fault)
     except InputError:  # faults of recordings are free text
@@ -60,24 +65,31 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format the duty of a record, its command and stroke direction; scores are compared within a duty."""
+    """Format the duty of a record: its command and its direction of stroke, if `levels` has them.
+
+    Scores are compared with a threshold from records of the same duty only.
+    """
     return ", ".join(str(levels[name]) for name in (COMMAND, STROKE) if name in levels)
 
 
 def matches_cause(named: str, true_cause: str) -> bool:
-    """Return True if a named cause is the true one, or an ambiguous cause that includes it."""
+    """Return True if the cause that a detector names is the true one, or an ambiguous one that includes it.
+
+    "piston or pump leak" includes both kinds of leak.
+    """
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Return the number, or None if it is None or not finite."""
+    """Return a number as it is, or None if it is None, infinite or nan."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def named_cause(evidence: Evidence | Statement) -> str:
-    """Return the cause that evidence names: a leak, only with the verdict `leak`; a fault; `none`; or `cannot tell`.
+    """Determine the cause that a detector names: a kind of leak, another fault, "none" or "cannot tell".
 
-    The verdict `leak` without a leak as its cause means a piston leak.
+    A kind of leak is named only with the verdict `leak`; without one, this verdict means a piston leak. With other
+    verdicts, "none" means that there is neither a leak nor another fault.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -87,12 +99,15 @@ def named_cause(evidence: Evidence | Statement) -> str:
 
 
 def ranking_score(evidence: Evidence | Statement) -> float | None:
-    """Return the score that ranks records by leakage; None for `cannot tell` or a cause that is no leak."""
+    """Return a detector's score if it ranks records by leakage, else None.
+
+    It does not if the verdict is `cannot tell` or the named cause is no leak.
+    """
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 
 def error_text(error: Exception) -> str:
-    """Format an error in one line."""
+    """Format an error as one line of text."""
     if isinstance(error, SealscopeError):
         return str(error)
     if isinstance(error, MemoryError):
@@ -102,10 +117,12 @@ def error_text(error: Exception) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseRow(CaseInputs):
-    """The stored result of a case: its inputs, and either scores or the `error` that prevented them.
+    """The stored result of one record: its inputs, and either scores or the error that prevented them.
 
-    `flow_lpm`: simulated mean flow [L/min] of the leak while open; `scores` and `statements`: by the plan's name of the
-    detector; `seconds`: processor time, which differs between runs and is not part of the result.
+    `flow_lpm` [L/min]: simulated mean flow of the leak while it is open, None if it is not known; `scores`: by
+    detector, its score and the onset that it estimates; `statements`: by detector, what it states, without scorers;
+    `error`: text of the error, None for none; `seconds`: processor time, which differs between runs and is not part
+    of the result.
     """
 
     flow_lpm: float | None = None
@@ -115,16 +132,16 @@ class CaseRow(CaseInputs):
     statements: Mapping[str, Statement] = field(default_factory=dict)
 
     def score(self, detector: str) -> float | None:
-        """Return a detector's score; None for `cannot tell` or without a result."""
+        """Return a detector's score; None if it cannot tell or there is no result."""
         return self.scores[detector][0] if detector in self.scores else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the row to plain JSON values."""
+        """Convert the row to a dictionary of plain JSON values."""
         return {**self.__dict__, "statements": {name: asdict(statement) for name, statement in self.statements.items()}}
 
     @classmethod
     def from_case(cls, case: CampaignCase, **values: Any) -> CaseRow:
-        """Build the row of a case, with its results or its `error`."""
+        """Build the row of a case from its inputs and `values`, which are its results or its `error`."""
         return cls(**{field.name: getattr(case, field.name) for field in fields(CaseInputs)}, **values)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Scores and statements of a plan's detectors on one record."""
+"""Run the detectors of a plan on one record: their scores, and what they state of a leak."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ INSPECTED = ("u", "x", "p_A", "p_B")
 def judge_record(
     recording: Recording, split_s: float | None, plan: SimulatedPlan | RecordedPlan, rig: Rig
 ) -> tuple[Scores, dict[str, Statement]]:
-    """Run each detector of a plan on a recording; return scores with onsets, and the statements of non-scorers.
+    """Run each detector of a plan on a recording; return scores and statements by detector.
 
-    `split_s` [s]: time on the recording's axis at which scorers split it, None for its middle; `rig`: the rig that
-    detectors may assume. Raises InputError if the inspection finds a defect that rules out any verdict.
+    The first result has each detector's score and the onset [s] that it estimates. The second has what each detector
+    states; scorers, which compute a score only, are not in it. `split_s` [s]: time at which scorers split the
+    recording into two parts, None for its middle; `rig`: the rig that detectors may assume. Raises InputError if the
+    recording has a defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)
     if record.defect is not None:
@@ -51,7 +53,10 @@ def judge_record(
 
 
 def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run the watch, `diagnose` or a registered detector on the examined recording."""
+    """Run one detector that is no scorer on a recording; return its evidence.
+
+    It is the watch of a machine, `diagnose` or a registered detector. `examination`: the prepared recording.
+    """
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:
@@ -62,7 +67,12 @@ def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
 def score_details(
     split_rms: SplitRms, names: Sequence[str], views: Views
 ) -> dict[str, tuple[float | None, float | None]]:
-    """Compute (score, None) of each scorer among the detectors `names`; a scorer estimates no onset."""
+    """Compute the score of each scorer among the detectors `names`; return (score, None) by detector.
+
+    The score is None if it cannot be computed. The second value stands for the onset, which a scorer does not
+    estimate. `split_rms`: RMS of the wavelet details of both parts of the record; `views`: channels by the name of a
+    view.
+    """
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:
         detector = parse_detector_name(name)
@@ -73,9 +83,10 @@ def score_details(
 
 
 def _score_over_threshold(statement: Statement) -> float | None:
-    """Divide the score of `diagnose` by its threshold, or subtract a threshold <= 0; None if either is missing.
+    """Compute a score of `diagnose` that can be compared between records: its score over its threshold.
 
-    A different detector may decide each record, so that the scores themselves are not comparable.
+    A different detector may decide each record, and scores of different detectors cannot be compared. If the
+    threshold is not > 0, it is subtracted instead. Returns None if the score or the threshold is missing.
     """
     score, threshold = ranking_score(statement), statement.threshold
     if score is None or threshold is None:
@@ -84,9 +95,10 @@ def _score_over_threshold(statement: Statement) -> float | None:
 
 
 def run_watch(recording: Recording, rig: Rig | str | os.PathLike[str], false_alarm: float) -> Evidence:
-    """Run the watch of a machine over a recording; return its evidence at the end; a raised alarm stays.
+    """Run the continuous watch of a machine (`Watch`) over a recording, and return its evidence at the end.
 
-    `false_alarm`: bound on the probability that a healthy machine raises an alarm within the recording.
+    An alarm that was raised stays until the end. `false_alarm`: bound on the probability that a healthy machine
+    raises an alarm within the recording.
     """
     alarms_per_1000_hours = false_alarm * 3.6e6 / recording.duration  # 1000 hours are 3.6e6 s
     watch = Watch(load_rig(rig), alarms_per_1000_hours, learn_hours=1000.0)

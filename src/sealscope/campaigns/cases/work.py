@@ -1,4 +1,4 @@
-"""Run one case: simulate its record and judge it with every detector."""
+"""Run one case of a campaign: simulate its record and judge it with every detector of the plan."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from sealscope.simulation.simulate import simulate_experiment
 
 
 def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
-    """Run one case and return its row; an error of any kind is stored in the row.
+    """Simulate and judge one case of a campaign, and return the row with its results.
 
-    The recording is written into `folder`, or discarded if that is None.
+    An error of any kind is stored in the row. The recording is written into `folder`, or discarded if `folder` is
+    None.
     """
     start_time = time.process_time()
     try:
@@ -28,7 +29,10 @@ def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None
 
 
 def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    """Simulate the record of a case, write it if a folder is given, and judge it; raise any error."""
+    """Simulate the record of a case, write it into `folder` unless that is None, and judge it.
+
+    Errors of any kind are raised.
+    """
     simulated = simulate_experiment(case_experiment(plan, case))
     if folder is not None:
         from sealscope.recordings import write

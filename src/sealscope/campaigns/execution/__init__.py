@@ -1,1 +1,1 @@
-"""Execution: processes, batches or a cluster run the cases; rows are appended to the campaign's folder."""
+"""Execution: a campaign's cases run in processes, batches or on a cluster; a folder stores their results."""

@@ -1,8 +1,8 @@
-"""Simulate many cases of a plan side by side, and score them from the RMS of the details around the onset.
+"""Simulate many cases of a plan side by side, and score them from the RMS of the wavelet details around the onset.
 
-The scores are computed by the same functions from the same samples as those of a recording (`scorers.SplitRms`). A
-batch keeps nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen on a
-few seconds of machines of its cell.
+The scores are computed by the same functions and from the same samples as those of a recording (`scorers.SplitRms`).
+A batch stores nothing else of a record, so a plan that needs more is refused. The solver's step of a case is chosen
+on short runs of machines with the same levels of the factors.
 """
 
 from __future__ import annotations
@@ -35,26 +35,29 @@ from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_met
 from sealscope.simulation.integrate import MAX_STEP_REFINEMENT, integrate_run, oversampling, steps_per_output
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers
 
-#: Runs of a batch; the rows are stored after each batch.
+#: Number of runs in a batch; the rows are stored after each batch.
 BATCH_SIZE = 256
 #: Mode of rows from batches. Their noise differs from that of single runs, so the two are not combined.
 IN_BATCHES = "in batches"
-#: Number of machines of a cell on which its step is chosen, and the length [s] of their runs: three of the windows in
-#: which `integrate` checks its error.
+#: Number of machines on which the step of a cell (a combination of levels) is chosen, and the length [s] of their
+#: runs: three of the windows in which `integrate_run` checks its error.
 N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the samples [begin, end) of the two parts of a record that scorers compare, in rows (2, 2)."""
+    """Compute the samples of the two parts of a record, before and after the onset, that scorers compare.
+
+    Returns an array (2, 2) with [begin, end) of each part.
+    """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
 
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
-    """Raise InputError if a plan needs something that a batch cannot simulate or score."""
+    """Check that batches can simulate and score all cases of a plan; raise InputError otherwise."""
 
     def refusal(rule: str) -> InputError:
-        """Make the error for a plan that breaks a rule of batches."""
+        """Build the error for a plan that breaks the given rule of batches."""
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
 
     for name in plan.detectors:
@@ -88,9 +91,10 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 
 
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
-    """Simulate the cases batch by batch and yield their rows; the error of a case is stored in its row.
+    """Simulate the cases of a plan batch by batch, and yield the row of each with its scores.
 
-    A row depends on its case only, not on the other cases of its batch.
+    An error of a case is stored in its row. A row depends on its case only, not on the other cases of its batch.
+    `threads`: number of threads of the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None
     choose_step = make_step_chooser(plan, profile)
@@ -110,7 +114,11 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
 
 
 def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
-    """Simulate and score one batch; if it fails, bisect it until the failing runs are isolated."""
+    """Simulate and score one batch of cases, given with their experiments, and return their rows.
+
+    If the batch fails, its halves are run in turn, until only the cases that fail by themselves have a row with an
+    error.
+    """
     if not pairs:
         return []
     bounds, rows = scored_bounds(plan), []
@@ -131,7 +139,11 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 
 
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
-    """Solve the leak coefficients of a batch on short runs, and shorten steps that are too long for the leak."""
+    """Find the leak coefficients that give the planned mean flows, in short runs; return the experiments with them.
+
+    The solver's step of an experiment is shortened if it is too long for the leak. Raises an error if one of several
+    experiments fails.
+    """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]
     if not leaky:
@@ -156,16 +168,20 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
 def make_step_chooser(
     plan: SimulatedPlan, profile: Profile | None = None
 ) -> Callable[[CampaignCase, Experiment], float]:
-    """Build the function that chooses the solver's step [s] of a case, independently of all other cases.
+    """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
-    `integrate` chooses a step by its error on `N_SCOUT_MACHINES` machines drawn for the case's cell. The result is the
-    shortest of these steps with the case's method, limited to the longest step that the case's machine allows.
+    For each cell, a combination of the factors' levels, `integrate_run` chooses steps by its error on
+    `N_SCOUT_MACHINES` machines that are drawn for it. The step of a case is the shortest of these with the same
+    solver, limited to the longest step that the case's machine allows. It does not depend on the other cases.
     """
     shared = digest(shared_inputs(plan))
 
     @cache
     def cell_steps(*levels: tuple[str, str | float]) -> dict[str, float]:
-        """Compute the shortest step [s], by method, that `integrate` chooses on machines drawn for a cell."""
+        """Compute the shortest step [s] that `integrate_run` chooses on machines drawn for a cell, by solver.
+
+        `levels`: (factor, level) of each factor, which define the cell.
+        """
         steps: dict[str, float] = {}
         for number in range(N_SCOUT_MACHINES):
             content: dict[str, Any] = {"use": "calibrate", "leak_lpm": 0.0, "levels": dict(levels), "replicate": number}
@@ -179,7 +195,10 @@ def make_step_chooser(
         return steps
 
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
-        """Choose the step [s] of the case's cell and method, or else of the case itself, limited to stable steps."""
+        """Choose the solver's step [s] of a case: that of its cell and solver, limited to the longest stable step.
+
+        If no machine drawn for the cell has this solver, the step is chosen on the experiment itself.
+        """
         method = choose_method(experiment.rig, experiment.method)
         step = cell_steps(*case.levels.items()).get(method)
         if step is None:  # no scout machine has this method
@@ -192,11 +211,11 @@ def make_step_chooser(
 
 
 def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step [s] up to `limit` [s] that divides the interval between outputs at `rate` [Hz]."""
+    """Compute the longest step [s], up to `limit` [s], that divides the interval between outputs at `rate` [Hz]."""
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 
 def _choose_method_and_step(experiment: Experiment) -> tuple[str, float]:
-    """Return the method and step [s] that `integrate` chooses over the first seconds of an experiment."""
+    """Choose the solver's method and step [s] by running the first `SCOUT_SECONDS` of an experiment without leaks."""
     run = integrate_run(replace(experiment, duration=min(experiment.duration, SCOUT_SECONDS), leaks=()), ())
     return run.method, run.step

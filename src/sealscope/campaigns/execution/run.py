@@ -1,4 +1,4 @@
-"""Run a campaign's missing cases; each row is stored at once, so that an interrupted run can be continued."""
+"""Run the missing cases of a campaign; each result is stored at once, and an interrupted run can be continued."""
 
 from __future__ import annotations
 
@@ -37,13 +37,17 @@ def run(
     batch: bool = False,
     trust: bool = False,
 ) -> store.CampaignProgress:
-    """Run the plan's cases that have no row in `folder` yet, and return the campaign's progress.
+    """Run the cases of a plan that have no result in `folder` yet, and return the campaign's progress.
 
-    `jobs`: number of processes, one per core by default and at most two per core, 1 for this process only; `cluster`:
-    address of a Dask scheduler to use instead; `retry`: run failed cases again; `batch`: simulate cases side by side
-    (`batches`) with `jobs` threads; `trust`: run the plan's controllers (`FILE.py:NAME`), which may be hostile. Rows do
-    not depend on process, order (`interleave_cases`) or batch. Raises InputError for an untrusted controller, a folder
-    with another campaign or in use by another run, and a plan that batches cannot run.
+    `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
+    address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
+    numbers of cases done, of all, and of failed ones; `task`: function that runs one case; `batch`: True to simulate
+    cases side by side (`batches`) with `jobs` threads; `trust`: True to run controllers that the plan names by file
+    or module, whose code may be hostile.
+
+    The results depend neither on the process, nor on the order of the cases, nor on the other cases of a batch.
+    Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
+    and for a plan that batches cannot run.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
@@ -80,7 +84,10 @@ def run(
 
 
 def _iter_rows(results: Generator[tuple[CampaignCase, CaseRow | None], None, None]) -> Generator[CaseRow, None, None]:
-    """Yield the row of each case; a case whose process died gets a row with that error."""
+    """Yield the row of each case from pairs of case and row.
+
+    A row of None means that the process of the case died; it is replaced by a row with that error.
+    """
     with closing(results):
         for case, row in results:
             yield row or CaseRow.from_case(case, error="the process that carried it out died")

@@ -1,4 +1,4 @@
-"""A campaign's folder: the rows that belong to a plan, and the head, which lists the inputs of these rows."""
+"""A campaign's folder: the rows with the results of its records, and the head, which lists the inputs of all rows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sealscope.storage.folders import make_folder
 from sealscope.storage.opening import open_inner
 from sealscope.storage.plain_values import parse_json
 
-#: Entries of the head that all rows of a folder share -> their names in messages.
+#: Entries of the head that must be the same for all rows of a folder, with their names in messages.
 _SHARED_ENTRIES = {
     "format": "form of rows",
     "name": "campaign",
@@ -43,10 +43,10 @@ RUN_BY_RUN = "run by run"
 
 @dataclass(frozen=True)
 class CampaignProgress:
-    """Progress of a campaign.
+    """The progress of a campaign.
 
-    `records`: number of records in the plan; `done`: those that have a row; `failed`: those whose row is an error;
-    `seconds`: mean processor time of a record, None if no record has a result.
+    `records`: number of records in the plan; `done`: number of records that have been run; `failed`: number of these
+    that ended with an error; `seconds`: mean processor time of a record, None if no record has a result.
     """
 
     records: int
@@ -56,12 +56,15 @@ class CampaignProgress:
 
     @property
     def complete(self) -> bool:
-        """True if every record has its row."""
+        """True if every record of the plan has been run."""
         return self.done == self.records
 
 
 def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
-    """Collect the inputs on which a campaign's rows depend; `mode`: `RUN_BY_RUN` or `batches.IN_BATCHES`."""
+    """Collect the inputs on which all rows (results) of a campaign depend, as plain JSON values.
+
+    `mode`: how the records are simulated, `RUN_BY_RUN` or `batches.IN_BATCHES`.
+    """
     detectors = [parse_detector_name(name) for name in plan.detectors]
     # scores of scorers depend neither on the false-alarm probability nor on the assumed rig
     has_verdicts = any(detector.scorer is None for detector in detectors)
@@ -82,7 +85,10 @@ def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str,
 
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
-    """Collect the plug-in detectors that a plan runs, each with a hash of its source; `diagnose` runs all of them."""
+    """Collect the plug-in detectors that a plan runs; return a hash of the source of each, by its name.
+
+    A plan with `diagnose` runs all plug-ins.
+    """
     bases = {detector.base for name in plan.detectors if (detector := parse_detector_name(name)).scorer is None}
     return {
         name: plug_in.fingerprint
@@ -92,7 +98,7 @@ def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
 
 
 def _installed_version() -> str:
-    """Return the version of the installed package, or `unknown`."""
+    """Return the version of the installed package, or "unknown" for a source tree that is not installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -102,15 +108,16 @@ def _installed_version() -> str:
 
 
 def read_rows(folder: Path) -> dict[str, CaseRow]:
-    """Read the last row of each case, by case id (`storage.rows.read_rows`)."""
+    """Read the newest row of each case in a campaign's folder, by the id of the case."""
     return rows.read_rows(folder, CaseRow.from_dict, WHAT)
 
 
 def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
-    """Read the rows of the plan's cases from its folder, by case id in rising order.
+    """Read the rows of a plan's cases from a campaign's folder, by the id of the case in rising order.
 
-    Rows without a result of one of the plan's detectors are left out. Raises InputError for rows of another plan,
-    UnreadableFile for a row whose inputs differ from its case's.
+    A row that lacks the score of one of the plan's detectors is left out, unless it is the row of a failed case.
+    Raises InputError if the rows belong to another plan, and UnreadableFile if the inputs in a row differ from those
+    of its case.
     """
     rows_by_id = read_rows(folder)
     if rows_by_id:
@@ -130,7 +137,7 @@ def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
 
 
 def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
-    """Read a campaign's rows and count those done and failed."""
+    """Read the rows in a campaign's folder, and count the records that are done and those that failed."""
     done = read_plan_rows(plan, folder).values()
     seconds = [row.seconds for row in done if row.error is None]
     mean = sum(seconds) / len(seconds) if seconds else None
@@ -138,7 +145,10 @@ def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
 
 
 def read_head(folder: Path) -> dict[str, Any] | None:
-    """Read the head of the folder's campaign; return None if there is no campaign yet."""
+    """Read the head of a campaign, the file with the inputs on which all its rows depend.
+
+    Returns None if the folder has no campaign yet. Raises UnreadableFile if the file is damaged.
+    """
     path = folder / HEAD
     try:
         with open_inner(path, "a campaign's head") as file:
@@ -155,7 +165,10 @@ def read_head(folder: Path) -> dict[str, Any] | None:
 
 
 def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
-    """Write the head of a new or continued campaign; raise InputError if the folder has rows from other inputs."""
+    """Write the head of a new or continued campaign, the file with the inputs on which all its rows depend.
+
+    Raises InputError if the folder has rows that were made from other inputs.
+    """
     make_folder(folder)
     existing = read_head(folder) or {}
     if (folder / rows.ROWS).is_file():
@@ -168,7 +181,10 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
 def _check_same_inputs(
     folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
 ) -> None:
-    """Raise InputError if the `existing` head differs from `row_inputs` in an entry that is not `ignored`."""
+    """Check that the head in a campaign's folder has the same inputs as new rows; raise InputError otherwise.
+
+    `existing`: entries of the head; `row_inputs`: inputs of the new rows; `ignored`: entries that may differ.
+    """
     for key, name in _SHARED_ENTRIES.items():
         if key not in ignored and existing.get(key) != row_inputs[key]:
             raise InputError(

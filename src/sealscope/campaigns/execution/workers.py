@@ -31,14 +31,17 @@ _QUEUED_PER_WORKER = 4
 def iter_results(
     task: Callable[[Item], Result], items: Iterable[Item], jobs: int, cluster: str | None = None
 ) -> Generator[tuple[Item, Result | None], None, None]:
-    """Run `task` on each item and yield item and result as they finish.
+    """Run `task` on each item in several processes, and yield pairs of item and result in the order of completion.
 
-    `jobs`: number of spawned processes, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
-    are used instead. Items are taken from `items` when a process is free. Items and `task` are pickled, `task` once per
-    process. If a process dies, for example killed for its memory, its item is run once more after all others, alone; a
-    second death gives the result None. Processes ignore the keyboard interrupt and end with the generator or the
-    parent. Raises the exceptions of `task`, MissingExtra without Dask, and InputError if no scheduler answers or a
-    worker has another version of Sealscope.
+    `jobs`: number of processes to start, 1 for this process only; `cluster`: address of a Dask scheduler whose
+    workers are used instead. An item is taken from `items` when a process is free. Items and `task` are pickled,
+    `task` once per process. Processes ignore the keyboard interrupt; they end with the generator or with the parent
+    process.
+
+    If a process dies, for example because it needs too much memory, its item is run once more, alone, after all
+    others. If it dies again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a
+    cluster is wanted and Dask is not installed, and InputError if no scheduler answers or a worker has another
+    version of Sealscope.
     """
     if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
@@ -78,7 +81,10 @@ def iter_results(
 def iter_results_in_order(
     jobs: int, task: Callable[[Item], Result], items: Sequence[Item]
 ) -> Iterator[tuple[Item, Result | None]]:
-    """Run `task` on each item in `jobs` processes, and yield items and results in the order of the items."""
+    """Run `task` on each item in `jobs` processes, and yield pairs of item and result in the order of the items.
+
+    The result is None if the process that ran it died twice (`iter_results`).
+    """
     results: dict[int, Result | None] = {}
     next_number = 0
     for (number, _), result in iter_results(partial(_run_numbered, task), enumerate(items), jobs):
@@ -89,10 +95,11 @@ def iter_results_in_order(
 
 
 class _Pools(NamedTuple):
-    """Pools of worker processes.
+    """Access to worker processes, on this machine or on a cluster.
 
-    `start_pool`: function that starts a pool; `max_items`: largest number of items that run or are queued; `submit`:
-    function that queues an item in a pool; `death`: exception that a dead process raises.
+    `start_pool`: function that starts a pool of processes; `max_items`: largest number of items that may run or wait
+    in pools at a time; `submit`: function that gives an item to a pool and returns its future; `death`: exception
+    that the future raises if the process died.
     """
 
     start_pool: Callable[[], Executor]
@@ -103,13 +110,17 @@ class _Pools(NamedTuple):
 
 @contextmanager
 def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Pools]:
-    """Provide processes of this machine; each is a separate pool, as a dead process breaks its whole pool."""
+    """Provide worker processes of this machine, and end them when the context ends.
+
+    Each process is a pool of its own, because a process that dies breaks its whole pool. `task`: function that they
+    run on items; `max_items`: largest number of processes.
+    """
     context = get_context("spawn")
     lifeline, parent_end = context.Pipe(duplex=False)
     pools: list[Executor] = []
 
     def start_process() -> Executor:
-        """Start a process, as a pool of one."""
+        """Start one worker process, as a pool of its own."""
         with _worker_environment():
             pools.append(ProcessPoolExecutor(1, context, _initialise_worker, (task, lifeline)))
             pools[-1].submit(os.getpid)  # the first item starts the process, within the environment
@@ -126,7 +137,12 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
 
 @contextmanager
 def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pools]:
-    """Provide the workers of the Dask scheduler at `address` as one pool."""
+    """Provide the workers of a Dask scheduler as one pool.
+
+    `task`: function that they run on items; `address`: of the scheduler. Raises MissingExtra if Dask is not
+    installed, and InputError if the scheduler does not answer, has no workers, or a worker has another version of
+    Sealscope.
+    """
     try:
         import distributed
     except ImportError:
@@ -152,7 +168,7 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
 
 
 def _run_numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
-    """Run `task` on the item of a (number, item) pair."""
+    """Run `task` on the item in a pair of number and item."""
     return task(numbered[1])
 
 
@@ -161,19 +177,22 @@ _task: list[Callable[[Any], Any]] = []
 
 
 def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any]) -> None:
-    """Initialise a worker process: store its task, ignore the interrupt, and end the process with its parent."""
+    """Initialise a worker process: store its task, ignore the keyboard interrupt, and end it when its parent ends.
+
+    `lifeline`: end of a pipe whose other end the parent process has.
+    """
     _task[:] = [task]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
 
 
 def _run_task(item: Any) -> Any:
-    """Run this process's task on an item."""
+    """Run the task that this worker process has stored on an item."""
     return _task[0](item)
 
 
 def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
-    """Exit this process when its parent closes the other end of the pipe or ends."""
+    """Wait until the parent process ends or closes the other end of the pipe `lifeline`, then exit this process."""
     with suppress(EOFError, OSError):
         lifeline.recv_bytes()
     os._exit(1)
@@ -181,7 +200,10 @@ def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
 
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Set `_ENVIRONMENT` for processes started in the block, except for variables that are set already."""
+    """Set the environment variables `_ENVIRONMENT` for the processes that are started within the context.
+
+    Variables that are already set keep their values.
+    """
     added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
     os.environ.update(added)
     try:
@@ -192,10 +214,10 @@ def _worker_environment() -> Iterator[None]:
 
 
 def cores() -> int:
-    """Count the cores that this process may use."""
+    """Count the processor cores that this process may use."""
     return max(1, len(os.sched_getaffinity(0))) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def process_count(jobs: int | None) -> int:
-    """Choose the number of processes: `jobs` up to two per core, by default one per core."""
+    """Choose the number of processes: `jobs`, but at most two per core; one per core if `jobs` is None."""
     return min(jobs or cores(), 2 * cores())

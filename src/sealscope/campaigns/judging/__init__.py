@@ -1,1 +1,1 @@
-"""Judging: thresholds from leak-free rows, verdicts on the others, and the tables of a result."""
+"""Judging: thresholds from the scores of leak-free records, verdicts on the other records, and tables of results."""

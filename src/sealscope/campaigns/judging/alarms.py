@@ -1,4 +1,4 @@
-"""Count each detector's alarms on groups of records: by size of the leak, cell of the factors, fault or family."""
+"""Count each detector's alarms on groups of records: by size of the leak, levels of the factors, fault or family."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ ALL, ANY_LAW = "all", "any"
 
 @dataclass(frozen=True)
 class AlarmFractions:
-    """Fractions of alarms of one detector on a group of records.
+    """Fractions of records on which one detector raised an alarm, and similar fractions, in one group of records.
 
-    `leak_lpm` (0: no leak, nan: any), `law`, `fault`, `family` and `levels` define the group. `cannot_tell` includes
-    the `failed` records, which have no result. `coverage`: fraction of stated intervals that contain the true flow;
-    `false_alarm` and `per_hour`: false alarms on the detector's leak-free records, None if there are no such records
-    or no hours; `named`: fraction of records with an alarm that names the true cause (`matches_cause`), None if the
-    detector names no causes.
+    The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`. `alarms`:
+    fraction with the verdict `leak`; `cannot_tell`: fraction with the verdict `cannot tell`, which includes the
+    records without a result; `failed`: number of these; `coverage`: of the intervals stated for the leak flow,
+    fraction that contains the true flow; `false_alarm`, `per_hour`: fraction of false alarms among the leak-free
+    records, and false alarms per hour, None if there are no such records or the hours are not known; `named`:
+    fraction of records with an alarm that names the true cause (`matches_cause`), None if the detector names no
+    causes.
     """
 
     detector: str
@@ -46,34 +48,41 @@ class AlarmFractions:
 
     @property
     def leak(self) -> str:
-        """Size and law of the leak as text."""
+        """Size and law of the leak as text, such as "0.05 laminar", or "no leak"."""
         return f"{self.leak_lpm:g} {self.law}" if self.leak_lpm else "no leak"
 
     @property
     def informedness(self) -> float:
-        """Fraction of alarms minus that of false alarms (Youden's J), 0 for a guess; nan without false-alarm rate."""
+        """Fraction of alarms minus fraction of false alarms (Youden's J), which is 0 for guesses.
+
+        nan if the fraction of false alarms is not known.
+        """
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
 @dataclass(frozen=True)
 class Alarms:
-    """Summarises the alarms in each detector's verdicts; proportions have intervals of `confidence`."""
+    """The verdicts of all detectors, with methods that summarise the alarms among them.
+
+    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals of all fractions.
+    """
 
     verdicts: Verdicts
     confidence: float
 
     def _with_references(self) -> Verdicts:
-        """Append the verdicts of the two reference detectors to those of the plan's detectors."""
+        """Append the verdicts of two reference detectors, which always or never raise an alarm, to all others."""
         rows = [record.row for record in next(iter(self.verdicts.values()), ())]
         references = {name: [JudgedRow(row, verdict, None) for row in rows]
                       for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
         return {**self.verdicts, **references}
 
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
-        """Yield alarms for each size of leak, or `pooled` over all sizes; the reference detectors come last.
+        """Yield the alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        `hours`: operating time of a record, None to omit false alarms per hour. Without leaky records, a detector has
-        one row of size 0 with alarms in 0 of 0 records.
+        Records with other faults are left out. The detectors that always and never raise an alarm come last. `hours`:
+        operating time of a record, None to omit false alarms per hour. If there are no records with a leak, each
+        detector has one result of size 0, with alarms in 0 of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -88,23 +97,24 @@ class Alarms:
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
     def by_cell(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms for each size of leak in each cell of the factors."""
+        """Yield the alarms of each detector for each size of leak and each combination of the factors' levels."""
         for name, records in drop_other_faults(self.verdicts).items():
             cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
             for (size, _), group in cells.items():
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms for each fault other than a piston leak, on records without a leak."""
+        """Yield the alarms of each detector for each fault other than a piston leak, on records without a leak."""
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
             for fault, group in group_by(faulty, lambda record: record.row.fault).items():
                 yield self._summarise(name, group, fault=fault)
 
     def by_family(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms for each family, size and law, with all families together first.
+        """Yield the alarms of each detector for each family of machines, size of leak and law of the leak.
 
-        A size with several laws also has a row of all its laws. Without families nothing is yielded.
+        The results of all families together come first. A size that occurs with several laws also has a result for
+        all of them together. If the records have no families, nothing is yielded.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)
@@ -117,12 +127,15 @@ class Alarms:
                         yield self._summarise(name, law_records, family=family, leak_lpm=size, law=law)
 
     def _proportion(self, flags: Iterable[bool]) -> Proportion:
-        """Count the true flags and return their proportion with its interval."""
+        """Compute the fraction of flags that are True, with its confidence interval."""
         values = list(flags)
         return proportion(sum(values), len(values), self.confidence)
 
     def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
-        """Compute the fractions of a group of records; `group_fields` are the fields that define the group."""
+        """Compute the fractions of alarms of a detector on a group of records.
+
+        `group_fields`: the fields of `AlarmFractions` that define the group, such as `leak_lpm` or `fault`.
+        """
         statements = [(record, record.statement) for record in group if record.statement is not None]
         intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
         names_cause = [

@@ -14,11 +14,11 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 
 @dataclass(frozen=True)
 class DetectorPod:
-    """One detector's probability of detection over the size of the leak.
+    """One detector's probability of detection (POD) over the size of the leak.
 
-    `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted,
-    with the reason in `why`; `proven`: smallest size from which on a detection probability of 90 % is proven by
-    counting alone.
+    `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
+    `why`: reason why there is no curve; `proven`: smallest size above which a detection probability of 90 % is proven
+    without a curve, by counting detections.
     """
 
     detector: str
@@ -29,13 +29,17 @@ class DetectorPod:
 
     @property
     def description(self) -> str:
-        """Method of the curve's fit, or the reason why there is no curve."""
+        """Name of the method by which the curve was fitted, or the reason why there is no curve."""
         return self.curve.estimator if self.curve else self.why
 
 
 @dataclass(frozen=True)
 class SizeRoc:
-    """One detector's ROC on the judged leak-free records and the records with one size of leak (nan: all sizes)."""
+    """One detector's ROC (receiver operating characteristic): detections over false alarms, for all thresholds.
+
+    It is computed from the scores of leak-free records and of the records with a leak of the size `leak_lpm`, nan for
+    all sizes together. `area`: area under the curve.
+    """
 
     detector: str
     leak_lpm: float
@@ -44,7 +48,10 @@ class SizeRoc:
 
 
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield each detector's probability of detection over the size of the leak, if there are leaky records."""
+    """Yield each detector's probability of detection over the size of the leak; skip it if no record has a leak.
+
+    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals.
+    """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:
@@ -60,7 +67,10 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 
 
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
-    """Yield ROC curves over each detector's scores; a record without a score ranks below all others."""
+    """Yield ROC curves of each detector that has scores: for all sizes of leak together, and for each size.
+
+    A record without a score counts as lower than all others. A curve needs two records with a leak and two without.
+    """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]
         min_score = min((score for score in scores if score is not None), default=None)

@@ -1,4 +1,4 @@
-"""Judge a campaign's rows: thresholds from its leak-free records, verdicts on all others, and their statistics."""
+"""Judge a campaign: thresholds from its leak-free records, verdicts on all other records, and their statistics."""
 
 from __future__ import annotations
 
@@ -34,11 +34,13 @@ from sealscope.evaluation.thresholds import Promise
 class Judgement:
     """The statistics of a campaign's verdicts.
 
-    `thresholds`: thresholds of scorers, set from `leak_free` records; `judged`: number of records with a result;
-    `failed`: rows with an error, which are `cannot tell` for every detector; `table`: alarms by size of the leak;
-    `overall`: alarms of all sizes together; `onsets`, `flows`, `causes`: errors of the detectors that state them;
-    `cells`, `faults`, `families`: alarms by cell of the factors, by other fault, by family of machines;
-    `achieved_flows`: size -> mean and standard deviation of the simulated leak flow [L/min].
+    `thresholds`: thresholds of the scorers (detectors that only compute a score), set from a number `leak_free` of
+    leak-free records; `judged`: number of judged records that have a result; `failed`: rows with an error, on which
+    the verdict of every detector is `cannot tell`; `table`: alarms by size of the leak; `overall`: alarms of all
+    sizes together; `onsets`, `flows`, `causes`: errors of the onsets, leak flows and causes that detectors state;
+    `pods`: probability of detection over the size; `rocs`: ROC curves; `cells`, `faults`, `families`: alarms by
+    combination of the factors' levels, by other fault, and by family of machines; `achieved_flows`: by planned size
+    of the leak, mean and standard deviation of the simulated leak flow [L/min].
     """
 
     thresholds: Thresholds
@@ -69,12 +71,16 @@ def judge(
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
-    """Compute the verdicts on all rows to judge, and their statistics.
+    """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
 
-    A detector states its verdict, or its score is compared with a threshold. Given `limits`, only these are used;
-    otherwise a scorer's fixed threshold, or the one from leak-free rows of the same duty (`compute_thresholds`).
-    `onset_s` [s]: true onset in leaky records; `hours`: operating time of a record; without them no errors of onsets
-    and no alarms per hour are computed. Raises InputError if there is no row to judge.
+    A detector states its verdict itself, or its score is compared with a threshold. The thresholds are `limits`, by
+    detector, if given; otherwise a scorer's fixed threshold, or one set from the leak-free rows of the same duty
+    (`compute_thresholds`).
+
+    `false_alarm`: wanted false-alarm probability; `promise`: "average" or "bound", the sense in which it is kept
+    (`quantile_threshold`); `confidence`: of all intervals; `onset_s` [s]: true onset of the leaks, None to compute no
+    errors of onsets; `hours`: operating time of a record, None to compute no false alarms per hour. Raises InputError
+    if there is no row to judge, or too few leak-free rows to set a threshold.
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
@@ -106,7 +112,10 @@ def judge(
 
 
 def _achieved_flows(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    """Compute the mean and the standard deviation of the simulated leak flow [L/min] for each size of leak."""
+    """Compute the mean and the standard deviation of the simulated leak flows [L/min], by planned size of the leak.
+
+    The standard deviation is nan for a single record. Sizes without a simulated flow are left out.
+    """
     achieved = {}
     for size, group in group_by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():
         flows = [row.flow_lpm for row in group if row.flow_lpm is not None]

@@ -1,4 +1,4 @@
-"""Compare detectors' statements with the truth: onset, flow and cause of the leak."""
+"""Compare what detectors state of a leak, its onset, flow and cause, with the truth."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 
 @dataclass(frozen=True)
 class StatedErrors:
-    """Errors of one detector's estimates at one size of leak (0: leak-free records).
+    """Errors of one detector's estimates on the records with one size of leak.
 
-    The estimates are onsets [s] in its alarms, or leak flows [L/min] in all records.
+    `leak_lpm`: size of the leak, 0 for leak-free records; `errors`: those of estimated onsets [s], over the records
+    with an alarm, or those of estimated leak flows [L/min], over all records.
     """
 
     detector: str
@@ -30,9 +31,10 @@ class StatedErrors:
 
 @dataclass(frozen=True)
 class NamedCauses:
-    """Confusion matrix of the true causes and the causes that one detector names; `none`: neither leak nor fault.
+    """The confusion matrix of one detector: how often it names each cause, for each true cause of a record.
 
-    `covered`: fraction of records in which it names the true cause, or an ambiguous cause that includes it.
+    The cause of a record without leak and fault is `none`. `covered`: fraction of records in which the detector names
+    the true cause, or an ambiguous cause that includes it.
     """
 
     detector: str
@@ -41,7 +43,11 @@ class NamedCauses:
 
 
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the onset in the alarms, by detector and size of leak, for detectors that estimate it."""
+    """Yield the errors of the estimated onsets for each detector and size of leak.
+
+    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `onset_s` [s]: true
+    onset of all leaks.
+    """
     for name, records in verdicts.items():
         for size, group in group_by(
             (record for record in records if record.size > 0 and record.alarm), attrgetter("size")
@@ -56,7 +62,10 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the leak flow, by detector and size of leak, for detectors that estimate it."""
+    """Yield the errors of the estimated leak flows [L/min] for each detector and size of leak.
+
+    Detectors that estimate no flow are skipped.
+    """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
             estimates = [
@@ -73,7 +82,10 @@ def _iter_errors(
     stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of the `stated` (estimate, truth, interval), or nothing if all estimates are missing."""
+    """Yield the errors of one detector's estimates at one size of leak, or nothing if all estimates are missing.
+
+    `stated`: for each record (estimate, true value, interval), with None for a missing estimate or interval.
+    """
     estimates = [math.nan if value is None else value for value, _, _ in stated]
     if np.isfinite(estimates).any():
         low, high = zip(
@@ -84,9 +96,10 @@ def _iter_errors(
 
 
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
-    """Yield the confusion matrix of true and named causes of each detector with statements, if any record has a fault.
+    """Yield the confusion matrix of true and named causes for each detector that names causes.
 
-    A record with a leak and another fault has two true causes and is left out; a failed one counts as `cannot tell`.
+    Nothing is yielded if no record has a fault other than a leak. A record with both has two true causes and is left
+    out; a record without a result counts as `cannot tell`.
     """
     for name, records in verdicts.items():
         single_cause_records = [record for record in records if not (record.size > 0 and record.row.fault)]
@@ -105,7 +118,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
 
 
 def _true_cause(record: JudgedRow) -> str:
-    """Return the true cause of a record: piston leak, the cause of its fault, or none."""
+    """Return the true cause of a record: "piston leak", the cause that its fault is known by, or "none"."""
     if record.size > 0:
         return PISTON_LEAK
     return expected_cause(record.row.fault) if record.row.fault else NO_CAUSE

@@ -1,4 +1,4 @@
-"""Convert a judgement to tables and write them as a campaign's result files; equal rows give equal bytes."""
+"""Convert a judgement to tables and write them as a campaign's result files; equal results give identical files."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from sealscope.campaigns.judging.judge import Judgement
 from sealscope.storage.csv_file import write_csv
 
 Value = str | float | int | None
-#: Name of a column -> value; every row of a table has the same columns.
+#: Values of one row by name of the column; every row of a table has the same columns.
 TableRow = dict[str, Value]
-#: Columns of a proportion.
+#: Columns into which a proportion is written.
 _PROPORTION = ("count", "of", "fraction", "low", "high")
 
 
 @dataclass(frozen=True)
 class PriorKnowledge:
-    """The information that a detector is given.
+    """The information that a detector is given before it judges a record.
 
-    `onset`: whether it knows the true onset of the leak; `channels`: the channels it sees; `rig`: the rig that it
-    assumes, "" for none.
+    `onset`: True if it knows the true onset of the leak; `channels`: the channels that it reads; `rig`: name of the
+    rig that it assumes, "" for none.
     """
 
     onset: bool
@@ -34,18 +34,21 @@ class PriorKnowledge:
     rig: str
 
     def as_row(self) -> TableRow:
-        """Convert the fields to cells of a table."""
+        """Convert the fields to values of a table's row, by name of the column."""
         return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
 
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load `tables.toml`: table -> column -> path of its content."""
+    """Load the file `tables.toml`: by table and column, the content of the column, as `_build_cells` reads it."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def resolve_attribute(source: Any, path: str) -> Any:
-    """Follow a dotted path of attributes, mapping keys and tuple indices; return None if a value on the way is None."""
+    """Return the value at a dotted path of attributes, mapping keys and tuple indices, starting from `source`.
+
+    Returns None if a value on the way is None.
+    """
     for name in path.split("."):
         if source is None:
             return None
@@ -57,10 +60,11 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the cells of one entry of `tables.toml`, several for a proportion or the levels of the `factors`.
+    """Build the values in one row for one entry of `tables.toml`, by name of the column.
 
-    `content`: flags, and the path of the value in `row`. "share": a proportion, left empty with "stated" if it counts
-    no records; "size": a size of leak, where nan becomes "any".
+    `content`: flags, and the dotted path of the value in `row`. With the flag "share" the value is a proportion,
+    which fills five columns; with "stated" too, they are empty if the proportion counts no records. With the flag
+    "size" it is a size of leak, and nan becomes "any". The path "levels" fills a column for each of the `factors`.
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)
@@ -76,9 +80,11 @@ def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) ->
 def build_tables(
     judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
 ) -> dict[str, list[TableRow]]:
-    """Build the tables of a judgement with the columns of `tables.toml`; the keys are the stems of their files.
+    """Build the tables of a judgement, with the columns that `tables.toml` lists, by name of the table.
 
-    `unit`: unit of the leaks' sizes; `known`: detector -> the information it was given; `part`: the plan's purpose.
+    The name is also that of the table's file. `unit`: unit of the leaks' sizes; `known`: by detector, the information
+    that it was given, None to leave out the columns for it; `part`: purpose of the plan, such as development or
+    judging.
     """
     knowledge = {name: row.as_row() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
@@ -104,7 +110,10 @@ def build_tables(
     }
 
     def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
-        """Build one row; columns of prior knowledge (content "known ...") are left out if `knowledge` is empty."""
+        """Build one row of a table from its columns, by name with their content, and the object that fills it.
+
+        Columns for the information given to a detector (content "known ...") are left out if `knowledge` is empty.
+        """
         cells: TableRow = {}
         for column, content in columns.items():
             if content.startswith("known ") and knowledge:
@@ -120,7 +129,10 @@ def build_tables(
 
 
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
-    """Build the table of all records in the order of their ids; run times are omitted, so that reruns agree."""
+    """Build the table of all records, with their inputs, scores and statements, in the order of their ids.
+
+    Run times are left out, because they would differ between two runs of the same campaign.
+    """
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
     stating_detectors = sorted({name for row in ordered for name in row.statements})
@@ -144,7 +156,10 @@ def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str =
 
 
 def write_tables(folder: Path, tables: Mapping[str, Sequence[TableRow]]) -> list[Path]:
-    """Write each table as `NAME.csv` with all digits, and remove the file of an empty table; return the files."""
+    """Write each table as `NAME.csv` into a folder, with all digits; return the paths of the files.
+
+    An empty table is not written, and its file of an earlier run is removed.
+    """
     paths = []
     for name, rows in tables.items():
         path = folder / f"{name}.csv"

@@ -1,4 +1,4 @@
-"""Collect the verdicts on each record: stated by a detector, or from its score and a threshold."""
+"""Collect the verdicts on each record, which a detector states or which follow from its score and a threshold."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _T = TypeVar("_T")
-#: (detector, duty) -> threshold from leak-free records of that duty.
+#: Thresholds by (detector, duty), each set from leak-free records of that duty (`duty_label`).
 Thresholds = Mapping[tuple[str, str], Threshold]
 
 
 class JudgedRow(NamedTuple):
-    """A row with one detector's verdict and `statement`, which is None for a scorer or a failed record."""
+    """The result of a record (`row`) with the verdict of one detector on it.
+
+    `statement`: what the detector states of a leak, None for a scorer, which only computes a score, and for a record
+    without a result.
+    """
 
     row: CaseRow
     verdict: str
@@ -25,7 +29,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Size of the true leak, 0 for none."""
+        """Planned size of the true leak in the unit of the plan, 0 for none."""
         return self.row.leak_lpm
 
     @property
@@ -39,7 +43,7 @@ class JudgedRow(NamedTuple):
         return self.verdict == "leak"
 
 
-#: detector -> its verdict on each record to judge.
+#: By detector, its verdict on each record to judge.
 Verdicts: TypeAlias = Mapping[str, Sequence[JudgedRow]]
 
 
@@ -50,10 +54,11 @@ def compute_thresholds(
     promise: Promise = "average",
     confidence: float = 0.95,
 ) -> Thresholds:
-    """Compute a threshold for each scorer that needs one and each duty with enough leak-free rows.
+    """Compute the threshold of each scorer that needs one, for each duty with enough leak-free rows.
 
-    A row without a score cannot raise an alarm and counts as the lowest score. Raises InputError if no duty has enough
-    rows for `false_alarm`.
+    The duty of a row is its command and stroke direction (`duty_label`). A row without a score cannot raise an alarm,
+    so it counts as the lowest score. `false_alarm`, `promise`, `confidence`: as in `quantile_threshold`. Returns
+    thresholds by (detector, duty). Raises InputError if no duty has enough rows for `false_alarm`.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
@@ -77,15 +82,16 @@ def compute_thresholds(
 def collect_verdicts(
     rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
-    """Collect the verdict of each detector on each row; return detector -> judged rows, in the order of `rows`.
+    """Collect the verdict of each detector on each row; return them by detector, in the order of `rows`.
 
-    A verdict that the detector states is taken. Otherwise it is `leak` if the detector's score exceeds its limit in
-    `limits` or, without one, the threshold for the row's duty in `thresholds`; `cannot tell` if the record failed, or
-    without a score or a limit.
+    If the detector states a verdict, this is used. Otherwise its score is compared with its limit in `limits`, or if
+    it has none there, with the threshold in `thresholds` for the row's duty: the verdict is `leak` if the score is
+    higher, else `no leak`. It is `cannot tell` if the record has no result, if there is no score, or if there is
+    neither limit nor threshold.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:
-        """Return a detector's verdict on a row."""
+        """Determine the verdict of one detector on one row."""
         if row.error is not None:
             return JudgedRow(row, CANNOT_TELL, None)
         if (statement := row.statements.get(detector)) is not None:
@@ -101,12 +107,12 @@ def collect_verdicts(
 
 
 def drop_other_faults(verdicts: Verdicts) -> Verdicts:
-    """Remove the records with a fault other than a leak."""
+    """Remove the records that have a fault other than a piston leak."""
     return {name: [record for record in records if not record.row.fault] for name, records in verdicts.items()}
 
 
 def group_by(items: Iterable[_T], key: Callable[[_T], Any]) -> dict[Any, list[_T]]:
-    """Group the items by a key; the keys are in rising order."""
+    """Group items by the key that the function `key` gives for each; the keys are in rising order."""
     groups: dict[Any, list[_T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

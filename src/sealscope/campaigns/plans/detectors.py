@@ -22,7 +22,7 @@ from sealscope.recordings.recording import CHANNEL_UNITS
 DIAGNOSE = "diagnose"
 WATCH = "watch"
 _VIEW = " @ "
-#: View -> its channels; the view "" applies to detectors that name none.
+#: Channels of each view, by its name; the view "" applies to detectors that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all except the test bench's flow meter, which measures the leak itself.
 ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
@@ -30,10 +30,11 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 
 @dataclass(frozen=True)
 class PlanDetector:
-    """One entry of a plan's `detectors`, parsed.
+    """A detector that a plan names, such as "diagnose @ pressures", split into its parts.
 
-    `base`: name of a scorer or detector, `diagnose` or `watch`; `scorer`: the scorer, None for a detector that decides
-    by itself; `view`: name of the set of channels it uses, "" if none is named.
+    `name`: the full name; `base`: the part before "@", which is a scorer, a detector, `diagnose` or `watch`; `view`:
+    the part after "@", which names the set of channels that it uses, "" if there is none; `scorer`: the rule that
+    computes its score, None for a detector that states verdicts itself.
     """
 
     name: str
@@ -43,13 +44,16 @@ class PlanDetector:
 
     @property
     def needs_threshold(self) -> bool:
-        """True if its threshold must be set from leak-free records."""
+        """True for a scorer whose threshold must be set from leak-free records."""
         return self.scorer is not None and self.scorer.threshold is None
 
 
 @cache
 def parse_detector_name(name: str) -> PlanDetector:
-    """Split a plan's detector name into base and view, without a check that they exist (`check_detector`)."""
+    """Split a detector name of a plan, such as "diagnose @ pressures", into detector and view (set of channels).
+
+    It is not checked that they exist; `check_detector` does that.
+    """
     base, _, view = name.partition(_VIEW)
     if base in SCORERS:
         return PlanDetector(name, base, view, SCORERS[base])
@@ -57,7 +61,7 @@ def parse_detector_name(name: str) -> PlanDetector:
 
 
 def check_detector(name: str, views: Views) -> None:
-    """Raise InputError if the name is no detector or its view is not defined in the plan."""
+    """Check that a detector name of a plan is known and its view is one of `views`; raise InputError otherwise."""
     parsed = parse_detector_name(name)
     if parsed.view and parsed.view not in views:
         known_views = ", ".join(view for view in views if view) or "none"

@@ -1,7 +1,7 @@
-"""Check and parse a plan's levels and faults: throttle closings, commands, controllers, loads and faults as text.
+"""Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
 
-Texts have the form of the options of `sealscope simulate`: `command` as `--command` (a voltage or a target for the
-piston), `controller` as `--controller`, `load` as `--load`.
+The texts have the form of the options of `sealscope simulate`: `command` that of `--command` (a voltage, or a target
+of the piston's position), `controller` that of `--controller`, `load` that of `--load`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force, parse_position
 from sealscope.units import parse_quantity
 
-#: Factors that set the duty of a machine.
+#: Factors of a plan that set the duty of a machine.
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
 #: Rate [Hz] at which a target is sampled to check that the piston can reach it.
 _TARGET_CHECK_RATE = 50.0
 
 
 def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
-    """Raise InputError if a level of `command`, `controller` or `load` is not valid for the rig over `duration` [s]."""
+    """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
+
+    `name`: the factor. A target of the position must be one that the rig's piston can reach within `duration` [s]; a
+    built-in controller must fit the rig.
+    """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):
         raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
@@ -42,8 +46,8 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Check that every controller of a plan is trusted and can be built; raise InputError otherwise.
 
-    A controller in a file that the plan names is run only if the caller says `trust`, as a plan may be hostile.
-    Installed controllers are always trusted.
+    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
+    Built-in and installed controllers are always trusted.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.profile:
@@ -61,14 +65,15 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
 
 
 def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
-    """Find the first command that is a voltage; None if all are targets for the piston's position."""
+    """Find the first command that is a voltage; return None if all are targets of the piston's position."""
     return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Return the rig's parameters for both throttles closed by `level`, such as 0.25 or '25 %'.
+    """Compute the rig's parameters that close the throttles of both lines by `level`, such as 0.25 or '25 %'.
 
-    A level of 0 leaves `line.orifices` unchanged. Raises InputError for a level below 0, or from 100 % on.
+    A level of 0 does not contain `line.orifices`, which says if the rig has throttles. Raises InputError for a level
+    below 0, or of 100 % and more.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
@@ -78,7 +83,11 @@ def throttle_values(level: str | float) -> dict[str, str | float]:
 
 
 def parse_plan_fault(text: str, onset_s: float) -> Fault:
-    """Parse a fault other than a piston leak; it starts at `onset_s` [s] unless the text states its own time."""
+    """Parse the text of a fault other than a piston leak.
+
+    It starts at `onset_s` [s] unless the text states a time itself ("... from 20 s"). Raises InputError if it is no
+    fault.
+    """
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")
     if fault is None:

@@ -1,6 +1,7 @@
-"""The two kinds of plan: simulated records, and recordings of a real machine.
+"""The two kinds of campaign plan: one of simulated records, and one of recordings of real machines.
 
-A field is the entry of the plan's file with its name or its `alias`; `place` is the path of the file.
+Each field is read from the entry of the plan's TOML file that has the field's name, or its `alias` if it has one;
+`place` is the path of the file.
 """
 
 from __future__ import annotations
@@ -26,19 +27,22 @@ _MAX_NAME_LENGTH = 80
 
 
 def _quantity_validator(unit: str) -> BeforeValidator:
-    """Build a validator that converts a text such as '20 s' to a number in `unit`."""
+    """Build a pydantic validator that converts a text such as '20 s' to a number in `unit`, and keeps numbers."""
     return BeforeValidator(lambda value: parse_quantity(value, unit) if isinstance(value, str) else value)
 
 
 def _validate_file_name(name: str) -> str:
-    """Return `name`; raise ValueError if it is no plain file name."""
+    """Check that `name` has only letters, digits, '-', '_' and '.', and return it; raise ValueError otherwise."""
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.'")
     return name
 
 
 def _validate_pattern(files: str) -> str:
-    """Return the pattern `files`; raise ValueError if it leaves its folder or uses `**` in an unsupported way."""
+    """Check a pattern of file names, and return it; raise ValueError if it is invalid.
+
+    It must stay within its folder, and may have one `**`, as a whole name.
+    """
     parts = Path(files).parts
     if not parts or Path(files).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
@@ -48,7 +52,7 @@ def _validate_pattern(files: str) -> str:
 
 
 def _validate_level(value: Any) -> Any:
-    """Return the level `value`; raise ValueError if it is neither text nor a finite number."""
+    """Check that a level, a value of a factor, is a text or a finite number, and return it; else raise ValueError."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(value, str) or (is_number and math.isfinite(value)):
         return value
@@ -56,7 +60,10 @@ def _validate_level(value: Any) -> Any:
 
 
 def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the channels `names`; raise ValueError for an unknown or repeated one, or the measured leak."""
+    """Check the names of channels, and return them; raise ValueError for an unknown or repeated channel.
+
+    The channel `q_leak` is refused, too: it measures the leak that detectors are to find.
+    """
     if not set(names) <= set(CHANNEL_UNITS) or len(set(names)) < len(names):
         raise ValueError(f"must be a list of channels, each once, got {list(names)}")
     if "q_leak" in names:
@@ -65,7 +72,7 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the view's name; raise ValueError if `parse_detector_name` could not parse it."""
+    """Check the name of a view, a set of channels, and return it; raise ValueError if it is empty or contains "@"."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -86,18 +93,19 @@ Values = Mapping[str, Any]
 
 
 class _TomlTable:
-    """A table of a plan's file; entries that are no field are refused."""
+    """A table of a plan's TOML file; reading one with an unknown entry raises an error."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordGroup(_TomlTable):
-    """`count` records of one kind, spread evenly over the cells of the factors.
+    """A group of simulated records with the same leak and fault, spread evenly over all combinations of the factors.
 
-    `use`: `calibrate` for leak-free records that set thresholds, `judge` for records that are judged by them;
-    `leak_lpm`: mean flow [L/min] of the leak from the plan's onset on, 0 for none; `law`: its law, `mixture` for half
-    of each; `fault`: another fault, as text.
+    `count`: number of records; `use`: `calibrate` for leak-free records from which thresholds are set, `judge` for
+    records on which verdicts are given; `leak_lpm` [L/min]: mean flow of the leak after the plan's onset, 0 for none;
+    `law`: its relation of flow and pressure, `mixture` for half of the flow by each of the other laws; `fault`:
+    another fault as text, "" for none.
     """
 
     count: Annotated[Count, Field(ge=1)]
@@ -113,7 +121,11 @@ class RecordGroup(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan(_TomlTable):
-    """The fields of all plans; an empty `title` is replaced by the name."""
+    """The fields of all plans.
+
+    `name`: also that of files; `title`: by default the name; `confidence`: of all intervals; `note`: remark of the
+    author; `place`: path of the plan's file.
+    """
 
     name: FileName
     title: Text = ""
@@ -124,11 +136,12 @@ class _Plan(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class _JudgedPlan(_Plan):
-    """The fields that plans over simulated and over recorded records share.
+    """The fields that plans of simulated records and plans of recordings have in common.
 
-    `false_alarm`, `promise`: as in `quantile_threshold`; `unit`: unit of the leaks' sizes; `views`: sets of channels by
-    the names that `detectors` may use; `channels`: the channels of detectors without a view; `assume`: the rig that
-    detectors may assume, with the values `assume_set`.
+    `false_alarm`: wanted false-alarm probability; `promise`: "average" or "bound", in which sense thresholds keep it
+    (`quantile_threshold`); `detectors`: names, as in "diagnose @ pressures"; `unit`: unit of the leaks' sizes;
+    `views`: sets of channels, by the name that follows the "@"; `channels`: channels of the detectors without a view;
+    `assume`: name of the rig that detectors may assume; `assume_set`: values that replace some of its parameters.
     """
 
     false_alarm: Fraction = 0.01
@@ -141,9 +154,10 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, rig: Rig | None) -> Rig | None:
-        """Load the rig that detectors may assume, by default `rig`; None if neither is given.
+        """Load the rig that detectors may assume: the rig named by `assume`, else `rig`.
 
-        The values `assume_set` are applied to it, or to the rig `thesis` in place of None.
+        The values `assume_set` replace its parameters; if there is no rig but such values, they replace those of the
+        rig `thesis`. Returns None if there are neither a rig nor values.
         """
         rig = rig if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -153,13 +167,17 @@ class _JudgedPlan(_Plan):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedPlan(_JudgedPlan):
-    """A simulated campaign.
+    """The plan of a simulated campaign.
 
-    `rig_name`: the rig, with its sampling `rate` and the values `rig_set`; `profile`: the bench profile from which each
-    record's machine is drawn, "" for the rig as it is; `onset_s`: start [s] of the leaks, nan for half of the duration;
-    `factors`: name -> levels, every combination is a cell. The factors `command`, `controller`, `load` and `closed` set
-    the duty, `family` selects families of the profile, other names are parameters of the rig. `seed`: base of every
-    case's seed; `part`: purpose of the plan, such as development or judging.
+    `rig_name`: name of the rig; `rig_set`: values that replace some of its parameters; `rate`: its sampling rate;
+    `profile`: name of the profile (a distribution of machines) from which the machine of each record is drawn, "" for
+    the rig itself; `duration_s` [s]: length of a record; `onset_s` [s]: start of the leaks, nan for half of the
+    duration; `records`: groups of records; `seed`: number from which the seeds of all records derive;
+    `keep_recordings`: True to store the recordings; `part`: purpose of the plan, such as development or judging.
+
+    `factors`: by name, the levels (values) of each factor; records are made for every combination of levels. The
+    factors `command`, `controller`, `load` and `closed` set the duty, `family` selects families of the profile, and
+    other names are parameters of the rig.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"
@@ -176,28 +194,30 @@ class SimulatedPlan(_JudgedPlan):
 
     @cached_property
     def rig(self) -> Rig:
-        """The rig that is simulated."""
+        """The rig that is simulated, with the plan's sampling rate and other values."""
         values = self.rig_set if self.rate is None else {"daq.sample_rate": self.rate, **self.rig_set}
         rig = load_rig(self.rig_name)
         return rig.with_overrides(values, source="set by the plan") if values else rig
 
     @cached_property
     def assumed(self) -> Rig:
-        """The rig that detectors may assume."""
+        """The rig that detectors may assume, by default the simulated one."""
         return self._load_assumed(self.rig) or self.rig
 
     @property
     def size(self) -> int:
-        """Number of records."""
+        """Number of records in all groups of the plan."""
         return sum(group.count for group in self.records)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSet(_TomlTable):
-    """Recordings of one kind.
+    """A set of recordings with the same size of leak.
 
-    `files`: pattern of the files, which are ordered by the numbers in their names; the set is numbers `first` to `end`
-    - 1 of them, counted from 1; `size`: 0 for healthy recordings, else the size of the leak in the plan's `unit`.
+    `files`: pattern of their file names; the files are ordered by the numbers in their names, and only those from
+    number `first` to `end` - 1, counted from 1, belong to the set. `use`: `calibrate` for healthy recordings from
+    which thresholds are set, `judge` for recordings on which verdicts are given; `size`: size of the leak in the
+    plan's `unit`, 0 for healthy recordings; `label`: name of the set in tables, by default the pattern.
     """
 
     files: Annotated[Text, AfterValidator(_validate_pattern)]
@@ -214,7 +234,11 @@ class RecordingSet(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedPlan(_JudgedPlan):
-    """A campaign over recordings in a folder of the caller."""
+    """The plan of a campaign over recordings of real machines, which are files in a folder.
+
+    `channel_map`: names of columns by channel; `rate_hz` [Hz]: sampling rate for files without times; `sets`: the
+    recordings.
+    """
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)
     rate_hz: Annotated[Number | None, _quantity_validator("Hz"), Field(alias="rate")] = None
@@ -222,7 +246,7 @@ class RecordedPlan(_JudgedPlan):
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """The rig that detectors may assume, None if the plan states none."""
+        """The rig that detectors may assume, or None if the plan states no rig."""
         return self._load_assumed(None)
 
 

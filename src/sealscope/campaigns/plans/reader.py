@@ -1,4 +1,4 @@
-"""Read a plan from TOML, and check all of it."""
+"""Read a campaign's plan from a TOML file, and check all of it before anything is run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ _T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
 #: Limits of records and of combinations of levels, so that a mistyped count does not plan a year of computing.
 MAX_RECORDS, MAX_CELLS = 1_000_000, 100_000
-#: Table with a plan's records -> class of the plan, its tables, and the entries of that table (none: a list of tables).
+#: By the name of the table that lists a plan's records: class of the plan, all its tables, and the entries of that
+#: table (none for a list of tables).
 _KINDS: Mapping[str, tuple[type[AnyPlan], tuple[str, ...], tuple[str, ...]]] = {
     "recordings": (RecordedPlan, ("campaign", "views", "recordings"), ("map", "rate", "unit", "sets")),
     "records": (SimulatedPlan, ("campaign", "factors", "views", "records"), ()),
@@ -46,7 +47,10 @@ def plan_names() -> tuple[str, ...]:
 
 
 def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
-    """Load a packaged plan by name, or a plan from a TOML file; raise InputError naming rule and place if invalid."""
+    """Load a packaged plan by its name, or a plan from a TOML file by its path.
+
+    Raises InputError, with the rule that is broken and its place, if the plan is invalid.
+    """
     text = os.fspath(name_or_path)
     if text in plan_names():
         return read_plan(read_toml(_PACKAGED / f"{text}.toml", "a plan", f"plans/{text}.toml"), f"plans/{text}.toml")
@@ -56,7 +60,11 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
 
 
 def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
-    """Build and check a plan from the parsed tables of a TOML file; [records] or [recordings] determines its class."""
+    """Build a plan from the parsed tables of a TOML file, and check it; raise InputError if it is invalid.
+
+    A plan with the table [recordings] is one of recordings, any other is one of simulated records. `place`: path of
+    the file, for messages; files that the plan names are relative to its folder.
+    """
     plan = _parse_tables(tree, place)
     plan = replace(plan, title=plan.title or plan.name)
     without_view = {} if plan.channels is None else {"": plan.channels}
@@ -78,7 +86,10 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 
 
 def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
-    """Build a plan from the entries of all tables; an InputError names the entry with its table."""
+    """Build a plan from the entries of all tables of its file, before the checks of `read_plan`.
+
+    Raises InputError, with the name of the entry and its table, if an entry is unknown or has a wrong value.
+    """
     source = next((name for name in _KINDS if name in tree), "records")
     plan_class, tables, source_entries = _KINDS[source]
     for key in tree:
@@ -99,7 +110,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
 
 
 def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
-    """Call `function`; add the entry and the plan's place to the text of an InputError."""
+    """Call `function` and return its result; if it raises InputError, add `entry` and `place` to the message."""
     try:
         return function()
     except InputError as error:
@@ -107,12 +118,15 @@ def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
 
 
 def _path_in_plan_folder(name: str, place: str) -> str:
-    """Prefix the name of a TOML file with the plan's folder; return other names, of packaged files, unchanged."""
+    """Complete the path of a TOML file that a plan names, relative to the plan's folder.
+
+    A name without the ending .toml is that of a packaged file, and is returned unchanged.
+    """
     return os.fspath(Path(place).parent / name) if name.endswith(".toml") else name
 
 
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
-    """Fill in paths and the onset of a simulated plan, and check it; raise InputError if it is invalid."""
+    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid."""
     place = plan.place
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
@@ -132,7 +146,11 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
 
 
 def _check_factors(plan: SimulatedPlan) -> None:
-    """Raise InputError for a repeated or invalid level, too many cells, or a controller with a voltage command."""
+    """Check the factors of a plan and their levels (values); raise InputError if one is invalid.
+
+    Each level must be valid and occur once, their combinations must not be too many, and controllers need commands
+    that are targets of the position.
+    """
     for name, levels in plan.factors.items():
         if len({repr(level) for level in levels}) < len(levels):
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
@@ -147,7 +165,10 @@ def _check_factors(plan: SimulatedPlan) -> None:
 
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
-    """List the commands of a plan: the levels of its factor, else those of its families, else those of its profile."""
+    """List the commands of a plan's records.
+
+    They are the levels of the factor `command`, else the commands of the plan's families, else those of its profile.
+    """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
     profile = load_profile(plan.profile)
@@ -156,7 +177,7 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
 
 
 def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
-    """Raise InputError if `level` is not valid for the factor `name`."""
+    """Check that `level` is a valid value of the factor `name`; raise InputError otherwise."""
     if name == "family":
         if not plan.profile:
             raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
@@ -168,7 +189,11 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 
 def _check_records(plan: SimulatedPlan) -> None:
-    """Raise InputError for duplicate groups, an unknown fault, or too few records to judge or to calibrate."""
+    """Check the groups of records of a plan; raise InputError if one is invalid.
+
+    No group may occur twice, each fault must be known, and there must be enough records to judge and enough leak-free
+    ones to set thresholds.
+    """
     kinds = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (kind, group) in enumerate(zip(kinds, plan.records, strict=True), 1):
         if group.fault:

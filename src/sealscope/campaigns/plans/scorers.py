@@ -1,6 +1,7 @@
-"""The thesis's rules as scorers: a record's score is computed from the RMS of its details and is high for a leak.
+"""The decision rules of the thesis as scorers: they compute a score of a record, which is high if there is a leak.
 
-A plan's leak-free records set the threshold of a scorer; that of a sign rule is 0.
+The score is computed from the RMS of the pressures' wavelet details d1 to d4 and d3d4, the product of d3 and d4. The
+threshold of a scorer is set from a plan's leak-free records; that of a sign rule is 0.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from sealscope.signals.filters import IntArray
 
 #: The machine's start is left out of the first part: this many seconds, but at most this fraction of the part.
 START_SECONDS, START_FRACTION = 2.0, 0.05
-#: Direction that a rule tests, the last word of its name -> statistic of the log RMS, and its sign in the score (0:
-#: the absolute value).
+#: By the direction that a rule tests, the last word of its name: the statistic of the log RMS, and its sign in the
+#: score (0 for its absolute value).
 _DIRECTIONS = {
     "fell": ("change", -1.0),
     "rose": ("change", 1.0),
@@ -33,10 +34,11 @@ _BOTH = "d3d4 of both chambers as the thesis says"
 
 
 def split_bounds(n: int, rate: float, split: int) -> IntArray:
-    """Compute the usable samples of the parts before and after sample `split` of `n`, (2, 2).
+    """Compute the usable samples of the two parts into which a record of `n` samples is split at sample `split`.
 
-    Each row is [begin, end). Samples are left out whose details depend on the other part or on padding, and at the
-    start `START_SECONDS` at `rate` [Hz], at most `START_FRACTION` of the part. A part without samples has end < begin.
+    Returns an array (2, 2) with [begin, end) of each part. Samples are left out if their wavelet details depend on
+    the other part or on padding. At the start of the record, `START_SECONDS` at the sampling rate `rate` [Hz] are
+    left out, too, but at most `START_FRACTION` of the part. A part without usable samples has end <= begin.
     """
     before, after = (int(samples) for samples in edge_samples()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
@@ -45,15 +47,20 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
 
 @dataclass(frozen=True)
 class SplitRms:
-    """The log RMS of d1..d4 and d3d4, (5,), of each chamber: before the split, after it, and over both parts."""
+    """The logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
+
+    `log_rms`: by chamber, three arrays (5,) for d1, d2, d3, d4 and d3d4: before the split, after it, and over both
+    parts.
+    """
 
     log_rms: Mapping[str, tuple[Array, Array, Array]]
 
     @classmethod
     def from_recording(cls, recording: Recording, split_s: float) -> SplitRms:
-        """Compute the log RMS on both sides of the time `split_s` [s]; no chamber is included if a part is too short.
+        """Compute the logarithms of the RMS on both sides of the time `split_s` [s].
 
-        The recording must be uniformly sampled without missing samples.
+        The recording must be uniformly sampled without missing samples. If one of the parts is too short, the result
+        has no chamber.
         """
         rate = recording.rate
         bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
@@ -66,7 +73,11 @@ class SplitRms:
 
     @classmethod
     def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
-        """Compute the log RMS from mean squares (2, 5) of each chamber's details over the samples `bounds` (2, 2)."""
+        """Compute the logarithms of the RMS from the mean squares of the details in both parts.
+
+        `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): samples of the parts
+        (`split_bounds`), whose numbers weight the mean over both.
+        """
         log_rms = {}
         with np.errstate(divide="ignore"):
             for chamber, (before, after) in squares.items():
@@ -75,12 +86,16 @@ class SplitRms:
         return cls(log_rms)
 
     def through(self, channels: Iterable[str]) -> SplitRms:
-        """Select the chambers whose pressures are among `channels`."""
+        """Select the chambers whose pressures are among `channels`; leave out the others."""
         visible = set(channels)
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return the `change` of a quantity's log RMS over the split, or its `level`; None if it cannot be computed."""
+        """Return one number: how the log RMS of a quantity changes at the split, or its level over both parts.
+
+        `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" or "level". Returns None
+        if the chamber is missing or the number is not finite.
+        """
         if chamber not in self.log_rms:
             return None
         before, after, overall = (float(log_rms[QUANTITIES.index(quantity)]) for log_rms in self.log_rms[chamber])
@@ -90,10 +105,11 @@ class SplitRms:
 
 @dataclass(frozen=True)
 class Scorer:
-    """A decision rule of the thesis, as a score to compare with a threshold.
+    """A decision rule of the thesis that computes a score of a record, to be compared with a threshold.
 
-    `parts`: conditions, each with quantity, chamber and direction (`fell`, ...); the score is the smallest score of the
-    conditions. `threshold`: fixed threshold, None if it is set from leak-free records.
+    `parts`: one condition or several, each with a quantity, a chamber and a direction, such as ("d3", "p_A", "fell");
+    the rule's score is the smallest score of its conditions. `threshold`: fixed threshold, None if it is to be set
+    from leak-free records.
     """
 
     name: str
@@ -102,12 +118,12 @@ class Scorer:
 
     @property
     def compares_parts(self) -> bool:
-        """True if the rule compares the parts before and after the split."""
+        """True if the rule compares the parts of a record before and after a time at which it is split."""
         return all(_DIRECTIONS[direction][0] == "change" for _, _, direction in self.parts)
 
     @property
     def description(self) -> str:
-        """Description of the score in plain English."""
+        """Description of the score in words, such as "the RMS of d3 of p_A fell over the record, ..."."""
         text = " and ".join(
             f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.parts
         )
@@ -117,7 +133,11 @@ class Scorer:
         return text + ending + ("; any change at all" if self.threshold is not None else "")
 
     def score(self, split_rms: SplitRms) -> float | None:
-        """Compute the score; None if a recording is too short, or a constant reading makes the log RMS infinite."""
+        """Compute the score of a record, which is high if there is a leak.
+
+        Returns None if the record is too short, if it lacks a chamber, or if a constant reading makes a logarithm
+        infinite.
+        """
         scores = []
         for quantity, chamber, direction in self.parts:
             statistic, sign = _DIRECTIONS[direction]
@@ -125,13 +145,14 @@ class Scorer:
             if value is None:
                 return None
             scores.append(sign * value if sign else abs(value))
-        return min(scores)  # every part must have changed
+        return min(scores)  # every condition must be met
 
 
 def _iter_scorers() -> Iterator[Scorer]:
-    """Yield rules on one wavelet detail of one chamber and the thesis's rule on both, with their sign rules.
+    """Yield all scorers: rules on one wavelet detail of one chamber, and the thesis's rule on both chambers.
 
-    A sign rule has the threshold 0: it fires at any change in its direction.
+    For rules on a fall or a rise there is also a sign rule, with the threshold 0: it raises an alarm at any change in
+    that direction.
     """
     for chamber, quantity, direction in product(CHAMBERS, QUANTITIES, _DIRECTIONS):
         rule = Scorer(f"{quantity} of {chamber} {direction}", ((quantity, chamber, direction),))

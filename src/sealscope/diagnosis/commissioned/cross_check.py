@@ -1,6 +1,6 @@
-"""Each healthy recording judged by all others, by the same decision as later recordings.
+"""Judge each healthy recording against all others, by the same decision as later recordings.
 
-Called by `commission`: if the others call one leaking, either it or they are no healthy recordings.
+Called by `commission`: if a recording is judged leaking, either it or the others are not healthy.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
 
-#: Fewest recordings of which each is judged by the others: the scatter of fewer is not known.
+#: Fewest recordings that are judged by each other, as the scatter of fewer is not known.
 MIN_RECORDINGS = 4
-#: How the text on a recording that differs from the others names its judges.
+#: Words in the text on a recording that differs from the others.
 BY_OTHERS = "by the others"
 
 
@@ -23,11 +23,13 @@ def cross_check(
     judge: Callable[[SummarisedRecording, tuple[SummarisedRecording, ...]], Diagnosis],
     keep: bool = False,
 ) -> tuple[tuple[SummarisedRecording, ...], tuple[str, ...]]:
-    """Diagnose each healthy recording against the others; return those to keep and a reason for each one left out.
+    """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
-    `judge(recording, reference)` diagnoses a recording against healthy ones. A recording judged leaking is left out,
-    unless `keep`, or unless half or more leak, as then no majority is healthy. If a kept one shows a leak or another
-    event, the verdict is added to its problems. Fewer than `MIN_RECORDINGS` are not judged.
+    `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. A recording judged
+    leaking is left out, unless `keep` is True, or at least half of the recordings leak and no healthy majority can be
+    assumed. Fewer than `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings and one line of
+    reason for each one left out. If a remaining recording shows a leak or another event, this is added to its list of
+    problems.
     """
     verdicts, leaking = dict[str, str](), dict[str, str]()
     for recording in healthy if len(healthy) >= MIN_RECORDINGS else ():
@@ -43,7 +45,7 @@ def cross_check(
 
 
 def _add_problem(recording: SummarisedRecording, problem: str | None) -> SummarisedRecording:
-    """Add a problem, if there is one, to those of a recording."""
+    """Return a recording with a text added to its list of problems; unchanged if `problem` is None."""
     if problem is None:
         return recording
     return replace(recording, about={**recording.about, "wrong": [*recording.about.get("wrong", ()), problem]})

@@ -1,9 +1,9 @@
-"""The summaries of a machine's healthy recordings, in a file next to its text (`machine_file`).
+"""Read and write the file of healthy summaries, which lies next to a machine's text file (`machine_file`).
 
-The file is lines: the first names the format, each other one is the summary of a recording, as its SHA-256, a blank and
-JSON. The text names the summaries it uses by their SHA-256. So a summary that was altered or lost is found and named, a
-summary that no text names does no harm, and a new file that has the old summaries, too, belongs to both texts, the old
-and the new, at whichever instant a writer is killed.
+The file consists of lines. The first line names the format. Each other line is the summary of a recording: its
+SHA-256, a blank and JSON. The text names the summaries it uses by their SHA-256. A summary that was altered or lost
+is therefore found and named, and a summary that no text names does no harm. A new file also contains the old
+summaries, and so fits both the old and the new text, at whichever instant a writer is killed.
 
 JSON holds `digest`, `units`, `rate`, `seconds`, `start_s`, `about`, `summaries` by the names of detectors, and
 `statistics` by their names. Arrays are bytes (`storage.plain_state.plain_array`). Unknown names are read, too.
@@ -34,35 +34,37 @@ from sealscope.storage.opening import open_regular
 from sealscope.storage.plain_state import plain_array, restore_array
 from sealscope.storage.plain_values import convert_type, parse_json
 
-#: What the file's name ends with, and its first line.
+#: Ending of the file's name, and its first line.
 SUFFIX, _HEAD = ".healthy", b"sealscope healthy summaries 1\n"
-#: The same before version 0.1, which this version still reads; so is "lessons" in place of the key "summaries".
+#: The same before version 0.1, which this version still reads. The key "summaries" was "lessons" then.
 OLD_SUFFIX, _OLD_HEAD = ".lessons", b"sealscope lessons 1\n"
 #: Largest file and longest line [bytes]; most summaries in a file.
 MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
-#: Most commas, brackets and braces in a line: a number, and a fraction of its bytes. Each becomes an object in memory.
+#: Most commas, brackets and braces in a line: this number plus this fraction of its bytes. Each becomes an object in
+#: memory.
 _MAX_MARKS, _MAX_FRACTION = 40, 0.1
-#: Largest size of a number: products of two do not overflow. Times are within the years that calendars have [s].
+#: Largest size of a number, so that products of two do not overflow; times within the years that calendars have [s].
 _MAX_NUMBER, _FIRST_TIME, _LAST_TIME = 1e100, -6.2e10, 2.5e11
 #: Largest size of the logarithm of a number that is neither zero nor infinite.
 _MAX_LOGARITHM = 750.0
-#: Largest ratio, due to rounding, of a squared product to the product of its squares (Cauchy's inequality).
+#: Largest ratio of a squared product to the product of the squares, which exceeds 1 only by rounding (Cauchy).
 _ROUNDING = 1.0 + 1e-6
 #: Length of a checksum in hexadecimal digits.
 _DIGITS = 64
 
 
 class Line(NamedTuple):
-    """A line of the file: the `checksum` that it states, and the JSON of a summary, unread."""
+    """One line of the file: the `checksum` it states, and `data`, the JSON of a summary, not yet parsed."""
 
     checksum: str
     data: bytes
 
 
 def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
-    """Make the pydantic type of a table from the types of its values; (type, None) for a value that may be absent.
+    """Make a pydantic type for a table whose keys and value types are given as keyword arguments.
 
-    `extra`: whether other values are preserved ("allow") or dropped.
+    A tuple (type, None) marks a value that may be absent. `extra` tells whether unknown keys are kept ("allow") or
+    dropped ("ignore").
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
     fields = {name: kind if isinstance(kind, tuple) else (kind, ...) for name, kind in value_types.items()}
@@ -70,10 +72,13 @@ def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any)
 
 
 def uniform_table_type(value_type: Any) -> Any:
-    """Make the pydantic type of a table of any names and one type of values; errors name the first value of another."""
+    """Make a pydantic type for a table with any keys, whose values all have one type.
+
+    Validation stops at the first value of another type, which the error names.
+    """
 
     def check_values(table: Any) -> Any:
-        """Check the values one after the other; raise ValueError for the first of another type."""
+        """Return the table unchanged; raise ValueError at the first value that is not of the expected type."""
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {table!r:.60}")
         for name, value in table.items():
@@ -87,12 +92,15 @@ def uniform_table_type(value_type: Any) -> Any:
 
 
 def list_type(value_type: Any, min_length: int = 0) -> Any:
-    """Make the pydantic type of a list of one type of values; errors name the first value of another."""
+    """Make a pydantic type for a list of at least `min_length` values of one type.
+
+    Validation stops at the first value of another type, which the error names.
+    """
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
 def _check_array(value: Any) -> Any:
-    """Return a value that is an array of numbers below `_MAX_NUMBER` in size; raise ValueError for any other."""
+    """Return the value if it is an array of numbers smaller than 1e100 in size; raise ValueError otherwise."""
     if not isinstance(value, np.ndarray):
         raise ValueError("must be an array of numbers")
     if not (np.abs(value) < _MAX_NUMBER).all():
@@ -101,13 +109,17 @@ def _check_array(value: Any) -> Any:
 
 
 def _check_statistic(value: Any) -> Any:
-    """Return a value that is a number, or an array of numbers, below `_MAX_NUMBER` in size; else raise ValueError."""
+    """Return the value if it is a number, or an array of numbers, below 1e100 in size; raise ValueError otherwise."""
     _check_array(np.array(value) if isinstance(value, float) else value)
     return value
 
 
 def _check_sums(summary: Any) -> Any:
-    """Return a balance's summary if its sums fit its terms and obey Cauchy's inequality; raise ValueError otherwise."""
+    """Return a volume balance's summary if its arrays are consistent; raise ValueError otherwise.
+
+    The arrays must have shapes that match the number of terms, and the sums of squares and products of leak and flow
+    must obey Cauchy's inequality.
+    """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {summary.sums.shape}")
@@ -131,7 +143,7 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return the summary of a recording's ringing if its `levels` and `duty` are valid; raise ValueError otherwise.
 
-    Their shapes must fit the chambers, and each number is a logarithm: its size is below `_MAX_LOGARITHM`.
+    Their shapes must match the number of chambers. Their numbers are logarithms and must be below 750 in size.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -205,7 +217,10 @@ _ABOUT = {
 
 
 def _restore_arrays(value: Any, name: str) -> Any:
-    """Replace packed arrays in a parsed JSON value, at any depth, by numpy arrays; errors state its `name`."""
+    """Convert packed arrays in a parsed JSON value, at any depth, to numpy arrays.
+
+    Raises ValueError with the `name` of an array that cannot be restored.
+    """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
             try:
@@ -235,7 +250,7 @@ _RECORDING = table_type(
 
 
 def _pack_arrays(value: Any) -> Any:
-    """Convert a value for JSON, without members that are None; a list of fractional numbers becomes an array."""
+    """Convert a value for JSON: drop entries that are None, and pack arrays and lists of fractional numbers."""
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
     if isinstance(value, np.generic):
@@ -251,12 +266,18 @@ def _pack_arrays(value: Any) -> Any:
 
 
 def _format_json(value: Any) -> bytes:
-    """Format a packed value as JSON; raise ValueError for numbers that are not finite, TypeError for other values."""
+    """Convert a value to JSON bytes, with arrays packed.
+
+    Raises ValueError for numbers that are not finite, and TypeError for values that JSON cannot represent.
+    """
     return json.dumps(_pack_arrays(value), allow_nan=False, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Raise ArithmeticError if a method's summary could not be read back, for example with infinite numbers."""
+    """Check that a detector's summary can be stored and read back; raise ArithmeticError otherwise.
+
+    For example, infinite numbers cannot be stored. `method` is the name of the detector.
+    """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
     except ValueError as error:
@@ -264,7 +285,10 @@ def check_summary(method: str, summary: Summary) -> None:
 
 
 def format_summary(recording: SummarisedRecording) -> Line:
-    """Format a recording's summaries as a line; raise InputError if the line could not be read back."""
+    """Convert a healthy recording's summaries to a line of the file.
+
+    Raises InputError if the line could not be read back.
+    """
     fields = {name: value for name, value in vars(recording).items() if name != "file"}
     try:
         data = _format_json(fields)
@@ -276,9 +300,10 @@ def format_summary(recording: SummarisedRecording) -> Line:
 
 
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
-    """Parse a line as the summaries of the recording `file`; `place`: path of the file of summaries, for errors.
+    """Parse a line of the file as the summaries of the recording called `file`.
 
-    Raises InputError if the checksum does not match, or a value breaks a rule.
+    `place` is the path of the file of summaries, for error messages. Raises InputError if the checksum does not match
+    or a value is not valid.
     """
     if sha256(line.data).hexdigest() != line.checksum:
         rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
@@ -296,15 +321,15 @@ def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
     return SummarisedRecording(file, **{"start_s": None, **fields})
 
 
-#: What a person does about a summary that is lost or damaged.
+#: Advice for a summary that is lost or damaged.
 _REMEDY = "take its [[healthy]] out of the machine's file, or commission it anew"
 
 
 def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecording]:
-    """Read the recordings of `files`, each named by the checksum of its line, in their order.
+    """Read the summaries of certain recordings, in the order of `files`.
 
-    Raises InputError if the file is missing, of another format or too large, or a line is missing, damaged or breaks a
-    rule.
+    `files` maps the checksum of each recording's line to the recording's name. Raises InputError if the file is
+    missing, of another format or too large, or if a line is missing, damaged or not valid.
     """
     recordings: dict[str, SummarisedRecording] = {}
     for line in _iter_lines(path):
@@ -318,7 +343,7 @@ def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecor
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Read all lines, unparsed and unchecked; none if the file cannot be read."""
+    """Read all lines of a file of summaries, without parsing or checking them; an empty list if it cannot be read."""
     try:
         return list(_iter_lines(path))
     except InputError:
@@ -326,7 +351,7 @@ def read_lines(path: Path) -> list[Line]:
 
 
 def write_lines(lines: Collection[Line], path: Path) -> None:
-    """Write the file of summaries atomically; raise InputError if it would be too large, or cannot be written."""
+    """Write a file of summaries as a whole; raise InputError if it would be too large or cannot be written."""
     size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # with a blank and a line feed
     max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)
     if size > MAX_SIZE or len(lines) > _MAX_SUMMARIES or max_line > _MAX_LINE:
@@ -341,7 +366,7 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
 
 
 def _iter_lines(path: Path) -> Iterator[Line]:
-    """Yield the complete lines of a file of summaries; raise InputError for a file that cannot be used."""
+    """Yield the complete lines of a file of summaries; raise InputError if the file cannot be read."""
     what = "a file of healthy summaries"
     try:
         with open_regular(path, what) as file:

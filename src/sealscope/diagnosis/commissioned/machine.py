@@ -1,4 +1,4 @@
-"""A commissioned machine: its rig, the map of its logs, and the summaries of its healthy recordings."""
+"""A commissioned machine: its rig, the channel map of its logs, and the summaries of its healthy recordings."""
 
 from __future__ import annotations
 
@@ -39,25 +39,37 @@ from sealscope.storage.folders import iter_inner_files
 if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.summary import MachineSummary
 
-#: Suffixes of files in a folder that are no recordings: Sealscope's own pages and settings, and notes.
+#: Suffixes of files in a folder that are not recordings: Sealscope's own pages and settings, and notes.
 NO_RECORDINGS = frozenset(
     {".toml", ".healthy", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
 )
-#: Beginning of a trend, or a verdict, that was written into the folder of the recordings.
+#: Beginning of the text of a trend or a verdict that was written into the folder of the recordings.
 _OWN_OUTPUT = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')
-#: Most samples that stay in memory between learning and judging; further recordings are read again.
+#: Most samples that are kept in memory between learning and judging; further recordings are read a second time.
 _MAX_SAMPLES = 20_000_000
 
-#: Judgements of a person on an alarm's leak.
+#: Judgements that a person may give on an alarm.
 Judgement = Literal["valid", "invalid", "repaired"]
 JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
 
 class JudgedAlarm(NamedTuple):
-    """A person's judgement of an alarm of the monitor.
+    """A person's judgement of an alarm of the monitor, or a repair.
 
-    `alarm`: name of the alarm, "" for a repair without one; `mark`: "valid", "invalid" or "repaired"; `date_s`: time of
-    the judgement, `onset_s`: begin of the leak, [s since 1970]; `leak_lpm`: its flow [L/min], None if unknown.
+    Attributes
+    ----------
+    alarm : str
+        Name of the alarm, "" for a repair without an alarm.
+    mark : str
+        "valid", "invalid" or "repaired".
+    date_s : float
+        Time of the judgement [s since 1970].
+    onset_s : float
+        Time at which the leak began [s since 1970].
+    leak_lpm : float or None
+        Flow of the leak [L/min], None if unknown.
+    reason : str
+        Reason given by the person, may be empty.
     """
 
     alarm: str
@@ -75,7 +87,10 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Path of a loaded machine's file, and hashes of its parts that reveal changes by other processes."""
+    """Path of the file that a machine was loaded from, and hashes of its parts.
+
+    The hashes reveal whether another process has changed the file since.
+    """
 
     path: Path
     parts: frozenset[bytes]
@@ -88,7 +103,7 @@ def _format_date(moment: float) -> str:
 
 @dataclass(frozen=True)
 class CommissionedMachine:
-    """A commissioned machine.
+    """A machine with its healthy recordings, to which its other recordings are compared.
 
     Parameters
     ----------
@@ -97,13 +112,13 @@ class CommissionedMachine:
     healthy : tuple of SummarisedRecording
         Its healthy recordings, in the order of their dates.
     rig : Rig, optional
-        What is stated of the machine; None: nothing.
+        Stated parameters of the machine, None if nothing is stated.
     channel_map : mapping of str to str, or "auto", optional
-        Channel to column of its logs.
+        Column of its logs for each channel.
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which it is to be repaired, such as "5 mL/min".
+        Leak from which it must be repaired, such as "5 mL/min".
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
@@ -130,13 +145,16 @@ class CommissionedMachine:
 
     @cached_property
     def summary(self) -> MachineSummary:
-        """Summary of the machine, its sensors and the smallest leak, from the healthy recordings."""
+        """Summary of the machine, its sensors and the smallest detectable leak, from the healthy recordings."""
         from sealscope.diagnosis.commissioned.summary import summarise_machine
 
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
     def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log of the machine by its channel map, or without the map if the log lacks the map's columns."""
+        """Read a log of the machine with its channel map, or without the map if the log lacks the map's columns.
+
+        Raises UnreadableFile if neither succeeds.
+        """
         return read_by_map(path, self.channel_map, self.rate)
 
     def diagnose(
@@ -145,9 +163,10 @@ class CommissionedMachine:
         *,
         false_alarm_probability: float = FALSE_ALARM_PROBABILITY,
     ) -> Diagnosis:
-        """Decide whether oil bypasses the piston in a recording, or in its file, against the healthy ones.
+        """Decide whether a recording, or the log at a path, shows a leak, given the machine's healthy recordings.
 
-        Arguments, result and errors as for `sealscope.diagnose`; rig, baseline and limit are the machine's.
+        Arguments, result and errors are those of `sealscope.diagnose`; rig, baseline and repair limit are the
+        machine's.
         """
         judged = recording if isinstance(recording, Recording) else self.read(recording)
         return diagnose(
@@ -160,10 +179,11 @@ class CommissionedMachine:
         )
 
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
-        """Return the machine with one more healthy recording.
+        """Return a copy of the machine with one more healthy recording.
 
-        Raises InputError if the recording is judged leaking, overlaps in time with a confirmed leak, is a copy of a
-        known recording, or cannot be trusted.
+        `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
+        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known recording, or cannot be
+        trusted.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy and (result := self.diagnose(recording)).verdict == LEAK:
@@ -174,7 +194,10 @@ class CommissionedMachine:
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Add a healthy recording without testing it for a leak; raise InputError for a copy of a known one."""
+        """Return a copy of the machine with one more healthy recording, without testing it for a leak.
+
+        Raises InputError if the recording cannot be used or is a copy of a known one.
+        """
         summarised = summarise_healthy(recording, assumed_rig(self.rig, recording)[0], file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
@@ -184,8 +207,9 @@ class CommissionedMachine:
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        A leak is open from its onset until a repair. A later judgement "invalid" of the same alarm revokes it, unless
-        it concerns a new alarm of the same name, whose onset is after the first judgement.
+        A leak is open from its onset until the next repair. A later judgement "invalid" of the same alarm revokes the
+        confirmation. It does not if it concerns a new alarm of the same name, whose onset is after the first
+        judgement.
         """
         for number, leak in enumerate(self.alarms, 1):
             is_revoked = any(
@@ -200,9 +224,9 @@ class CommissionedMachine:
         return None
 
     def since(self, start_s: float) -> CommissionedMachine:
-        """Return the machine without the recordings and alarms from before `start_s` [s since 1970].
+        """Return a copy of the machine without the recordings and alarms from before `start_s` [s since 1970].
 
-        Recordings of an unknown time are dropped, too. Raises InputError if no recording is left.
+        Recordings of unknown time are dropped, too. Raises InputError if no recording remains.
         """
         healthy = tuple(
             recording for recording in self.healthy if recording.start_s is not None and recording.start_s >= start_s
@@ -221,9 +245,10 @@ class CommissionedMachine:
 
 
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
-    """Read a log by the map of its machine, or without the map if it lacks the map's columns.
+    """Read a log with the channel map of its machine, or without the map if the log lacks the map's columns.
 
-    Raises UnreadableFile with the error of reading by the map if neither way succeeds.
+    `rate` is the sampling rate [Hz] of a log without a time column. If neither way succeeds, raises the
+    UnreadableFile that reading with the map gave.
     """
     if not channel_map:
         return read(path, rate=rate)
@@ -237,9 +262,10 @@ def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: flo
 
 
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
-    """List the files of recordings in a folder, or at one or several paths; raise InputError if there is none.
+    """List the files of recordings at one or several paths, each a file or a folder.
 
-    Hidden files and Sealscope's own files in a folder are left out, and, with a warning, links that lead out of it.
+    In a folder, hidden files and files that Sealscope wrote are left out. Links that lead out of the folder are left
+    out with a warning. Raises InputError if no file remains.
     """
     try:
         named_paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
@@ -261,7 +287,7 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
 
 
 def _is_own_output(file: Path) -> bool:
-    """Test whether a file begins as a verdict or a trend that this program wrote."""
+    """Test whether a file begins like a verdict or a trend that this program wrote; False if it cannot be read."""
     try:
         with file.open("rb") as content:
             return _OWN_OUTPUT.match(content.read(200)) is not None
@@ -270,7 +296,11 @@ def _is_own_output(file: Path) -> bool:
 
 
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
-    """Compute every detector's summary of a healthy recording; raise InputError if it cannot be trusted or used."""
+    """Compute every detector's summary of a healthy recording; raise InputError if it cannot be trusted or used.
+
+    `file` is the name of the recording and `checksum` the SHA-256 of its file. A detector that fails is left out, and
+    its error is logged.
+    """
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)
@@ -325,29 +355,30 @@ def commission(
     paths : path-like or sequence of path-like
         A folder of healthy recordings, or their files.
     rig : Rig, str or path-like, optional
-        Parameters that are stated of the machine: a Rig, the name of a packaged one or the path of a TOML file; by
-        default nothing is stated.
+        Stated parameters of the machine: a Rig, the name of a packaged rig or the path of a TOML file; by default
+        nothing is stated.
     map : mapping of str to str, or "auto", optional
-        Channel to column of the logs, as for `sealscope.read`; by default that of the rig's file.
+        Column of the logs for each channel, as for `sealscope.read`; by default the map in the rig's file.
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which the machine is to be repaired: a flow (``"5 mL/min"``) or a creep (``"8 mm/min"``, the default).
+        Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
+        (``"8 mm/min"``, the default).
     name : str, optional
         Name of the machine.
     keep : bool, optional
-        Whether to keep recordings that are judged leaking by the others; by default they are left out.
+        Whether to keep a recording that is judged leaking in comparison with the others; by default it is left out.
 
     Returns
     -------
     CommissionedMachine
-        Its `diagnose` judges other recordings; `sealscope.write_machine` keeps it.
+        The machine. Its method `diagnose` judges other recordings, and `sealscope.write_machine` saves it.
 
     Raises
     ------
     InputError, UnreadableFile
-        There is no recording, none can be used, or `rig` or `limit` is not valid. While others can be used, those that
-        cannot, and copies, are listed in `left_out` instead.
+        There is no recording, none can be used, or `rig` or `limit` is not valid. If only some recordings cannot be
+        used, or are copies, they are listed in `left_out` instead.
 
     Examples
     --------
@@ -365,7 +396,7 @@ def commission(
     stated_rig = None if rig is None else load_rig(rig)
     channel_map = map if map is not None else {} if stated_rig is None else stated_rig.channel_map
     machine, problems = CommissionedMachine(name, (), stated_rig, channel_map, rate, limit), list[str]()
-    # by file name; recordings only as far as they fit into memory
+    # by file name; as many recordings as fit into memory
     path_of, recording_of, n_samples = dict[str, Path](), dict[str, Recording](), 0
     for path in recordings_in(paths):
         try:
@@ -381,7 +412,7 @@ def commission(
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
-        """Diagnose a healthy recording by the `reference` ones."""
+        """Diagnose one healthy recording against the healthy recordings `reference`."""
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 

@@ -1,11 +1,12 @@
-"""The file of a commissioned machine: TOML that people read and edit, with its summaries in a file next to it.
+"""Read and write the file of a commissioned machine: TOML that people can edit, with its summaries beside it.
 
-It is also a rig's file: `[rig]`, `[motor]` and so on state the machine's parameters, `[map]` its channels. `[machine]`
-names the machine, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]` names a
-recording and the checksum of its summary in that file (`healthy_file`). `[[alarms]]` are judgements of persons.
+It is also a rig's file: `[rig]`, `[motor]` and so on state the machine's parameters, `[map]` its channels.
+`[machine]` names the machine, `[learnt]` summarises its healthy recordings for people to read, and each `[[healthy]]`
+names a recording and the checksum of its summary in the second file (`healthy_file`). `[[alarms]]` are judgements of
+persons.
 
-The summaries are written before the text. They include those that the present text and its backup, `.bak`, name: no
-text lacks a summary, even if the writer is killed.
+The summaries are written before the text. They include those that the present text and its backup, `.bak`, name. So
+no text ever lacks a summary, even if the writer is killed.
 """
 
 from __future__ import annotations
@@ -47,11 +48,11 @@ from sealscope.storage.folders import lock_file
 from sealscope.storage.plain_values import convert_type
 from sealscope.storage.toml_file import parse_toml, read_toml
 
-#: What this version writes and reads; names in [machine] that are written anew with each change.
+#: Format that this version writes and reads; names in [machine] that are written anew with each change.
 _FORMAT, _REWRITTEN = 2, ("sealscope", "written", "summaries")
-#: Summaries that neither text names are written, too, while the file is smaller [bytes].
+#: Summaries that neither text names are written, too, as long as the file is smaller than this [bytes].
 _SPARE = 5_000_000
-#: Longest wait for another process that writes [s], and the error then.
+#: Longest wait [s] for another process that writes, and the error after it.
 _LONGEST_WAIT, _BUSY = 60.0, "a machine's file must be free to be written, got another process that writes it ({})"
 _HEAD = """\
 # A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
@@ -61,7 +62,7 @@ _HEAD = """\
 
 
 def _parse_moment(text: Any) -> float:
-    """Parse an ISO 8601 time as seconds since 1970; raise ValueError otherwise."""
+    """Parse a time in ISO 8601 format to seconds since 1970; raise ValueError for any other text."""
     try:
         moment = datetime.fromisoformat(text).timestamp()
         datetime.fromtimestamp(moment, UTC)
@@ -76,7 +77,7 @@ _Moment = Annotated[float, BeforeValidator(_parse_moment)]
 
 
 def _check_format(number: int) -> int:
-    """Check that a file is of the format that this version reads; raise ValueError otherwise."""
+    """Return the format number if it is the one this version reads; raise ValueError otherwise."""
     if number != _FORMAT:
         raise ValueError(f"must be {_FORMAT}, got {number}: commission it anew")
     return number
@@ -108,12 +109,13 @@ _FILE = table_type(
 def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) -> Path:
     """Write a machine's file completely or not at all; an existing file is kept as `.toml.bak`.
 
-    A link is written through. The summaries of its healthy recordings are written next to it, as `.healthy`.
+    If the path is a link, the file it leads to is written. The summaries of the healthy recordings are written to a
+    second file of the same name with the ending `.healthy`.
 
     Parameters
     ----------
     machine : CommissionedMachine
-        What `sealscope.commission` returns.
+        The machine, for example from `sealscope.commission`.
     path : str or path-like
         The file, ending in .toml.
 
@@ -125,8 +127,8 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     Raises
     ------
     InputError
-        The path does not end in .toml, or cannot be written, or writing would undo what another has changed since the
-        machine was loaded.
+        The path does not end in .toml or cannot be written, or writing would undo a change that another process has
+        made since the machine was loaded.
 
     Examples
     --------
@@ -153,10 +155,11 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
 def update_machine(
     path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
 ) -> CommissionedMachine:
-    """Read, change and write a machine's file without losing the changes of another process.
+    """Apply a change to a machine's file without losing changes that another process makes at the same time.
 
-    `change` is called once without a lock, and once more if the file has changed meanwhile. Raises InputError as
-    `read_machine`, `write_machine` and `change` do; then the file stays as it was.
+    `change` converts the machine that was read into the one to write. It is called a second time if another process
+    has written the file meanwhile. Returns the changed machine. Raises InputError as `read_machine`, `write_machine`
+    and `change` do; the file then stays as it was.
     """
     target = _resolve_target(path)
     machine = read_machine(target)
@@ -169,7 +172,10 @@ def update_machine(
 
 
 def _resolve_target(path: str | os.PathLike[str]) -> Path:
-    """Follow a path's links to the file to write; raise InputError if it does not end in .toml."""
+    """Follow the links of a path to the file to write.
+
+    Raises InputError if it does not end in .toml or its folder does not exist.
+    """
     target = _follow_links(path)
     if target.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {target}")
@@ -178,7 +184,7 @@ def _resolve_target(path: str | os.PathLike[str]) -> Path:
 
 
 def _follow_links(path: str | os.PathLike[str]) -> Path:
-    """Follow a path's links to a file; raise InputError if they end in a circle."""
+    """Follow the links of a path to a file; raise InputError if they end in a circle."""
     try:
         return Path(path).resolve()
     except (OSError, RuntimeError, ValueError) as error:
@@ -187,16 +193,21 @@ def _follow_links(path: str | os.PathLike[str]) -> Path:
 
 
 def _lock(target: Path) -> AbstractContextManager[object]:
-    """Lock a machine's file against other processes that write it; raise InputError if one takes too long."""
+    """Lock a machine's file against other processes that write it.
+
+    Entering the returned context raises InputError if another process holds the lock for more than 60 s.
+    """
     return lock_file(target.with_name(f".{target.name}.lock"), _BUSY.format(target), _LONGEST_WAIT)
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
-    """Write the summaries, a backup of the present file, then the new file, safe against interruption.
+    """Write a machine's summaries, a backup of the present text file, then the new text file.
 
-    The summaries written are those of the machine and those that the present file or its backup names. Other present
-    ones are kept while the total size stays below `_SPARE` bytes. Raises InputError if the new text could not be read
-    back.
+    An interruption at any time leaves a complete text with its summaries.
+
+    The summaries written are those of the machine and those that the present file or its backup names. Other
+    summaries in the present file are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the
+    new text could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))
@@ -208,7 +219,7 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
     lines |= {line.checksum: line for line in map(format_summary, machine.healthy)}
     size = sum(len(line.data) for line in lines.values())
-    for checksum, line in present_lines.items():  # texts that were renamed or copied may name it
+    for checksum, line in present_lines.items():  # renamed or copied texts may name them
         if checksum not in lines and (size := size + len(line.data)) < _SPARE:
             lines[checksum] = line
     write_lines([*lines.values()], target.with_suffix(SUFFIX))
@@ -220,12 +231,15 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
 
 
 def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
-    """Format the text of a machine's file at `target`."""
+    """Format a machine as the text of its file at `target`, encoded in UTF-8."""
     return (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
 
 
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
-    """Parse the rows of [[alarms]], one at a time to save memory; raise ValueError for the first that breaks a rule."""
+    """Parse the tables of `[[alarms]]`; raise ValueError with the number of the first one that is not valid.
+
+    They are parsed one at a time, which saves memory.
+    """
     if not isinstance(rows, list):
         raise ValueError(f"alarms must be tables, got {rows!r:.60}")
     alarms = []
@@ -238,14 +252,14 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Map the hash of each part of a machine's file to a description of its change.
+    """Hash each part of a machine's file, and describe in words how a change of that part would be reported.
 
-    A part is anything that another process may change: the statements with the rig, a healthy recording, or a judged
-    alarm.
+    A part is anything that another process may change: the statements about the machine, one healthy recording, or
+    one judged alarm. Returns a mapping from hash to description.
     """
 
     def hash_value(value: Any) -> bytes:
-        """Hash a plain value."""
+        """Return the first 16 bytes of the SHA-256 of a plain value."""
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     statements = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
@@ -256,11 +270,12 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
 
 
 def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Describe a change of a machine's file since loading that writing would undo; None if there is none.
+    """Find a change of a machine's file since loading that writing would undo; None if there is none.
 
-    `origin`: parts when the file was loaded; `present`: parts of the file now; `written`: parts about to be written,
-    all by hash (`_hash_parts`). A change is a present part that is neither in `origin` nor in `written`, or a part in
-    both `origin` and `written` that is no longer present.
+    `origin` holds the hashes of the file's parts when it was loaded, `present` those of the file now and `written`
+    those about to be written (`_hash_parts`). A change is a present part that is neither in `origin` nor in
+    `written`, or a part in both `origin` and `written` that is no longer present. Returns the description of the
+    first change.
     """
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
@@ -268,14 +283,17 @@ def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[
 
 
 def _read_checked(path: Path) -> dict[str, Any]:
-    """Read and check the tables of a machine's text except its rig's; raise InputError if one breaks a rule."""
+    """Read the tables of a machine's text and check all but the rig's; raise InputError if a value is not valid."""
     tree = _read_tree(path, str(path))
     _convert_tree(tree, str(path))
     return tree
 
 
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
-    """Read a machine's text without checks, keys from before version 0.1 renamed; `place`: its path for messages."""
+    """Read the tables of a machine's text without checking them; `place` is its path for error messages.
+
+    Keys from before version 0.1 get their present names.
+    """
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
     for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
@@ -286,7 +304,7 @@ def _read_tree(path: Path, place: str) -> dict[str, Any]:
 
 
 def _read_if_valid(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's text; return an empty mapping if it cannot be read."""
+    """Read the tables of a machine's text without checking them; an empty mapping if the text cannot be read."""
     try:
         return _read_tree(path, str(path))
     except InputError:
@@ -294,14 +312,18 @@ def _read_if_valid(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of the summaries that a machine's text, valid or not, names."""
+    """List the checksums of the summaries that a machine's text names, even if parts of the text are not valid."""
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the path of a machine's summaries: the file of the same name or, if that is absent, one its text names."""
+    """Return the path of a machine's file of summaries.
+
+    It has the name of the text at `path` with another suffix. If there is no such file, it is the one that the text
+    names.
+    """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
     candidates = [path.with_suffix(SUFFIX), path.with_suffix(OLD_SUFFIX)]
@@ -311,7 +333,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the tables of a machine's file at `path`."""
+    """Build the nested tables of a machine's file, to be written at `path`."""
     from importlib.metadata import version
 
     summary, columns = machine.summary, machine.channel_map
@@ -349,9 +371,10 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 
 
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
-    """Format a table as lines of TOML: values and inline tables of plain values first, then the inner tables.
+    """Format a table as lines of TOML: first plain values and short tables in one line, then the other inner tables.
 
-    `path`: dotted name of the table, "" for the whole file, whose lists are arrays of tables; `heading`: first line.
+    `path` is the dotted name of the table, or "" for the whole file, in which a list becomes an array of tables.
+    `heading` is the first line. A table without plain values has no heading.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -369,12 +392,12 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
 
 
 def _format_key(name: str) -> str:
-    """Format a TOML key, quoted unless it may be bare."""
+    """Format a key for TOML, in quotes if TOML requires them."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _format_value(name)
 
 
 def _format_value(value: Any) -> str:
-    """Format a plain value as TOML, without members that are None; numbers to the last digit."""
+    """Format a plain value as TOML. Entries that are None are left out, and numbers keep all their digits."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -391,7 +414,7 @@ def _format_value(value: Any) -> str:
 
 @checked_call
 def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
-    """Read a machine's file.
+    """Read the file of a commissioned machine, with the summaries of its healthy recordings.
 
     Parameters
     ----------
@@ -406,7 +429,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     Raises
     ------
     InputError
-        The file cannot be read, is of another format, or one of its values breaks a rule.
+        The file cannot be read, is of another format, or one of its values is not valid.
 
     Examples
     --------
@@ -438,7 +461,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 
 
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
-    """Check and convert the tables of a machine's text; raise InputError, with the `place`, if one breaks a rule."""
+    """Check and convert the tables of a machine's text; raise InputError with the `place` if a value is not valid."""
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)
         check_request(tables.get("map", {}), tables["machine"].get("rate"))

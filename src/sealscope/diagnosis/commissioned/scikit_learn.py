@@ -1,4 +1,4 @@
-"""A commissioned machine as an estimator of scikit-learn: `fit` on healthy recordings, `predict` on others."""
+"""A commissioned machine as a scikit-learn estimator: `fit` on healthy recordings, `predict` on others."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ Paths = Sequence[str | os.PathLike[str]]
 
 
 class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
-    """Outlier detector for files of recordings, whose outliers are leaking recordings.
+    """Detect leaking recordings among files, as outliers from the healthy recordings.
 
     Parameters
     ----------
     rig, map, rate, limit : optional
-        As for `sealscope.commission`.
+        Arguments of `sealscope.commission`.
     false_alarm_probability : float, optional
-        Probability of an outlier on a healthy recording.
+        Probability that a healthy recording is classified as an outlier.
 
     Attributes
     ----------
@@ -59,27 +59,27 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: Paths, y: object = None) -> Self:
-        """Learn from files of healthy recordings `X`; `y` is ignored."""
+        """Commission a machine from the files of healthy recordings `X`; `y` is ignored."""
         self.machine_: CommissionedMachine = commission(X, rig=self.rig, map=self.map, rate=self.rate, limit=self.limit)
         return self
 
     def score_samples(self, X: Paths) -> Array:
-        """Compute the negative score of each file: the lower, the more it leaks; nan if it cannot be judged."""
+        """Compute minus the score of each file (n,): the lower, the more it leaks; nan if it cannot be judged."""
         return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
-        """Compute the threshold minus the score of each file: < 0 for a leak, nan if it cannot be judged."""
+        """Compute threshold minus score of each file (n,): negative for a leak, nan if it cannot be judged."""
         diagnoses = self._diagnoses(X)
         score: Array = np.array([diagnosis.score for diagnosis in diagnoses], dtype=float)
         return np.array([diagnosis.threshold for diagnosis in diagnoses], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
-        """Return -1 for each file with a leak, 1 for one without, 0 if it cannot be judged."""
+        """Classify each file (n,): -1 for a leak, 1 for no leak, 0 if it cannot be judged."""
         labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
         return np.array([labels[diagnosis.verdict] for diagnosis in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
-        """Diagnose each file by the commissioned machine."""
+        """Diagnose each file with the commissioned machine."""
         check_is_fitted(self)
         p = self.false_alarm_probability
         return [self.machine_.diagnose(path, false_alarm_probability=p) for path in X]

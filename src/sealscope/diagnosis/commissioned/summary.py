@@ -1,4 +1,4 @@
-"""Summary of a machine from healthy recordings: terms, sensors, scatter, smallest leak, and problems."""
+"""Summarise a machine from its healthy recordings: balance terms, sensors, smallest detectable leak, and problems."""
 
 from __future__ import annotations
 
@@ -29,13 +29,17 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.healthy import SummarisedRecording, Summary
     from sealscope.parameters import Rig
 
-#: Findings that a logger causes in each recording: corrected there, and reported when the machine is commissioned.
+#: Findings that a logger causes in each recording. They are corrected, and reported when the machine is commissioned.
 _LOGGER_HABITS = ("unsigned_speed",)
 _PRIORS = COMMISSIONED.smallest
 
 
 class TermEstimate(NamedTuple):
-    """Coefficient of the balance: value, standard error, scatter between recordings (None for a single one), unit."""
+    """Estimated coefficient of one term of the volume balance.
+
+    `deviation` is its standard error, `scatter` its standard deviation between recordings (None for a single
+    recording), and `unit` the unit of all three numbers.
+    """
 
     value: float
     deviation: float
@@ -44,11 +48,17 @@ class TermEstimate(NamedTuple):
 
 
 class SmallestLeak(NamedTuple):
-    """The smallest leak that is detected in the next recording with the stated probability.
+    """The smallest leak that the next recording shows with a stated probability (`power` of `priors.toml`).
 
-    `lpm`: flow [L/min], None if the machine's size is not stated; `share`: fraction of the pump's flow; `halved_by`:
-    factor by which the number of healthy recordings and days must grow to halve this leak, None if none of those tried
-    is enough.
+    Attributes
+    ----------
+    lpm : float or None
+        Flow of the leak [L/min], None if the machine's size is not stated.
+    share : float
+        Flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move.
+    halved_by : int or None
+        Factor by which the number of healthy recordings and days must grow to halve this leak. None if no factor that
+        was tried is enough.
     """
 
     lpm: float | None
@@ -62,10 +72,18 @@ class SmallestLeak(NamedTuple):
 
 @dataclass(frozen=True)
 class MachineSummary:
-    """Figures of a machine from its healthy recordings.
+    """Figures of a machine, estimated from its healthy recordings.
 
-    `terms` by name; `noise`: standard deviation by channel in its unit; `smallest` leak, None if no balance states one;
-    `problems`: a line each.
+    Attributes
+    ----------
+    terms : mapping of str to TermEstimate
+        Coefficients of the volume balance by the name of the term.
+    noise : mapping of str to float
+        Standard deviation of the noise of each channel, in the channel's unit.
+    smallest : SmallestLeak or None
+        Smallest detectable leak, None if no volume balance can state one.
+    problems : list of str
+        Problems of the recordings, one line each.
     """
 
     terms: Mapping[str, TermEstimate]
@@ -74,7 +92,11 @@ class MachineSummary:
     problems: list[str] = field(default_factory=list)
 
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
-        """Format the summary as a table of some ten lines."""
+        """Format the summary as a table of about ten lines.
+
+        `healthy` are the recordings that it summarises, and `rig` the stated sizes of the machine, None if there are
+        none.
+        """
         units = dict(healthy[0].units) if healthy else {}
         display_units = {name: _display_unit(healthy, name, unit) for name, unit in units.items()}
         starts = [recording.start_s for recording in healthy if recording.start_s is not None]
@@ -101,9 +123,9 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, 16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Format the table rows on the smallest leak and on the recordings needed to halve it.
+        """Make the table rows on the smallest detectable leak and on the recordings needed to halve it.
 
-        `are_dated`: also state the number of days.
+        `are_dated` tells whether the dates of the recordings are known; the number of days is then mentioned, too.
         """
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
@@ -117,7 +139,7 @@ class MachineSummary:
 
 
 def _describe_rig(rig: Rig | None) -> str:
-    """Format the stated sizes of the machine."""
+    """Describe the stated sizes of the machine in one line; None stands for a machine of unknown sizes."""
     rig = rig or unstated_rig()
     if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
         return rig.title or rig.name
@@ -131,13 +153,19 @@ def _describe_rig(rig: Rig | None) -> str:
 
 
 def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) -> str:
-    """Return the unit to display a channel in: that of the log, else a common one instead of the SI `unit`."""
+    """Return the unit in which to display the channel `name`.
+
+    This is its unit in the log or, if that is not known, bar for Pa, mm for m and otherwise its SI `unit`.
+    """
     log_unit = healthy[0].about.get("log_units", {}).get(name)
     return str(log_unit or {"Pa": "bar", "m": "mm"}.get(unit, unit))
 
 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
-    """Format the ranges of pump flow, if the machine's size is stated, of pressure difference and oil temperature."""
+    """Format the ranges over the healthy recordings of pump flow, pressure difference and oil temperature.
+
+    Quantities that are not known are left out; the flow needs a machine of stated size.
+    """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
     ranges = {
@@ -158,7 +186,7 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Describe a healthy recording for the summary: pressure, oil temperature, noise, units and problems."""
+    """Describe a healthy recording for display: pressure, oil temperature, noise, units in the log, and problems."""
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
         description["pressure_bar"] = _round_to_4_digits(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
@@ -179,7 +207,11 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
 def summarise_machine(
     healthy: Sequence[SummarisedRecording], rig: Rig | None, left_out: Sequence[str] = ()
 ) -> MachineSummary:
-    """Summarise a machine's healthy recordings; `left_out`: the unusable ones with reasons."""
+    """Summarise a machine's healthy recordings.
+
+    `left_out` are recordings that could not be used, with the reasons; they become the first of the problems. Terms
+    and smallest leak are estimated from the recordings with a volume balance of the same terms as the first one.
+    """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
     for recording in healthy:
@@ -203,7 +235,10 @@ def summarise_machine(
 
 
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Estimate the balance's terms from the Gram matrices of all recordings, and their scatter between recordings."""
+    """Estimate the balance's coefficients from all recordings together, and their scatter between recordings.
+
+    `sums` holds the Gram matrix (m, m) of each recording, whose rows are scaled to unit noise.
+    """
     equation = equations(rig, channels)[0]
     roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
     nuisance = list(roles.nuisance)
@@ -218,20 +253,21 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 
 
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients of some `columns` of a balance by least squares from its Gram matrix (m, m)."""
+    """Fit the coefficients of some `columns` of a volume balance by least squares, from its Gram matrix (m, m)."""
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
-    """Estimate the smallest leak that is detected in a recording of a later day under the usual duty.
+    """Estimate the smallest leak that a recording of a later day will show under the usual duty.
 
-    The leak exceeds the threshold of Student's t test by the normal quantile of the detection probability `power`. More
-    healthy days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
+    It is detected with the probability `power` (`priors.toml`). The rise of the leakage due to it exceeds the
+    threshold of Student's t test by the normal quantile of this probability. More healthy days lower the threshold
+    and the error of the healthy mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
     def smallest_rise(n_repeats: int) -> float:
-        """Estimate the smallest detectable rise of the conductance, given `n_repeats` times as many healthy days."""
+        """Estimate the smallest detectable rise of the conductance with `n_repeats` times as many healthy days."""
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 
@@ -246,7 +282,10 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of the recordings, each kind (text before a colon) once, with its file or number of files."""
+    """List the problems of all recordings, one line for each kind, with the file's name or the number of files.
+
+    Problems with the same text before the first colon are of one kind.
+    """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
         for text in recording.about.get("wrong", ()):
@@ -259,10 +298,11 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 
 
 def _estimate_noise(values: Array) -> float:
-    """Estimate the standard deviation of white noise from second differences, at least that of rounding.
+    """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
-    The variance of second differences of white noise is 6 times that of the noise; 0.6745 is the median absolute value
-    of a standard normal number. Returns 0 for fewer than three finite values.
+    The variance of second differences of white noise is 6 times that of the noise, and 0.6745 is the median absolute
+    value of a standard normal number. The estimate is at least the rounding error of the channel's resolution.
+    Returns 0 for fewer than three finite values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:
@@ -272,7 +312,7 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Report a pressure below vacuum in more than 1 % of the samples, "" if there is none."""
+    """Describe a pressure that is below vacuum in more than 1 % of the samples; "" if there is none."""
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
     offset = (-P_ATM - low_pressure) / BAR
@@ -280,7 +320,10 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 
 
 def _describe_glitches(part: Recording, name: str) -> str:
-    """Report single samples that differ from both neighbours by more than the channel's range, "" if there are none."""
+    """Describe single samples that stand out from both neighbours by more than the channel's range.
+
+    The result is "" if there are none. The range is that between the 1 % and 99 % quantiles of the channel.
+    """
     values = part[name]
     if len(values) < 3:
         return ""

@@ -1,4 +1,4 @@
-"""What the monitor reads of a machine's file: the rig, how its logs are read, its repair limit and healthy level."""
+"""Read from a machine's file what the monitor needs: rig, layout of its logs, repair limit and healthy leakage."""
 
 from __future__ import annotations
 
@@ -22,20 +22,30 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.storage.toml_file import read_toml
 
-#: Fewest healthy recordings with which a leakage is compared: a single one has no scatter.
+#: Fewest healthy recordings that a leakage is compared with, as a single one has no scatter.
 _MIN_RECORDINGS = 2
 _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 
 
 @dataclass(frozen=True)
 class WatchedMachine:
-    """An actuator to be monitored, from the file of a rig or a machine.
+    """An actuator to be monitored, as stated by the file of a rig or of a commissioned machine.
 
-    `rig`: sizes of the machine; if only the areas are stated, its displacement is measured from the healthy recordings;
-    `channel_map`: channel -> column of its logs; `rate`: sampling rate [Hz] of logs without a time column; `limit_lpm`:
-    leak at which it must be repaired [L/min], None if that needs an unknown area; `machine`: healthy recordings against
-    which whole recordings are judged, None if there are none; `healthy`: leakage of pump and piston together in these,
-    None if it cannot be determined.
+    Attributes
+    ----------
+    rig : Rig
+        Sizes of the machine. If only the areas are stated, the pump's displacement is measured from the healthy
+        recordings.
+    channel_map : mapping of str to str
+        Channel to column of its logs.
+    rate : float or None
+        Sampling rate [Hz] of logs without a time column.
+    limit_lpm : float or None
+        Leak at which the machine must be repaired [L/min], None if that needs a piston area that is not stated.
+    machine : CommissionedMachine or None
+        Machine whose healthy recordings whole recordings are compared with, None if there are none.
+    healthy : HealthyLevel or None
+        Leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
     """
 
     rig: Rig
@@ -47,7 +57,7 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load a packaged rig, a rig file or a machine file for the monitor; raise InputError as `load_rig`."""
+    """Load a packaged rig, a rig file or a machine file for the monitor; raise InputError if it cannot be read."""
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
         return WatchedMachine(named_rig, named_rig.channel_map)
@@ -66,9 +76,9 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Test whether two rigs are equal except for a displacement that differs by at most 5 %.
+    """Test whether two rigs are equal but for the pump's displacement, which may differ by at most 5 %.
 
-    A new measurement of the displacement may differ by that much.
+    Two measurements of one pump's displacement may differ by that much.
     """
     values, values_before = rig.model_dump(), rig_before.model_dump()
     for tree in (values, values_before):
@@ -77,7 +87,10 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Replace a rig's displacement by the median measured in healthy recordings, if only its areas are stated."""
+    """Replace the displacement of a rig by the one measured in healthy recordings, if the rig states only its areas.
+
+    The new value is the median over the recordings. Without a measurement the rig is returned unchanged.
+    """
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
@@ -89,28 +102,32 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 
 
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
-    """Estimate the leakage conductance of pump and piston together from the sums of the healthy recordings.
+    """Estimate the leakage conductance of pump and piston together in the healthy recordings.
 
-    None if fewer than two recordings have it; a machine behind a servo valve, with several balances, has none.
+    The result is None if fewer than two recordings have an estimate. A machine with a servo valve has several
+    balances and no estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:
         return None
-    # the highest level may be due to the warmest oil: the lowest is no lower than that allows
+    # the highest level may be due to the warmest oil, which limits how far the lowest one is below it
     low = max(min(levels), max(levels) / INFERENCE.oil.warmest)
     known_s = max((recording.start_s for recording in healthy if recording.start_s is not None), default=0.0)
     return HealthyLevel(float(np.mean(levels)), low, max(levels), float(np.std(levels, ddof=1)), known_s, len(levels))
 
 
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
-    """Fit the leakage conductance [m^3/(s Pa)] to a recording's sums; None unless they are of a single balance."""
+    """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
+
+    The result is None if the summary does not contain the sums of exactly one balance.
+    """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:
         return None
     roles, gram = ColumnRoles(balances[0]), np.asarray(summary["sums"], dtype=float)[0]
     if gram.shape != 2 * (roles.left + 1,):
         return None
-    # without the pump's leakage, which lies in parallel, the leak's column stands for both
+    # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
     conductance = float(fit_columns(gram, roles, [*nuisance, roles.leak])[-1] * float(summary["scale"]))
     return conductance if np.isfinite(conductance) else None

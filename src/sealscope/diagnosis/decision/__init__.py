@@ -1,1 +1,1 @@
-"""What a recording's observables mean: events that explain them, healthy recordings as their null, one verdict."""
+"""From the tests of a recording to a verdict: calibration by healthy recordings, explanations by events, decision."""

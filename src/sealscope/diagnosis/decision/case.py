@@ -1,4 +1,4 @@
-"""Grounds of a decision: the judging report, rival explanations, healthy recordings, and the tests of a leak."""
+"""Grounds of a decision: the report of the judging detector, other explanations, and the tests for a leak."""
 
 from __future__ import annotations
 
@@ -23,12 +23,17 @@ from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Cause
 
-#: The third test, after WITHIN and AGAINST: whether the leakage is more than the rig's file allows a healthy machine.
+#: Name of the third test, besides WITHIN and AGAINST: whether the leakage exceeds the limit in the rig's file.
 LEVEL = "against the rig's file"
 
 
 class LeakTest(NamedTuple):
-    """A test of a leak: score, threshold, `chance` of the score without a leak, allowed false-alarm `probability`."""
+    """Result of a test for a leak.
+
+    `name`: WITHIN, AGAINST or LEVEL, i.e. within the recording, against healthy recordings, or against the rig's
+    file; `chance`: probability of at least this `score` without a leak; `probability`: allowed probability of a false
+    alarm, with which the score exceeds the `threshold`.
+    """
 
     name: str
     score: float
@@ -38,9 +43,11 @@ class LeakTest(NamedTuple):
 
 
 class OtherEvent(NamedTuple):
-    """Event other than a leak that explains a rare change, with its `probability`.
+    """Event other than a leak that explains a rare change in a recording.
 
-    `observable`: the rarest one that it explains; `chance`: of this observable in a healthy recording.
+    `cause`, `description`: those of the event; `probability`: posterior probability of an event with this cause;
+    `observable`: the rarest observable that it explains; `chance`: probability of that observable in a healthy
+    recording.
     """
 
     cause: Cause
@@ -52,10 +59,12 @@ class OtherEvent(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Grounds of a decision: the judging report, all observables, and their chances in healthy recordings (`null`).
+    """Everything that a decision on one recording depends on.
 
-    `false_alarm_probability`: that of `leak` on a leak-free recording; `weigh_rivals`: whether other causes compete
-    with a leak, False for a method that decides alone.
+    `judge`: report of the detector that judges; `observables`: tests of all detectors that are considered; `null`:
+    distribution of the observables in healthy recordings; `false_alarm_probability`: allowed probability of the
+    verdict `leak` on a leak-free recording; `weigh_rivals`: true if other causes (rivals) compete with a leak, false
+    for a method that decides alone.
     """
 
     judge: Observed
@@ -66,24 +75,25 @@ class Case:
 
     @property
     def leak(self) -> LeakMeasure | None:
-        """Leak as measured by the judging provider, None if it measures none."""
+        """Leakage as measured by the judging detector; None if it does not measure leakage."""
         return self.judge.leak
 
     @property
     def rarest_observable(self) -> Observable:
-        """The judging provider's rarest observable."""
+        """The observable of the judging detector that is least probable in a healthy recording."""
         return min(self.judge.observables, key=lambda observable: observable.chance)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Sets of events that explain the observables, with their probabilities."""
+        """Sets of events that explain the observables, with their probabilities, the most probable first."""
         return explain(self.observables, self.null.chance, None if self.leak is None else self.leak.step_rise)
 
     def leak_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that a leak past piston or pump caused an alarm.
+        """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
 
-        If rivals are not weighed it is 1. For a level above the rig's limit it is that of an alarm of a step within the
-        recording, which may have raised the level, or 1 without such an alarm.
+        It is 1 if rivals are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the rig's
+        file, a leak that began within the recording may have raised it: the probability is then that of an alarm of
+        that test, or 1 if there is none.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -95,24 +105,26 @@ class Case:
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
-        """The tests that the observations allow; together they have the allowed false-alarm probability."""
+        """The tests for a leak that the reports allow; together they have the allowed false-alarm probability."""
         return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests whose chance is below the allowed false-alarm probability, in order of precedence.
+        """Tests that raise an alarm, i.e. whose chance is below their allowed false-alarm probability.
 
-        A step comes before a rise, unless the leak is older than the recording.
+        The test for a leak that began within the recording comes first, unless the leak seems older than the
+        recording.
         """
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self._has_onset_within else reversed(alarms))
 
     @property
     def _has_onset_within(self) -> bool:
-        """True if a leak that began within the recording explains step and rise better than an older one.
+        """True if a leak that began within the recording is a better explanation than an older leak.
 
-        The older one explains the rise alone, the younger one the step and the rise that this step causes. Without a
-        rise to explain, or if holds date the rise within the recording, there is no question.
+        An older leak explains only the leakage above that of healthy recordings (the rise). One that began within the
+        recording explains a step, i.e. a sudden increase of the leakage, and the rise that this step causes. The
+        result is also true if there are no healthy recordings, or if holds date the leak within the recording.
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -122,16 +134,17 @@ class Case:
 
     @cached_property
     def other_event(self) -> OtherEvent | None:
-        """Event other than a leak that explains a rare change with sufficient probability, or None.
+        """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The observables are tried in the order of their chances, up to the chance that a healthy recording allows.
+        The observables are tried from the rarest on, as long as they are rarer than is allowed in a healthy
+        recording.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
             observable: [event for event in named_events if event.affects(observable)]
             for observable in self.observables
         }
-        # several tests may name an event: one for each kind of data that shows one
+        # each kind of data that shows an event is one more test that may name an event by mistake
         n_tests = len({observable.data for observable, candidates in candidates_of.items() if candidates})
         allowed = DECISION.explanation.heading * self.false_alarm_probability / max(n_tests, 1)
         chances = {observable: self.null.chance(observable) for observable in self.observables}
@@ -148,10 +161,12 @@ class Case:
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
-    """Make the tests of a measured leak: a step within the recording, a rise over healthy ones, a level too high.
+    """Make the tests for a leak from measured leakage: within the recording, against healthy ones, against a limit.
 
-    The tests share the allowed false-alarm probability. If a step and a rise are tested, the fraction
-    `questions.within` goes to the step; if a step and a level are tested, it goes to the level.
+    The leakage is tested for a step (a sudden increase) within the recording, for a rise over healthy recordings, and
+    for a level above the limit in the rig's file, as far as `leak` allows. The tests share the allowed false-alarm
+    probability. If a step and a rise are tested, the fraction `questions.within` of `priors.toml` goes to the step;
+    if a step and a level are tested, it goes to the level.
     """
     from scipy.special import ndtr, ndtri
 
@@ -173,14 +188,17 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key of the null distribution for a provider's test of a step of the leak."""
+    """Return the key under which `HealthyNull` stores a detector's test of the leak for a step.
+
+    `provider`: name of the detector.
+    """
     return f"{provider}: step"
 
 
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
-    """Make the test of a provider that measures no leak, by the rarest of its observables that a leak changes.
+    """Make the test for a leak from a detector that does not measure leakage.
 
-    The result has one test, or none if no observable is affected by a leak.
+    It is the test of the rarest of its observables that a leak changes. The result is empty if a leak changes none.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

@@ -1,7 +1,8 @@
-"""Choose one decision among those of several detectors.
+"""Choice of one decision among those of several detectors.
 
-If any of several could raise the alarm, their false-alarm probabilities would add up. So one judges: the first of
-`ORDER` that reaches a verdict, then a user's own detectors, last the change of RMS, which states no size.
+If each of several detectors could raise the alarm, their false-alarm probabilities would add up. Therefore only one
+judges: the first of `ORDER` that reaches a verdict, then a user's own detectors, and last the change of RMS, which
+states no size.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the place of a detector in the order of judging, 0 first.
+    """Return the place of a detector, by its name, in the order in which detectors may judge; 0 is the first.
 
     All plug-ins share one place, after the detectors that measure the leak and before the change of the RMS.
     """
@@ -36,15 +37,19 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Test whether a usable detector decides: it states a verdict or a cause, or its score exceeds the threshold."""
+    """Return True if the evidence of a detector is usable and decides, i.e. if the detector does not abstain.
+
+    A detector decides if it states a verdict or a cause, or if its score exceeds the threshold.
+    """
     return evidence.usable and not evidence.abstains
 
 
 def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
-    """Choose the decision of the first detector that decides, with all decisions as its `parts`.
+    """Combine the decisions of several detectors into one: that of the first detector, by rank, that decides.
 
-    `no leak` becomes `cannot tell` if the recording's end is not judged, or if there is a `refusal`, the reason why it
-    must not be stated.
+    All decisions become its `parts`. A verdict `no leak` becomes `cannot tell` if the end of the recording is not
+    judged, or if `refusal` gives a reason why `no leak` must not be stated (None if there is none). If no detector
+    decides, the verdict is `cannot tell`, too.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -68,9 +73,11 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """State `cannot tell`, with the reason of the first usable detector.
+    """Make the verdict `cannot tell` for the case that no detector decides, with a reason.
 
-    If none is usable, the reason is that of the detector that needs the fewest channels.
+    `ranked`: decisions of all detectors in the order of judging; `usable`: those that could use the recording. The
+    reason is that of the first usable detector. If none is usable, it is that of the built-in detector which needs
+    the fewest channels.
     """
     if usable:
         undecided = usable[0]

@@ -1,9 +1,10 @@
-"""The one decision: from observations of a recording, and of healthy ones, to a verdict.
+"""The decision on a recording: from the reports of detectors to a verdict.
 
-`leak` if a test exceeds its threshold, set by the false-alarm probability and calibrated by healthy recordings, and
-leaks are the most probable explanation. Else `no leak`, if the 95 % bound of a leak over all explanations is small
-enough to be worth stating; else `cannot tell`, with the bound and the rival explanation. Nothing else states a verdict:
-`combine` chooses between the decisions of several providers.
+The verdict is `leak` if a test exceeds its threshold and leaks are the most probable explanation. The threshold
+follows from the false-alarm probability, and is calibrated by healthy recordings. Otherwise the verdict is `no leak`
+if the 95 % upper bound of a leak is small enough, and `cannot tell` if it is not, with the bound and the most
+probable other explanation. No other module states a verdict; `combination.combine` chooses among the decisions of
+several detectors.
 """
 
 from __future__ import annotations
@@ -33,28 +34,29 @@ def decide(
     false_alarm_probability: float,
     weigh_rivals: bool = True,
 ) -> Evidence:
-    """Decide on a recording by the report of one provider.
+    """Decide whether a recording shows a leak, by the report of one detector.
 
     Parameters
     ----------
     judge : Observed
-        The provider that judges.
+        Report of the detector that judges.
     reports : sequence of Observed
-        All reports, with or without that of `judge`; their observables are rival explanations.
+        Reports of all detectors, with or without that of `judge`; their observables may show other causes.
     null : HealthyNull
-        Chances of the observables in healthy recordings of the machine.
+        Distribution of the observables in healthy recordings of the machine.
     false_alarm_probability : float
-        Probability of `leak` on a leak-free recording.
+        Allowed probability of the verdict `leak` on a leak-free recording.
     weigh_rivals : bool, optional
-        Whether other causes compete with a leak; False for a method that decides alone.
+        True if other causes compete with a leak; False for a method that decides alone.
 
     Returns
     -------
     Evidence
+        The verdict with its reason, the leak's size or bound, and the tests.
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    # two measures of the leak rest on the same samples, and are no rivals
+    # two measures of the leak use the same samples, and do not compete
     rivals = [report for report in reports if report is not judge and (report.leak is None or judge.leak is None)]
     observables = [*judge.observables]
     if weigh_rivals:
@@ -66,7 +68,7 @@ def decide(
 
 
 def _evidence_without_leak(case: Case) -> Evidence:
-    """State `no leak` or `cannot tell`, with the bound of a leak and the event that explains what changed."""
+    """Make the verdict `no leak` or `cannot tell`, with the bound of a leak and the event that explains a change."""
     alarm, leak, other = next(iter(case.alarms), None), case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     verdict = decide_without_leak(*_bound_and_limit(case, bound))
@@ -83,7 +85,10 @@ def _evidence_without_leak(case: Case) -> Evidence:
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
-    """State the leak that an alarm is due to: cause, onset and size."""
+    """Make the verdict `leak`, with cause, onset and size of the leak.
+
+    `alarm`: test that detected the leak.
+    """
     leak, fields = case.leak, dict[str, Any]()
     if leak is None:
         fields["cause"], onset = "piston leak", case.rarest_observable.onset
@@ -105,14 +110,21 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 
 
 def _leak_cause(case: Case, leak: LeakMeasure) -> Cause:
-    """Name the cause of a leak: the piston alone if an observed pump leak is surely no explanation."""
+    """Return the cause of a leak as the detector states it, or "piston leak" if a leak of the pump is excluded.
+
+    A leak of the pump is excluded if it was tested by an observable of its own and its probability is negligible.
+    """
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST
     return "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
 
 
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Compute the fields of `Evidence` on the leak's size: in L/min, unless refused, and relative to the pump."""
+    """Compute the fields of `Evidence` that state a leak's size, by their names.
+
+    `flow`: mean flow of the leak, None if unknown (no fields). The size is relative to the pump and, if the machine's
+    size is stated, in L/min with a 95 % interval; otherwise the field `refuses` says that L/min are not stated.
+    """
     if flow is None:
         return {}
     fields: dict[str, Any] = {"relative": leak.relative(flow)}
@@ -126,10 +138,10 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
 
 
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
-    """Compute the 95 % upper bound of a leak [m^3/s].
+    """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
-    If an alarm may be due to a leak, the bound is at least the upper end of that leak's interval. It is infinite if it
-    reaches the pump's mean flow, or nothing bounds the leak.
+    If an `alarm` may be due to a leak, the bound is at least the upper end of that leak's interval. The bound is
+    infinite if it would reach the pump's mean flow, or if the leakage was not measured.
     """
     leak = case.leak
     if leak is None:
@@ -144,10 +156,11 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 
 
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
-    """Return the 95 % bound of a leak, and the largest bound that allows `no leak`.
+    """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
-    Both are flows [m^3/s] or, if no leak is measured, changes of the ringing's log RMS. The bound of the ringing is
-    infinite if none was measured, after an alarm, or at a sampling rate too low for it to exclude a leak.
+    `bound`: upper bound of the leak's flow [m^3/s]. If leakage is measured, both results are flows [m^3/s]. Otherwise
+    they are changes of the ringing of the pressures, as the logarithm of its RMS. The bound of the ringing is
+    infinite if it was not measured, after an alarm, or if the sampling rate is too low for it to exclude a leak.
     """
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])
@@ -158,7 +171,10 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the smallest step within the recording that would have been found [m^3/s]; None if none was tested."""
+    """Compute the flow [m^3/s] of the smallest leak that would be found if it began within the recording.
+
+    Return None if that was not tested.
+    """
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
@@ -167,9 +183,10 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add the provider's name, shares and ratio of sizes, and the results of the tests, to the evidence.
+    """Add to the evidence the detector's name, the judged fraction, the ratio of sizes, and the results of the tests.
 
-    `judging`: test whose result is stated, None to add no results. All tests are added as `parts` if there are several.
+    `judging`: test whose score, threshold and chance are stated, None to add no results. If there are several tests,
+    all are added as `parts`.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

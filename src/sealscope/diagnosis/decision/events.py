@@ -1,4 +1,4 @@
-"""The table of possible events: their frequency, and the observables they change (`events.toml`)."""
+"""The table of events that may happen to a machine: their frequency, and what they change (`events.toml`)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from sealscope.diagnosis.verdict.evidence import Cause
 
 @dataclass(frozen=True)
 class Event:
-    """An event of `events.toml`, with its prior probability in a recording.
+    """An event that may happen to a machine or its instruments within a recording, from `events.toml`.
 
-    `cause`: heading under which a verdict names it, None if none does; `affected`, `disturbed`: patterns "data: name"
-    of observables that it changes, and of those it may change as a side effect; `description`: its words in a reason.
+    `cause`: heading under which a verdict names the event, None if a verdict never does; `probability`: prior
+    probability that it begins within a recording; `affected`: patterns "data: name" of the observables that it
+    changes; `disturbed`: patterns of those that it may change as a side effect; `description`: words for it in a
+    reason.
     """
 
     name: str
@@ -30,30 +32,30 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if the sizes of the event's observables count (`Observable.advantage`).
+        """True if a prior on the sizes of the event's changes counts (`Observable.advantage`).
 
-        A prior on the sizes exists only for events that a verdict names.
+        It does for events that a verdict may name, i.e. that have a cause.
         """
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
-        """Test whether the event changes an observable."""
+        """Return True if the event changes an observable."""
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
-        """Test whether the event may change an observable as a side effect."""
+        """Return True if the event may change an observable as a side effect."""
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
 
 @lru_cache(maxsize=4096)
 def _matches(key: str, patterns: tuple[str, ...]) -> bool:
-    """Test whether an observable's "data: name" matches one of the patterns."""
+    """Return True if the `key` "data: name" of an observable matches one of the patterns; "*" stands for any text."""
     return any(fnmatchcase(key, pattern) for pattern in patterns)
 
 
 @cache
 def load_events() -> Sequence[Event]:
-    """Read the table of events."""
+    """Read all events from `events.toml`."""
     rows = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
     return tuple(
         Event(

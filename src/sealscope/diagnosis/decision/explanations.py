@@ -1,13 +1,14 @@
-"""Explanations of the observations: sets of at most three events, each with its probability.
+"""Explanations of what the detectors observe in a recording: sets of at most three events, each with its probability.
 
-A set's posterior is the product of its events' probabilities and, for each kind of data, the Bayes factor of the best
-description by an event of the set; data that no event of the set changes contribute a factor of 1. So a step of the
-noise together with a leak is two events, and does not compete with the leak. The Bayes factor of a change of chance p
-under the null is at most 1 / (-e p log p), 1 for p > 1/e (Sellke, Bayarri and Berger); p is the predictive chance that
-healthy recordings calibrate (`null`).
+The posterior of a set is the product of the prior probabilities of its events and of one Bayes factor for each kind
+of data: that of the best description by an event of the set. Data that no event of the set changes contribute a
+factor of 1. Thus a step of the noise together with a leak is explained by two events, which do not compete. The Bayes
+factor of a change is at most 1 / (-e p log p), where p is the probability of the change in a healthy recording, or 1
+for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy recordings (`null`).
 
-A term describes a change to within a few per cent only: logarithms of Bayes factors of the same data are divided by
-1 + 2 m B, with B the largest and m the misfit (`priors.toml`), so that rivals differ no more than the terms are known.
+A term of the balance describes a change only to within a fraction. Therefore the logarithms of the Bayes factors of
+the same data are divided by 1 + 2 m B, with the largest of them, B, and the misfit m (`priors.toml`). Alternative
+explanations then do not differ by more than the terms are known.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
 """
@@ -30,23 +31,26 @@ from sealscope.diagnosis.verdict.evidence import Cause
 
 #: Largest number of events in an explanation.
 MAX_EVENTS = 3
-#: Smallest log Bayes factor (ten to one) of the data that make an event part of a set of several: duty, noise and
-#: friction change together so often that sets of events with less evidence would crowd out a leak.
+#: Minimum log Bayes factor (ten to one) for an event to be combined with others. Duty, noise and friction change
+#: together so often that sets of events with less evidence would crowd out a leak.
 MIN_LOG_FACTOR = 2.3
-#: Events whose leakage passes the piston or the pump, which lie in parallel.
+#: Events that are a leak past the piston or in the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A set of events with its posterior probability, and the kinds of `data` that it explains."""
+    """A set of events that explains a recording, with its posterior probability.
+
+    `data`: kinds of data (`Observable.data`) that the set explains.
+    """
 
     events: tuple[Event, ...]
     probability: float
     data: frozenset[str] = frozenset()
 
     def has(self, *names: str) -> bool:
-        """Test whether one of the events has one of the names."""
+        """Return True if the set contains an event with one of the names."""
         return any(event.name in names for event in self.events)
 
 
@@ -59,12 +63,23 @@ def explain(
     chance: Callable[[Observable], float] = lambda observable: observable.chance,
     rise: LeakRise | None = None,
 ) -> tuple[Explanation, ...]:
-    """Compute the posterior probabilities of sets of events, the most probable first.
+    """Compute which events explain the observables of a recording, and with which probabilities.
 
-    They are conditional on some event having happened. The sets are each single event, and combinations of the events
-    that the observables support. `chance`: predictive chance of an observable in a healthy recording
-    (`null.HealthyNull.chance`); `rise`: of the leakage over healthy recordings, which a leak causes in proportion to
-    its size and the time since its onset.
+    Parameters
+    ----------
+    observables : sequence of Observable
+        Tests of a recording, by all detectors.
+    chance : callable, optional
+        Probability of an observable in a healthy recording (`null.HealthyNull.chance`), by default as it states.
+    rise : LeakRise, optional
+        Leakage above that of healthy recordings. A leak causes it in proportion to its size and to the time since its
+        onset.
+
+    Returns
+    -------
+    tuple of Explanation
+        Sets of events, the most probable first: each single event, and combinations of up to `MAX_EVENTS` events that
+        the observables support. The probabilities are conditional on some event having happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -84,11 +99,14 @@ def explain(
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of the balance's terms by their likelihoods relative to the best.
+    """Rank the terms of the volume balance by likelihood: the best keeps its log Bayes factor, others get less.
 
-    The terms are rival descriptions of the same residual. Healthy recordings calibrate how rare the best of them is,
-    but are too few to tell which term describes it best: for that the likelihoods in the judged recording alone count.
-    `log_factors` are corrected for misfit; so are the differences (`_correct_for_misfit`).
+    The factor of another term is that of the best minus the difference of their log likelihoods, and at least 0.
+    The terms are alternative descriptions of the same residual. Healthy recordings show how rare the best of them is,
+    but are too few to show which term describes it best. For that only the likelihoods in the judged recording count.
+
+    `log_factors`: observables with their log Bayes factors, corrected for misfit (`_correct_for_misfit`), as the
+    differences are; those of other data are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -104,9 +122,10 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of each kind of data for the misfit of its model.
+    """Reduce the log Bayes factors of observables, since a model describes its data only approximately.
 
-    Each is divided by 1 + 2 m B, where B is the largest factor of that kind and m the misfit.
+    Each is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the misfit of a
+    model (`explanation.misfit` in `priors.toml`).
     """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:
@@ -116,20 +135,23 @@ def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list
 
 
 class _Posterior(NamedTuple):
-    """Logarithm of the posterior of a set of events, up to a constant, and the kinds of data that it explains."""
+    """Logarithm of the posterior of a set of events, up to a constant, and the kinds of `data` that it explains."""
 
     logarithm: float
     data: frozenset[str]
 
 
 def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
-    """Maximise the posterior of a set of events over the times at which each of them may have begun."""
+    """Compute the posterior of a set of events, each with its best possible onset.
+
+    `gains_of`: log Bayes factors of each event by its name, for each possible onset (`_possible_gains`).
+    """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
     for choice in product(*(gains_of[event.name] for event in group)):
         gains = {data: max(other.get(data, 0.0) for other in choice) for event_gains in choice for data in event_gains}
         if RISE in gains:
-            # the best description of the rise counts, and each event whose rise contradicts it reduces that
+            # the best description of the rise counts; each event that contradicts the rise reduces it
             rises = [event_gains.get(RISE, 0.0) for event_gains in choice]
             gains[RISE] = max(*rises, 0.0) + sum(min(rise, 0.0) for rise in rises)
         if (total := sum(gains.values())) > best:
@@ -140,23 +162,25 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 def _possible_gains(
     event: Event, factors: Sequence[tuple[Observable, float]], rise: LeakRise | None
 ) -> Sequence[_Gains]:
-    """Compute an event's log Bayes factors by kind of data, one mapping for each possible time of onset.
+    """Compute an event's log Bayes factors by kind of data, for each possible time of its onset.
 
-    The first mapping is for an onset within the recording. For a leak, if `rise` is given, a second one is for an onset
-    before the recording: such a leak explains only the rise and no other data.
+    `factors`: observables with their log Bayes factors. The first mapping is for an onset within the recording. For a
+    leak, if `rise` is given, a second one is for an onset before the recording: such a leak explains only the leakage
+    above that of healthy recordings (the rise) and no other data.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
         return [gains]
     if gains.get("volumes", 0.0) > 0.0:
-        gains[RISE] = rise.step_log_ratio  # of the rise, its step is the part that began within the recording
+        gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
     return [gains, {RISE: log_bayes_factor(rise.rise.chance)}]
 
 
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    The event begins when the observable that it explains best changes. Others count if they may coincide with it.
+    `factors`: observables with their log Bayes factors. The onset of the event is that of the observable which it
+    explains best. Other observables count if they may have changed at the same time.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -179,10 +203,11 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
 
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
-    """Compute the log Bayes factor of an observable against no change.
+    """Compute the log Bayes factor of a change of an observable to no change.
 
-    For an alternative to the leak the factor is at most that of the leak's rise plus their log likelihood ratio, as a
-    rise of the leakage makes the alternative seem to rise as well.
+    `chance`: probability of the observable in a healthy recording. An increase of the leakage makes an alternative to
+    it, such as an external leak, seem to increase as well. Therefore the log factor of such an observable is at most
+    that of the leakage (`rise`) plus the log likelihood ratio of the two.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -192,9 +217,10 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
 
 
 def log_bayes_factor(chance: float) -> float:
-    """Compute the logarithm of the largest Bayes factor that a chance c under the null allows.
+    """Compute the logarithm of the largest Bayes factor of a change to no change that a p-value c allows.
 
-    It is -log(-e c log c) for c < 1/e, else 0.
+    `chance`: the p-value c, i.e. the probability of such a score without a change. The result is -log(-e c log c) for
+    c < 1/e, else 0 (T. Sellke et al., 2001).
     """
     if chance >= np.exp(-1.0):
         return 0.0
@@ -203,7 +229,10 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Test whether two observables may have changed at the same time, by the 95 % intervals of their onsets."""
+    """Return True if two observables may have changed at the same time, by the 95 % intervals of their onsets.
+
+    An observable without onset may coincide with any other.
+    """
     if observable.onset is None or anchor.onset is None:
         return True
     max_distance = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
@@ -213,9 +242,11 @@ def _coincide(observable: Observable, anchor: Observable) -> bool:
 def probability_of(
     explanations: Sequence[Explanation], *names: str, cause: Cause | None = None, data_kind: str | None = None
 ) -> float:
-    """Compute the probability that one of the named events, or any event with this cause, happened.
+    """Compute the probability that one of the named events, or any event with the given cause, happened.
 
-    `data_kind`: use only the explanations that explain this kind of data (`Observable.data`), renormalised.
+    `explanations`: sets of events with their probabilities; `names`: names of events; `data_kind`: if given, only the
+    sets that explain this kind of data (`Observable.data`) count, and their probabilities are renormalised. The
+    result is 0 if no set remains.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)

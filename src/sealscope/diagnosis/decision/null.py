@@ -1,15 +1,16 @@
-"""Calibrate the chances of all statistics by healthy recordings, as a provider's law may state too small ones.
+"""Calibration of the chances that detectors state, by those that they stated for healthy recordings.
 
-A provider's law gives each statistic a chance P under the null; its surprisal u = -log P is then exponential. The law
-fails in a fraction of machines (`priors.toml`): there u / lambda is exponential, with an exponential prior on
-log lambda > 0. With the u_1 .. u_n of n healthy recordings the predictive chance is
+A detector states for each statistic a chance P, i.e. the probability that a healthy recording scores as high. If that
+is right, the surprisal u = -log P of a healthy recording is exponentially distributed. In a fraction of machines
+(`priors.toml`) the stated chances are too small: there u / lambda is exponential, with an exponential prior on
+log lambda > 0. With the u_1 .. u_n of n healthy recordings the calibrated (predictive) chance is
 
     P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ p_k lambda_k^(-n) exp(-sum_i u_i / lambda_k),
 
-lambda_0 = 1 for the law itself.
+where lambda_0 = 1 leaves the stated chance as it is.
 
-A rest, a ramp or a warm-up of every healthy recording is then no alarm. Without healthy recordings the law is not
-changed.
+Thus a rest, a ramp or a warm-up that every healthy recording has raises no alarm. Without healthy recordings the
+stated chances are not changed.
 """
 
 from __future__ import annotations
@@ -24,45 +25,59 @@ from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Values of lambda that the predictive chance sums over, after 1.
+#: Number of values of lambda that the calibrated chance sums over, in addition to 1.
 NODES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class HealthyNull:
-    """Predictive chances of observables, from their `surprisals` -log(chance) in healthy recordings, by `null_key`."""
+    """Distribution of observables in healthy recordings of a machine, with which their chances are calibrated.
+
+    `surprisals`: -log(chance) of each observable in each healthy recording, by the key of the observable
+    (`null_key`).
+    """
 
     surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)
     _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the predictive chance that an observable has at least this surprisal in a healthy recording."""
+        """Compute the calibrated probability of at least this score of an observable in a healthy recording."""
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Compute the predictive chance of a statistic from its chance by the provider's law."""
+        """Compute the calibrated chance of a statistic from the `chance` that its detector states.
+
+        `key`: key of the statistic in `surprisals`.
+        """
         weights, inflations = self._inflation(key)
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
-        """Invert `calibrate`: compute the chance by the provider's law whose predictive chance is `chance`."""
+        """Compute the chance that a detector must state for the calibrated chance to be `chance`.
+
+        It is the inverse of `calibrate`; `key`: key of the statistic in `surprisals`.
+        """
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
         return float(np.exp(-find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        """Return the posterior weights and values of lambda, the mean of a key's surprisals in healthy recordings."""
+        """Return posterior weights and values of lambda, the mean surprisal of a statistic in healthy recordings.
+
+        Both have the same shape (k,). `key`: key of the statistic in `surprisals`.
+        """
         if key not in self._posteriors:
             self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
         return self._posteriors[key]
 
 
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
-    """Compute the posterior weights and values (NODES + 1,) of lambda, the mean of exponential surprisals.
+    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals.
 
-    The first value is 1, by the provider's law. n surprisals have the likelihood lambda^-n exp(-sum / lambda).
+    Both have the shape (NODES + 1,); the first value is 1, for a detector that states its chances correctly. n
+    `surprisals` have the likelihood lambda^-n exp(-sum / lambda). Without any both results are [1].
     """
     prior_null = DECISION.null
     if not len(surprisals):
@@ -70,7 +85,7 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     logarithm = np.append(0.0, np.linspace(0.0, np.log(prior_null.largest), NODES))
     inflation = np.exp(logarithm)
     prior = np.exp(-logarithm / prior_null.inflation)
-    prior[1:] *= prior_null.fails / prior[1:].sum()  # `fails`: fraction of machines in which the law is wrong
+    prior[1:] *= prior_null.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong chances
     prior[0] = 1.0 - prior_null.fails
     log_posterior = np.log(prior) - len(surprisals) * logarithm - float(np.sum(surprisals)) / inflation
     weights = np.exp(log_posterior - log_posterior.max())
@@ -78,10 +93,16 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 
 
 def null_key(observable: Observable) -> str:
-    """Return the key of an observable's null distribution: data and name, or the data alone if it is a comparison."""
+    """Return the key under which `HealthyNull` stores an observable.
+
+    It consists of data and name, or of the data alone for a comparison with healthy recordings, which has no onset.
+    """
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 
 
 def comparison_key(data: str) -> str:
-    """Return the key of the null distribution of comparisons with healthy recordings, of one kind of data."""
+    """Return the key under which `HealthyNull` stores comparisons with healthy recordings by one kind of data.
+
+    `data`: kind of data, as in `Observable.data`.
+    """
     return f"{data}: against"

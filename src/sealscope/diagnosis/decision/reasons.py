@@ -1,4 +1,4 @@
-"""The reason of a verdict, in one line: keys and values of `decide`, filled in from `texts.toml`."""
+"""The reason of a verdict as one line of text, composed from the texts of `texts.toml`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,11 @@ _MIN_RINGING_RATE: float = RMS_PRIORS.rate.ringing
 
 
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict: the leak or its bound, then the rival explanation, then remarks."""
+    """Compose the reason of a verdict in words: the leak or its bound, then another explanation, then remarks.
+
+    `alarm`: test that raised the alarm, None if none did; `bound`: 95 % upper bound of the leak's flow [m^3/s];
+    `other`: event other than a leak that explains what changed, or None.
+    """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
     text = _bound_text(case, evidence, bound)
@@ -45,7 +49,7 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe the leak that an alarm is due to."""
+    """Describe the detected leak in words; `alarm`: test that detected it."""
     key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name if alarm else "", "level")
     total = evidence.total_leakage
     if case.leak is None:
@@ -64,7 +68,10 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """Describe the bound of a leak, and a recording that would bound it more closely."""
+    """Describe in words how large an undetected leak can be, and a recording that would bound it more closely.
+
+    `bound`: 95 % upper bound of its flow [m^3/s].
+    """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
@@ -83,7 +90,10 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """Describe the largest drop of the ringing that the data allow, and reasons why a leak may hide."""
+    """Describe in words the largest drop of the pressures' ringing that the data allow, and why a leak may hide.
+
+    `ringing`: its precision, None if it was not measured; `provider`: name of the detector.
+    """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
     percent = -100.0 * np.expm1(-ringing.bound)
@@ -99,7 +109,7 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe the change of the ringing, and the probability of a leak behind it."""
+    """Describe in words a change of the pressures' ringing, and the probability that a leak caused it."""
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))
     where = _onset_text(rarest) or _against_text(ringing)
@@ -108,7 +118,7 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """Name the healthy recordings that the ringing is compared with."""
+    """State the number of healthy recordings that the ringing was compared with; "" if there are none."""
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)
@@ -116,9 +126,10 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
-    """Name the most probable explanation other than a leak, and a recording that would separate the two.
+    """Describe the most probable explanation other than a leak, and how to tell it from a leak.
 
-    If that is a change of the operating point, only its time is stated. The text is empty without such an explanation.
+    `alarm`: test that raised the alarm. If the explanation is a change of the operating point, only its time is
+    stated. The text is "" if there is no such explanation, or if that time is unknown.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
@@ -147,23 +158,23 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
 
 
 def _onset_text(observable: Observable) -> str:
-    """Describe the onset of a change, "" if it has none."""
+    """State the onset of an observable's change in words; "" if it has none."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
 
 
 def _observable_text(other: OtherEvent) -> str:
-    """Name the observable by which an event is recognised, unless the event's description contains it."""
+    """Name the observable that shows an event; "" if the event's description already contains its name."""
     name = other.observable.name
     return "" if name in other.description else text_of("doubt", "shown", name=name)
 
 
 def _rarity_text(chance: float) -> str:
-    """Format a chance as one in so many healthy recordings, at most 10 000."""
+    """State a chance in words as "one of so many healthy recordings", at most one of 10 000."""
     count = f"{float(f'{1.0 / max(chance, 1e-4):.2g}'):,.0f}".replace(",", " ")
     return text_of("doubt", "rarity", count=count)
 
 
 def _remarks(case: Case) -> str:
-    """Format the remarks of the measure of the leak."""
+    """Return the texts of all remarks on the measured leakage; "" if there are none."""
     leak = case.leak
     return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

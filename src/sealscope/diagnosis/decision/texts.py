@@ -11,15 +11,15 @@ from typing import Any
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
-    """Read `texts.toml`."""
+    """Read the tables of texts from `texts.toml`: text by key, by the name of the table."""
     return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
 
 
 def text_of(table: str, key: str, **values: Any) -> str:
-    """Return the text `key` of a `table` in `texts.toml`, with `values` filled in."""
+    """Return the text with a given `key` in a `table` of `texts.toml`, with `values` filled in for its fields."""
     return _texts()[table][key].format(**values)
 
 
 def has_text(table: str, key: str) -> bool:
-    """Test whether a `table` in `texts.toml` has a text `key`."""
+    """Return True if a `table` of `texts.toml` has a text with the given `key`."""
     return key in _texts()[table]

@@ -1,4 +1,4 @@
-"""The verdict where no test found a leak, by the bound of an undetected one."""
+"""The verdict if no test found a leak, from the upper bound of an undetected leak."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, NO_LEAK, Verdict
 
 
 def decide_without_leak(bound: float, max_bound: float) -> Verdict:
-    """Decide `no leak` if the 95 % upper bound of a leak is at most `max_bound`, else `cannot tell`."""
+    """Decide on a recording in which no test found a leak.
+
+    The verdict is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is at most `max_bound` in the
+    same unit, and `cannot tell` otherwise.
+    """
     verdict: Verdict = NO_LEAK if math.isfinite(bound) and bound <= max_bound else CANNOT_TELL
     return verdict
 
 
 def bound_worth_stating(flow: float) -> float:
-    """Compute the largest bound of a leak that allows the verdict `no leak`.
+    """Compute the largest upper bound of an undetected leak that still allows the verdict `no leak`.
 
-    It is a fraction of the pump's `flow`, in the same unit, and is 0 if `flow` is not positive.
+    It is a fraction (`worth.share` in `priors.toml`) of the pump's `flow`, in the same unit, or 0 if `flow` is not
+    positive.
     """
     return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0

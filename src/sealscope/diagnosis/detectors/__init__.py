@@ -1,1 +1,1 @@
-"""What every detector promises, which there are, and how they are run."""
+"""Detectors: the protocol that every detector follows, the list of detectors, and functions to run them."""

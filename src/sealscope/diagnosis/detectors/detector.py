@@ -1,4 +1,4 @@
-"""The detector protocol, and the checks of a detector's report."""
+"""The protocol of a detector, and checks of the reports that detectors return."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ PLUG_IN = "plug-in"
 
 
 class Detector(Protocol):
-    """A detector, which follows quantities over a recording and tests them for changes, without a verdict.
+    """A detector, which estimates quantities over a recording and tests them for changes, without a verdict.
 
-    Its recordings are uniformly sampled, and their chamber pressures and command have no missing sample (missing ones
-    are bridged, and marked in `Recording.bridged`); any other channel may be absent or contain NaN.
+    Its recordings are uniformly sampled, and no sample of the chamber pressures and the command is missing: missing
+    ones are bridged and marked in `Recording.bridged`. Any other channel may be absent or contain NaN.
 
     A method `learn(recording)` may return the detector's summary of a healthy recording as plain values, or None. A
     detector with this method also receives stored summaries (`healthy.SummarisedRecording`) as baselines, and reads
@@ -36,14 +36,14 @@ class Detector(Protocol):
     name: str
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the detector can use the recording, else the reason why not, in one line."""
+        """Return None if the detector can use the recording, else a line of text with the reason why not."""
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Estimate the observables of a `usable` recording, and test them for changes.
+        """Estimate the observables of a recording that is `usable`, and test them for changes.
 
-        `baseline`: leak-free recordings of the same machine, at any duty, without copies; if empty, only changes within
-        the recording are tested.
+        `baseline` holds leak-free recordings of the same machine at any duty, without copies. If it is empty, only
+        changes within the recording are tested.
         """
         ...
 
@@ -53,7 +53,10 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
-    """Return the reason, in one line, why a detector cannot use a recording; None if it can."""
+    """Return a line of text with the reason why a detector cannot use a recording; None if it can use it.
+
+    Raises TypeError if the detector gives anything else than a text or None.
+    """
     reason: Any = detector.usable(recording)
     if reason is None:
         return None
@@ -65,14 +68,15 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make an observable for a user-defined detector from its p-value; a piston leak is assumed to change it.
+    """Make the observable of a user's own detector from its p-value; it counts as a change that a piston leak causes.
 
     Parameters
     ----------
     name : str
         Name of the change, in plain words.
     chance : float
-        Probability that a healthy recording changes as much; for several tests the smallest one, times their number.
+        Probability that a healthy recording changes as much. If several changes were tested, the smallest probability
+        times the number of tests.
     size : float
         The change, in the detector's own unit; negative for a fall.
     onset : tuple of float, optional
@@ -84,7 +88,11 @@ def make_observable(
 
 
 def validate_report(report: Any, name: str) -> Observed:
-    """Return a detector's report with its name; raise TypeError, ValueError or ArithmeticError if it is not valid."""
+    """Return a detector's report, with `name` as its provider; raise an error if the report is not valid.
+
+    A single observable counts as a report. Raises TypeError for wrong types, ValueError for a chance outside 0 to 1
+    or a reason of several lines, and ArithmeticError for a score that is not finite.
+    """
     if isinstance(report, Observable):
         report = Observed(name, (report,))
     if not isinstance(report, Observed):
@@ -102,10 +110,10 @@ def validate_report(report: Any, name: str) -> Observed:
 
 
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
-    """Describe the error of a detector in one line, and log it with the traceback, once in a process.
+    """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
 
-    `distribution`: that of a plug-in, None for a built-in detector. An arithmetic error of a built-in detector is
-    due to impossible readings, not to a defect: it is logged at the debug level.
+    `distribution` is the name of the package that brings the detector, None for a built-in one. An arithmetic error
+    of a built-in detector is due to impossible readings, not to a defect, and is logged at the debug level.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)
@@ -119,5 +127,5 @@ def log_failure(name: str, distribution: str | None, error: Exception) -> str:
 
 @cache
 def _log_once(line: str) -> None:
-    """Log an error with the traceback of the exception being handled, once per process for each text of the line."""
+    """Log a line with the traceback of the exception being handled, once per process for each text of the line."""
     _log.exception("%s", line)

@@ -1,4 +1,7 @@
-"""Run detectors on recordings, and collect the surprisal, -log(chance), of their observables in healthy ones."""
+"""Run detectors on recordings, and collect how unusual the changes within healthy recordings look.
+
+The measure is the surprisal, -log(chance), with the chance that the detector's own law gives for such a change.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +43,10 @@ _AT_REST = (VOLUME_BALANCE,)
 
 
 def limit_threads() -> AbstractContextManager[object]:
-    """Limit the loaded libraries of linear algebra to one thread.
+    """Limit the loaded linear-algebra libraries to one thread while the returned context is open.
 
-    Matrices are small: threads would slow the computation down threefold, and their sums do not repeat to the bit.
+    The matrices are small. Several threads would make the computation three times slower, and its results would not
+    be reproducible to the last bit.
     """
     return _thread_pools(len(sys.modules)).limit(limits=1)  # type: ignore[no-any-return]
 
@@ -51,7 +55,7 @@ def limit_threads() -> AbstractContextManager[object]:
 def _thread_pools(n_modules: int) -> Any:
     """Find the loaded linear-algebra libraries.
 
-    The search takes milliseconds and is repeated only if `n_modules`, the number of imported modules, has changed.
+    The search takes milliseconds, and is repeated only when `n_modules`, the number of imported modules, has changed.
     """
     from threadpoolctl import ThreadpoolController
 
@@ -59,10 +63,10 @@ def _thread_pools(n_modules: int) -> Any:
 
 
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
-    """Test a recording for changes that may be mistaken for a leak: of duty, noise, hum and pressure levels.
+    """Test a recording for changes of duty, noise, mains hum and pressure levels, which may be mistaken for a leak.
 
-    The changes are tested within the recording and against the healthy ones. `distrust`: reason why the pressures
-    cannot be judged, or None.
+    The changes are tested within the recording and against the healthy recordings. `distrust` is the reason why the
+    pressures cannot be judged, in which case the report is empty; None if they can.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -74,9 +78,10 @@ def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: 
 def run_detector(
     name: str, recording: Recording, baseline: Sequence[Healthy], rig: Rig, distrust: str | None = None
 ) -> Observed:
-    """Run a registered detector on a recording; `distrust`: reason why the pressures cannot be judged, or None.
+    """Run the registered detector called `name` on a recording and return its report.
 
-    Raises KeyError if it is not registered. If it fails, the error is logged and reported.
+    `distrust` is the reason why the pressures cannot be judged, which the report then states; None if they can.
+    Raises KeyError if there is no such detector. An error of the detector is logged and stated in the report.
     """
     factory = detectors()[name]
     try:
@@ -91,7 +96,10 @@ def run_detector(
 
 
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
-    """Run a detector with the baselines it can use, or report why it cannot use the recording or any baseline."""
+    """Run a detector with those baseline recordings that it can use.
+
+    If it cannot use the recording, or none of the given baselines, the report is empty and states the reason.
+    """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
         lack = describe_hold(recording)
@@ -105,7 +113,7 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
 
 
 def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
-    """Return the reason why a detector cannot use a healthy recording, or None if it can."""
+    """Return the reason why a detector cannot use a healthy recording; None if it can."""
     if isinstance(healthy, Recording):
         return unusable_reason(detector, healthy)
     has_summary = detector.name in healthy.summaries
@@ -113,15 +121,19 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal, -log(chance), of each change within a healthy recording, by `null.null_key`.
+    """Compute the surprisal, -log(chance), of each change that the detectors see within a healthy recording.
 
-    Keys of a balance whose pump is cut off at rest have the prefix `SHUT`.
+    Returns surprisals by the key of the change (`null.null_key`). Results of the volume balance under the hypothesis
+    that the pump is cut off at rest have keys with the prefix `SHUT`.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals of the signals and of the balance; without a balance, of the pressure response instead."""
+    """Compute the surprisals of the signals and of the volume balance (`healthy_surprisals`).
+
+    Without a balance, those of the pressure response are used.
+    """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
     if unusable_reason(balance, recording) is None:
@@ -139,9 +151,9 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal of each observable that changes within the recording, by `null.null_key`.
+    """Collect the largest surprisal of each observable that is tested for a change within the recording.
 
-    The test for a step of the leak is included.
+    Returns surprisals by key (`null.null_key`). The test for a step of the leak has a key of its own.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:
@@ -154,11 +166,12 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
-    """Collect the null distribution of every observable, the surprisals -log(chance) of healthy recordings.
+    """Collect how large each tested statistic is in the healthy recordings, as surprisals -log(chance).
 
-    Comparisons between recordings have one distribution for each kind of data, made of the largest surprisal of each
-    healthy recording against all others. `shut`: use the balance's surprisals under the hypothesis that the pump is cut
-    off at rest.
+    These surprisals are the null distribution of a detector's observables. For comparisons between recordings there
+    is one distribution for each kind of data: the largest surprisal of each healthy recording when it is compared
+    with all others. With `shut`, the balance's surprisals are those under the hypothesis that the pump is cut off at
+    rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -178,7 +191,10 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others; yield the observables of each."""
+    """Compare the ringing of each healthy recording with that of all others; yield the results as observables.
+
+    Nothing is yielded for fewer than three recordings of the same chambers and sampling rate.
+    """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]
     summaries = healthy_summaries(detector, usable_entries)

@@ -1,11 +1,11 @@
-"""Detectors by name: the built-in ones, and those of other distributions, found by entry point.
+"""Find detectors by name: the built-in ones, and those that other installed packages register as entry points.
 
-A distribution names a class, or any function of a Rig that gives a detector, in its `pyproject.toml`:
+A package names a class, or any function that makes a detector for a Rig, in its `pyproject.toml`:
 
     [project.entry-points."sealscope.detectors"]
     "pressure means" = "my_package:PressureMeans"
 
-A broken one is left out with a logged line.
+A detector that cannot be loaded is left out, and the reason is logged.
 """
 
 from __future__ import annotations
@@ -33,19 +33,26 @@ _RESERVED = ("diagnose", "always fire", "never fire")
 
 @dataclass(frozen=True)
 class PlugIn:
-    """Factory of a detector of another distribution: a call with a rig makes the detector for that rig."""
+    """Factory of a detector from another installed package; calling it with a rig makes the detector.
+
+    `name` is the detector's name, `distribution` the name of the package, and `make` the function or class that the
+    package registers.
+    """
 
     name: str
     distribution: str
     make: Factory
 
     def __call__(self, rig: Rig) -> Detector:
-        """Make the detector."""
+        """Make the detector for a rig."""
         return self.make(rig)
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the source file, to distinguish its results from another version's."""
+        """First 16 digits of the SHA-256 of the source file, to tell results of different versions apart.
+
+        The result is "unknown" if the source file cannot be read.
+        """
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -54,7 +61,7 @@ class PlugIn:
 
 
 def _make_detector(module: str, name: str, rig: Rig) -> Detector:
-    """Import the class of a built-in detector, and make it for a rig."""
+    """Make a built-in detector for a rig, from the class `name` in a module of `sealscope.diagnosis`."""
     detector: Detector = getattr(import_module(f"sealscope.diagnosis.{module}"), name)(rig)
     return detector
 
@@ -68,16 +75,16 @@ DETECTORS: dict[str, Factory] = {
 
 
 def detectors() -> Mapping[str, Factory]:
-    """Return every detector by name: the built-in ones, then those of installed distributions."""
+    """Return the factories of all detectors by name: the built-in ones, then those of other installed packages."""
     return {**DETECTORS, **plug_ins(frozenset(DETECTORS))}
 
 
 @cache
 def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
-    """Return the detectors of installed distributions, in the order of their names.
+    """Find the detectors of other installed packages, in the order of their names; the result is cached.
 
-    A detector that cannot be loaded, or whose name is that of a built-in detector, of another plug-in or reserved, is
-    left out with one logged line that names its distribution. The search is made once in a process.
+    A detector is left out with one logged line if it cannot be loaded, or if its name is not valid, is reserved, or
+    belongs to a built-in detector or to another package.
     """
     plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):

@@ -1,1 +1,1 @@
-"""One inference: the balance of volumes in weak form, information in blocks, one decision."""
+"""Estimation of leakage from recordings: volume balances in weak form, likelihoods in blocks, and tests of both."""

@@ -1,4 +1,4 @@
-"""Blocks of a balance from the samples of a recording or a stream, with identical sums."""
+"""Blocks of a volume balance from the samples of a recording or of a stream, with identical results."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ _BLOCKS = INFERENCE.blocks
 #: Maximum and minimum length of a block [s].
 MAX_BLOCK_TIME: float = _BLOCKS.longest
 MIN_BLOCK_TIME: float = _BLOCKS.shortest
-#: Offset of p_A - p_B below which the terms need not be evaluated again about it [standard deviations of its prior]:
-#: the root and the carrying side are not linear in it.
+#: Offset of p_A - p_B from which the terms are evaluated again about it [standard deviations of its prior], since the
+#: root and the carrying side are not linear in it.
 NEGLIGIBLE_OFFSET = 3.0
 #: Channels that balances read.
 READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
@@ -66,12 +66,26 @@ BATCH_SAMPLES = 8192
 
 
 class BlockStream:
-    """Division of a stream of samples into blocks, which do not depend on the sizes of the pushes.
+    """Division of a stream of samples into blocks, each reduced to Gram matrices of the balance.
 
-    `balances`: of the machine (`terms.equations`); `rate` [Hz]; `block_s`: length of a block [s], rounded to whole
-    strides of the weak form; `n_first`: number of first blocks that are weighted together, None for all of the first
-    push; `start`: time of the first sample [s]; `offset`: of the sensors, subtracted from p_A - p_B [Pa]; `on_samples`
-    is called with the clock and the samples of each block before it is closed.
+    The blocks do not depend on how many samples arrive at a time.
+
+    Parameters
+    ----------
+    balances : sequence of Equation
+        Balances of the machine (`terms.equations`).
+    rate : float
+        Sampling rate [Hz].
+    block_s : float
+        Length of a block [s], rounded to whole strides of the weak form.
+    n_first : int, optional
+        Number of first blocks that are weighted together; None for all blocks of the first `push`.
+    start : float
+        Time of the first sample [s].
+    offset : float
+        Sensor offset [Pa] that is subtracted from p_A - p_B.
+    on_samples : callable, optional
+        Called with the start time [s] and the samples of each block before the block is closed.
     """
 
     def __init__(
@@ -101,7 +115,7 @@ class BlockStream:
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Continue with samples from the time `begin` [s], after a gap; drop earlier samples without a block."""
+        """Prepare for samples from the time `begin` [s] on, after a gap; drop samples of an incomplete block."""
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
         self._first = 0  # index since `begin` of the first stored sample
@@ -109,22 +123,23 @@ class BlockStream:
         self._n_closed = 0  # blocks since `begin`
 
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
-        """Add samples, each channel of the same length; return the blocks that they complete, or None.
+        """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
-        Missing samples are NaN. `last`: no samples follow, so that the remaining ones are closed as well.
+        `samples`: equally long arrays by channel name, NaN where a sample is missing. `last`: no samples follow, so
+        that blocks are closed that otherwise wait for the samples after them.
         """
         if samples:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
         length = self._strides * self._stride
-        # samples after a block that its last rows reach over, and that its speeds and rests depend on
+        # samples after a block that its last rows extend over, and that its speeds and rests depend on
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         n_complete = max(0, (self._end - tail) // length)
         min_blocks = 1 if last or self._weighting.has_blocks else self._n_first or 1
         if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
             return None
         joined, ends = self._join_pieces(), [n_complete]
-        if self._n_first is not None:  # the first together, later ones one by one, for pieces of any size
+        if self._n_first is not None:  # the first together, later ones one by one, however many samples arrive
             first_end = self._n_closed + 1 if self._weighting.has_blocks else min(self._n_first, n_complete)
             ends = list(range(first_end, n_complete + 1))
         starts = [self._n_closed, *ends[:-1]]
@@ -143,7 +158,7 @@ class BlockStream:
         return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the stream in plain values for JSON."""
+        """Return the state of the stream as plain values for JSON, from which `load_state` continues."""
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
             "begin": self._begin,
@@ -155,7 +170,7 @@ class BlockStream:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state` with identical results; raise InputError if it does not fit."""
+        """Restore the state of a stream that `state` returned; raise InputError if it does not fit these balances."""
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
@@ -169,10 +184,12 @@ class BlockStream:
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Estimate the sign of each equation's left side, since sensors may be connected in reverse.
+        """Estimate for each equation whether the sign of the recorded flow is correct; sensors may be reversed.
 
-        Three symptoms of correct wiring add their log odds: friction dissipates, and p_A - p_B correlates with the flow
-        into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
+        `rows`: rows (r, m) of each equation. The result is 1 for each left side with a correct sign, else -1.
+
+        Three symptoms of correct wiring add their log odds. Friction dissipates, so p_A - p_B correlates with the
+        flow into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
         probability Phi(z) of a correct sign, except for a fraction of machines in which something else causes it.
         """
         signs = []
@@ -188,7 +205,7 @@ class BlockStream:
         return tuple(signs)
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
-        """Build the blocks with the indices `first` to `end` - 1, whose rows are weighted together."""
+        """Compute the blocks with the indices `first` to `end` - 1 from samples; their rows are weighted together."""
         length = self._strides * self._stride  # of a block [samples]
         self._estimate_stream_constants(samples, (self._n_first or end) * length)
         if self._on_samples is not None:
@@ -218,9 +235,10 @@ class BlockStream:
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
     def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate the limits of rests, and absolute minus gauge pressures, once for a stream.
+        """Estimate the constants of the stream: absolute minus gauge pressures, and speeds that count as resting.
 
-        The pressures are estimated from the first `n_samples`.
+        They are estimated once, when they are first needed. The pressures are estimated from the first `n_samples`
+        only. The speeds, below which pump or piston count as resting, are None unless the balance needs them.
         """
         if self._absolute_offsets is None:
             self._absolute_offsets = {
@@ -232,9 +250,12 @@ class BlockStream:
             self._rest_limits = RestLimits(max_rest_rate(pump, self._rate), max_rest_rate(piston, self._rate))
 
     def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
-        """Compute the rows of the regression in the blocks `first` to `end` - 1, with weights, flows and pressures."""
+        """Compute the rows of the regression, with their weights, in the blocks `first` to `end` - 1.
+
+        The result also contains the mean flow and the distribution of p_A - p_B in each block.
+        """
         length = self._strides * self._stride
-        # samples of the blocks; the windows of the last rows extend beyond them, to SPAN strides
+        # samples of the blocks; the test functions of the last rows extend beyond them, to SPAN strides
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
         piece = {  # with margins
@@ -262,9 +283,10 @@ class BlockStream:
 
 
 class _BlockRows(NamedTuple):
-    """Rows (r, m) of each equation, the weight of each row (r,), and `Blocks.flow` and `Blocks.pressures`.
+    """Rows of a regression in K blocks: `rows` (r, m) of each equation, and `weights` (r,).
 
-    The weight is 1 without holes, a fraction next to a hole, and 0 with a missing sample.
+    The weight is 1 without holes, a fraction next to a hole of the recording, and 0 with a missing sample. `flow`
+    (K,) and `pressures` (K, p) are those of `Blocks`.
     """
 
     rows: tuple[Array, ...]
@@ -274,15 +296,15 @@ class _BlockRows(NamedTuple):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of a sum of products (r,), of overlapping rows, against a mean of zero."""
+    """Compute the z score of the sum of `products` (r,) against a mean of zero, corrected for overlapping rows."""
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
 def _sign_log_odds(z: float, other_cause: float) -> float:
-    """Compute the log odds that a sign with the z score `z` is right.
+    """Compute the log odds that a flow has the correct sign, given the z score `z` of a symptom of correct wiring.
 
-    `other_cause`: probability that something else than the sign causes the score.
+    `other_cause`: probability that something other than the sign causes the score.
     """
     from scipy.special import ndtr
 
@@ -290,7 +312,10 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
 
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient by least squares from the Gram matrix (m, m); 0 if undetermined."""
+    """Compute the z score of the leak's coefficient by least squares; 0 if the rows do not determine it.
+
+    `gram` (m, m): Gram matrix of `n_rows` rows.
+    """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
     coupling = gram[np.ix_(nuisance, leak_and_left)]
@@ -305,9 +330,11 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float) -> float:
-    """Compute the rate below which a volume or a position counts as resting.
+    """Compute the speed below which a pump or a piston counts as resting.
 
-    It is a fraction of the mean rate in motion, or the noise of an averaged rate if that is larger. `increments` (n,).
+    It is a fraction of the mean speed in motion, or three standard deviations of the noise of an averaged speed if
+    that is larger. `increments` (n,): increments of the pump's volume [m^3] or of the position [m]; `rate`: sampling
+    rate [Hz]. The result is in m^3/s or m/s.
     """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
@@ -320,21 +347,31 @@ def max_rest_rate(increments: Array, rate: float) -> float:
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute absolute minus gauge pressure [Pa]: the atmosphere, or more if readings (n,) are below vacuum."""
+    """Compute the difference of absolute and gauge pressure [Pa] for the readings (n,) of a sensor.
+
+    It is the atmosphere, or more if readings would otherwise be below the least absolute pressure.
+    """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
     return max(P_ATM, MIN_ABSOLUTE_PRESSURE - min_reading)
 
 
 def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels by name, NaN in holes (`flag_holes`) and where a pressure is clipped."""
+    """Return the samples of channels by name, with NaN in holes of the recording and where a pressure is clipped.
+
+    Holes are long gaps of missing samples that were bridged (`flag_holes`).
+    """
     samples = bridged_samples(recording, names)
     is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
     return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels, NaN where a pressure is clipped; the entry `HOLE`, if any, is 1 in holes."""
+    """Return the samples of channels by name, with NaN where a pressure is clipped.
+
+    In holes, i.e. long gaps of missing samples that were bridged, the bridging values remain. If there are holes, the
+    additional entry `HOLE` is 1 there and 0 elsewhere.
+    """
     samples, is_hole = {}, flag_holes(recording)
     if is_hole.any():
         samples[HOLE] = is_hole.astype(float)
@@ -349,11 +386,12 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
 def derive_drive_signals(
     samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
 ) -> dict[str, Array]:
-    """Add signals of the drive's model to samples: `START`, and the pump's speed if only u shows it.
+    """Add signals from a model of the drive to the samples of a recording.
 
-    `START` is the decay of the drive's initial state. The speed "omega" [rad/s] is added only if the pump is known by
-    the command u alone: it is the drive's response to u, NaN where u is missing. `loaded`: under the load p_A - p_B;
-    otherwise without load, and the droop of the real speed under load counts as leakage.
+    The entry `START` is the decay of the drive's initial state. The pump's speed "omega" [rad/s] is added if the
+    command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing. With
+    `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts
+    as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -369,21 +407,22 @@ def derive_drive_signals(
 
 
 def _hold_missing(values: Array) -> Array:
-    """Replace each missing value of an array (n,) by the previous one, by 0 at the beginning."""
+    """Replace each missing value (NaN) of an array (n,) by the last one before it, or by 0 at the beginning."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])
 
 
 def min_samples_for_step(rate: float) -> int:
-    """Return the minimum number of samples in which a step can be tested: `MIN_BLOCKS` blocks."""
+    """Compute the minimum number of samples to test a recording for a step, i.e. those of `MIN_BLOCKS` blocks."""
     stride = stride_samples(rate)
     return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
 
 class RegimeBlocks(NamedTuple):
-    """Blocks of a recording, equations and columns for valves that are open, or `shut`, at rest (`regimes`).
+    """Blocks, balances and columns of a recording, under one assumption on the valves while the pump rests.
 
-    `blocks`: with the offset of p_A - p_B removed; `plain`: as recorded; `shut`: valves cut the pump off at rest.
+    `shut`: true if valves then cut the pump off from the cylinder, false if it stays connected. `blocks`: after
+    removal of the sensor offset of p_A - p_B; `plain`: the same blocks as recorded.
     """
 
     blocks: Blocks
@@ -394,9 +433,10 @@ class RegimeBlocks(NamedTuple):
 
 
 class RecordedBlocks(NamedTuple):
-    """Blocks of a recording for valves that are `open` and `shut` at rest (`regimes`).
+    """Blocks of a recording under both assumptions on the valves while the pump rests (`regimes`).
 
-    `shut`: None if the pump never rests; `odds`: log odds that valves cut the pump off at rest.
+    `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the pump never rests; `odds`:
+    log odds of the latter.
     """
 
     open: RegimeBlocks
@@ -404,12 +444,18 @@ class RecordedBlocks(NamedTuple):
     odds: float
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for shut valves if the log `odds` from all recordings are > 0, else those for open ones."""
+        """Return the blocks for the more probable state of the valves at rest: shut if `odds` > 0, else open.
+
+        `odds`: log odds of shut valves, from all recordings of the machine.
+        """
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
-    """Compute the blocks of a recording for valves that are open and shut at rest; None if it allows no balance."""
+    """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short.
+
+    There are two versions: the pump may stay connected to the cylinder while it rests, or valves may cut it off.
+    """
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
     if not balances:
@@ -436,7 +482,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     columns = ColumnRoles(stream_balances[0])
 
     def regime_blocks_about(shut: bool, offset: float) -> Blocks:
-        """Compute the blocks about an offset [Pa] for the pump cut off at rest (`shut`) or not."""
+        """Compute the blocks after subtracting `offset` [Pa], for a pump that is cut off at rest (`shut`) or not."""
         blocks = blocks_about(offset)
         assert blocks is not None  # as many samples as for `recorded`
         return apply_regime(blocks, columns, shut) if may_shut else blocks
@@ -450,9 +496,10 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
-    """Build the blocks for the equations `balances`, with the offset of p_A - p_B removed.
+    """Compute the blocks for the equations `balances`, as recorded and without the sensor offset of p_A - p_B.
 
-    `blocks_about(offset)` computes the blocks with an offset [Pa] subtracted from p_A - p_B.
+    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
+    estimated from the blocks; if it is large, the blocks are computed again about it.
     """
     columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
     blocks = remove_pressure_offset(plain, columns)

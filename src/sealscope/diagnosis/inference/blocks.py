@@ -1,16 +1,19 @@
-"""Likelihood of a balance's coefficients in blocks of a recording, from sums that add up.
+"""Likelihood of a balance's coefficients in blocks of a recording, from sums over the rows of each block.
 
-A block stores the Gram matrix of its rows over all columns (terms and left side). Gram matrices of blocks add up to
-that of their union, so that a stream and a whole recording are handled alike, and a recording of hours costs no more
-than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
+A balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A block is
+a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side). Gram
+matrices of blocks add up to that of their union. A stream and a whole recording are therefore handled alike, and a
+recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
+(`row_weights`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its size (`priors.toml`):
 
-    Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2,
+    Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2.
 
-with the sums N_k of d^2 and n_k of d y, B_k of d o, M of o o' (plus the priors) and m of o y over the rows of block
-k (d the column of g, o the others with their drifts, y the left side); its likelihood is exp(eta' g - g' Lambda g/2).
+Here d is the column of g, o are the other columns with their drifts, y is the left side and s^2 the variance of a
+row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of o o' over all rows,
+plus the precision of the priors, and m that of o y. The likelihood of g is exp(eta' g - g' Lambda g / 2).
 """
 
 from __future__ import annotations
@@ -39,7 +42,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import plain_array, require_part, restore_array
 
-#: Maximum number of blocks of a fit; neighbouring blocks are added up beyond it.
+#: Maximum number of blocks of a fit; if there are more, neighbouring blocks are added up.
 MAX_BLOCKS = 240
 #: Degree of the Legendre polynomials of the drifts.
 DRIFT_DEGREE = 2
@@ -51,19 +54,19 @@ _MAX_OFFSET_STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Consecutive blocks of a recording.
+    """Consecutive blocks of a recording, each a few seconds long and reduced to sums.
 
     Parameters
     ----------
     start, end : array of float, shape (K,)
         Times of the first and the last row of each block [s].
     gram : array of float, shape (K, E, m, m)
-        Sums of the products, over the rows' variances, of the m columns over the rows of each of E equations, the left
-        side last.
+        Gram matrices of each block for each of E equations: weighted sums, over the rows, of the products of the m
+        columns with each other. The left side is the last column.
     rows : array of float, shape (K,)
         Number of rows without missing samples; a row next to a hole counts as a fraction of one.
     flow : array of float, shape (K,)
-        Mean absolute rate of the left side [m^3/s].
+        Mean magnitude of the first equation's left side, as a flow [m^3/s].
     pressures : array of float, shape (K, p)
         Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
     zero : array of float, shape (K,)
@@ -86,11 +89,14 @@ class Blocks:
         return Blocks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def pack(self) -> Blocks:
-        """Drop the lower triangles of the Gram matrices for storage: `gram` becomes (K, E, m (m + 1) / 2)."""
+        """Return the blocks with the upper triangles of `gram` only, (K, E, m (m + 1) / 2), for storage."""
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Restore the Gram matrices (K, E, size, size) of packed blocks; raise InputError for another shape."""
+        """Return the blocks that `pack` has reduced, with the full Gram matrices (K, E, size, size).
+
+        Raise InputError if the stored shapes do not fit `size`.
+        """
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
         if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
@@ -106,19 +112,20 @@ class Blocks:
 
     @property
     def moving_flow(self) -> float:
-        """Mean flow while the pump delivers [m^3/s], weighted by the flow itself, so that standstills do not count."""
+        """Mean flow while the pump delivers [m^3/s]; weighting by the flow itself excludes standstills."""
         return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags (K,) of the blocks in motion.
+        """Flags (K,) of the blocks in which the machine moves.
 
-        Their mean flow is at least a fraction of `moving_flow`, more than is needed to hold a load.
+        Their mean flow is at least a fraction of `moving_flow` (`rest.moves` in `priors.toml`), which exceeds the
+        flow that holds a load.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
-        """Add up neighbouring blocks so that at most `max_blocks` remain."""
+        """Return at most `max_blocks` blocks, by adding up equal numbers of neighbouring ones."""
         group = -(-len(self) // max_blocks)
         if group <= 1:
             return self
@@ -137,32 +144,41 @@ class Blocks:
         )
 
     def mean_pressure(self, offset: float | None = None) -> Array:
-        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block (K,).
+        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, shape (K,).
 
-        By default the offset is `zero`. The mean flow of a laminar leak is its coefficient times this pressure.
+        `offset` [Pa]: error of the sensors, by default `zero`. The mean flow of a laminar leak is its coefficient
+        times this pressure.
         """
         return np.asarray(np.abs(self.pressures - (self.zero[:, None] if offset is None else offset)).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,).
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,).
 
-        The mean flow of an orifice is its coefficient times this mean.
+        The mean flow of a leak through an orifice is its coefficient times this mean.
         """
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:
-        """Concatenate the blocks of consecutive parts."""
+        """Concatenate the blocks of consecutive `parts` of one recording."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
 
 class ColumnRoles:
-    """Indices of one equation's columns in its Gram matrices, by role, and the priors on their coefficients.
+    """Role of each column in one equation's Gram matrices, and the priors on its coefficient.
 
-    `left`: left side; `nuisance`: coefficients unknown in any machine; `compared`: nuisances, and columns fitted if
-    recordings are compared; `motion`: of the piston or the valve's edges; `fast`: coefficients free in each block while
-    rows are weighted; `slow`: common to all blocks. Prior standard deviations (m - 1,): `drift_rate`, relative [1/min];
-    `between_deviation` between recordings, relative, may be infinite; `level_deviation`. `drivers`: `Term.driver`.
+    A column belongs to a term of the balance or to its left side. Indices of columns:
+
+    - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
+    - `nuisance`: terms whose coefficients are unknown in any machine;
+    - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
+    - `motion`: motion of the piston, or flow of the valve's edges;
+    - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
+
+    Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
+    `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, in the
+    unit of the coefficient. `names` and `drivers` (m - 1,): those of the terms; `healthy_conductance` [m^3/(s Pa)]:
+    standard deviation of a healthy machine's leak.
     """
 
     def __init__(self, equation: Equation) -> None:
@@ -188,9 +204,9 @@ class ColumnRoles:
         self.healthy_conductance = equation.healthy
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return the roles for a test of the column `name` in place of the leak.
+        """Return the roles for a test of the term `name` instead of the leak.
 
-        The leak's changes between recordings then have a prior.
+        The leak becomes an ordinary term, with a prior on its differences between recordings (`between.pump`).
         """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
@@ -198,9 +214,10 @@ class ColumnRoles:
         return roles
 
     def leak_deviation(self, test: int, blocks: Blocks) -> float:
-        """Return the prior standard deviation of a healthy machine's leak coefficient; infinite for other terms.
+        """Compute the prior standard deviation of a coefficient in a healthy machine, in the unit of the coefficient.
 
-        `test`: index of the column. For an orifice it gives the same mean flow as the laminar leak's.
+        `test`: index of its column. The prior of a flow through an orifice gives the same mean flow over `blocks` as
+        that of a laminar leak. The result is infinite for columns that no pressure drives, or without a prior.
         """
         driver = self.drivers[test] if test < self.left else ""
         pressure, root = (float(np.mean(values)) for values in (blocks.mean_pressure(), blocks.mean_root()))
@@ -208,10 +225,11 @@ class ColumnRoles:
         return self.healthy_conductance * per_conductance[driver]
 
     def offset_deviation(self, test: int, blocks: Blocks) -> float:
-        """Return the prior standard deviation of a sensor offset, in the unit of a leak's column.
+        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
 
-        `test`: index of the column; the result is 0 for other columns than a leak's. The offset's deviation is at most
-        the mean pressure, since recordings may be in counts.
+        `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for that of an
+        orifice, and 0 for columns that no pressure drives or in an equation without flow offset. The deviation of the
+        pressure is at most its mean over `blocks`, since recordings may be in counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -221,7 +239,11 @@ class ColumnRoles:
 
 
 class Weighting:
-    """Huber's weights of the rows of blocks, and the weighted sums over earlier blocks that the fit depends on."""
+    """Weighting of the rows of successive blocks by Huber's weights, which limit the effect of outliers.
+
+    The weights follow from a fit that also uses weighted sums over earlier blocks. These sums are the state of the
+    object. `columns`: roles of the columns in each equation.
+    """
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
         self._columns = columns
@@ -234,11 +256,11 @@ class Weighting:
         return self._count > 0
 
     def state(self) -> dict[str, Any]:
-        """Return the weighted sums over earlier blocks as plain values for JSON."""
+        """Return the number of earlier blocks and the weighted sums over them, as plain values for JSON."""
         return {"count": self._count, "known": [plain_array(sums) for sums in self._earlier_sums]}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`; raise InputError if its shapes do not fit."""
+        """Restore the sums over earlier blocks from a saved `state`; raise InputError if its shapes do not fit."""
         self._count = int(require_part(state, "count", int))
         restored = [restore_array(sums, "known") for sums in require_part(state, "known", list)]
         shapes = [sums.shape for sums in self._earlier_sums]
@@ -249,11 +271,12 @@ class Weighting:
         self._earlier_sums = restored
 
     def compute_gram_matrices(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
-        """Compute the Gram matrices (K, E, m, m) of K blocks, outlying rows weighted down; update the earlier sums.
+        """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.
 
-        `values`: rows (r, m) of all blocks, for each equation; `ends`: index past the last row of each block. Huber's
-        weights follow from a fit to these and earlier blocks: coefficients of fast columns are free in each block,
-        those of slow ones common to all.
+        `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
+        Huber's weights follow from a fit to these and earlier blocks, in which the coefficients of fast columns are
+        free in each block and those of slow columns common to all (`ColumnRoles`). The sums over earlier blocks are
+        updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
@@ -267,7 +290,10 @@ class Weighting:
 
 
 def solve(matrix: Array, right: Array) -> Array:
-    """Solve matrix x = right for a positive semidefinite matrix; components in its null space are zero."""
+    """Solve matrix x = right for a positive semidefinite `matrix` (n, n) and `right` (n,) or (n, k).
+
+    The matrix is scaled to a unit diagonal, with a small ridge; components of x in its null space are about zero.
+    """
     scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     scale[~(scale > 0.0)] = 1.0
     column = scale[:, None]
@@ -283,17 +309,21 @@ def solve(matrix: Array, right: Array) -> Array:
 
 @cache
 def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """Import LAPACK's positive definite solver, which takes a third of NumPy's time for a few columns."""
+    """Return LAPACK's solver for positive definite matrices, imported when first used.
+
+    For a few columns it takes a third of the time of NumPy's solver.
+    """
     from scipy.linalg.lapack import dposv
 
     return dposv  # type: ignore[no-any-return]
 
 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
-    """Compute the likelihood of one column's coefficient in each block, with all other coefficients eliminated.
+    """Compute the likelihood of one coefficient of a balance in each block, with all other coefficients eliminated.
 
-    `test`: index of the column, or of the left side to test a change of scale; `replaces`: index of a column to omit;
-    `columns`: roles in each equation, whose likelihoods are multiplied.
+    `columns`: roles of the columns in each equation; the likelihoods of the equations are multiplied. `test`: index
+    of the coefficient's column, or of the left side to test a change of its scale. `replaces`: index of a column to
+    omit.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -306,18 +336,22 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, repla
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
-    """Compute Legendre polynomials over the blocks, (K, DRIFT_DEGREE + 1), and the recording's length [min]."""
+    """Compute Legendre polynomials in time over K blocks, (K, DRIFT_DEGREE + 1), and the recording's length [min].
+
+    Slow drifts of coefficients are sums of these. A single block has only the constant polynomial.
+    """
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
     position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0
     return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
 class _NormalEquations(NamedTuple):
-    """Sums of a regression on the nuisance columns times their drift polynomials (c in all) and on a tested column.
+    """Sums of a regression of the left side on nuisance columns that drift and on one tested column.
 
-    `gram` (c, c) and `moment` (c,), products of the nuisance columns with themselves and with the left side. Of the
-    tested column in each block: `coupling` (K, c) to the nuisance columns, `energy` (K,), its sum of squares, and
-    `tested_moment` (K,), its product with the left side. `left_square`: sum of squares of the left side.
+    The nuisance columns are multiplied by their drift polynomials, c columns in all. `gram` (c, c) and `moment` (c,):
+    products of these columns with each other and with the left side. Sums of the tested column in each of K blocks:
+    `coupling` (K, c), its products with the nuisance columns; `energy` (K,), its sum of squares; `tested_moment`
+    (K,), its product with the left side. `left_square`: sum of squares of the left side.
     """
 
     gram: Array
@@ -328,7 +362,7 @@ class _NormalEquations(NamedTuple):
     left_square: float
 
     def eliminate_tested(self) -> tuple[Array, Array, float]:
-        """Return `gram`, `moment` and `left_square` with the tested coefficient, free in each block, eliminated."""
+        """Return `gram`, `moment` and `left_square` after eliminating the tested coefficient, free in each block."""
         energy = np.maximum(self.energy, np.finfo(float).tiny)
         gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
         moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
@@ -338,7 +372,11 @@ class _NormalEquations(NamedTuple):
 def _build_normal_equations(
     gram: Array, polynomials: Array, nuisance: list[int], test: int, left: int
 ) -> _NormalEquations:
-    """Build the normal equations from Gram matrices (K, m, m), nuisances times drift `polynomials` (K, degrees)."""
+    """Build the normal equations of a regression on drifting nuisance columns and one tested column.
+
+    `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, degrees): drift polynomials, by each of which the
+    columns `nuisance` are multiplied; `test`, `left`: indices of the tested column and of the left side.
+    """
     n, degrees = len(nuisance), polynomials.shape[1]
     size = n * degrees
     # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
@@ -355,9 +393,10 @@ def _build_normal_equations(
 
 
 class _Prior(NamedTuple):
-    """Prior standard deviations of the nuisance coefficients' `level` and `drift` (c,), and of the sensor `offset`.
+    """Prior standard deviations of c nuisance coefficients: of their `level` and their `drift`, (c,) each.
 
-    `current_offset`: offset subtracted in the sums; the last coefficient, its error, has the mean -`current_offset`.
+    The last coefficient is the remaining error of a sensor offset whose prior standard deviation is `offset`. The
+    sums are computed after subtracting `current_offset`, so the error has the prior mean -`current_offset`.
     """
 
     level: Array
@@ -367,9 +406,10 @@ class _Prior(NamedTuple):
 
 
 class _NuisanceFit(NamedTuple):
-    """Fitted nuisance coefficients, their prior precision, and its product with their prior mean, (c,) each.
+    """Fit of the nuisance coefficients: `coefficients` (c,) and `variance` of a row, inflated for overlapping rows.
 
-    `variance` of a row, inflated for the overlap of the rows.
+    `prior_precision` (c,): prior precision of the coefficients, times `variance`; `prior_moment`
+    (c,): its product with their prior mean.
     """
 
     coefficients: Array
@@ -379,9 +419,11 @@ class _NuisanceFit(NamedTuple):
 
 
 def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
-    """Fit the nuisance coefficients and the variance of a row; the tested coefficient is free in each block.
+    """Fit all coefficients but the tested one (the nuisance), and the variance of a row.
 
-    Each nuisance has `degrees` coefficients: a constant part and polynomials of its drift.
+    The tested coefficient is free in each block.
+    Each nuisance column has `degrees` coefficients: a constant one and those of the polynomials of its drift.
+    `n_rows`: number of rows in all blocks.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -404,9 +446,10 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows:
 
 
 class _EquationFit(NamedTuple):
-    """Fit of one equation: the sums about the fitted `offset` of p_A - p_B [Pa], and the nuisance coefficients.
+    """Fit of one equation: sensor offset of p_A - p_B and nuisance coefficients.
 
-    The last nuisance coefficient is the remaining error of the offset.
+    `offset`: the fitted offset [Pa], relative to the one already removed; `normal`: sums after subtracting it;
+    `nuisance`: coefficients, the last of which is the remaining error of the offset.
     """
 
     normal: _NormalEquations
@@ -415,11 +458,14 @@ class _EquationFit(NamedTuple):
 
 
 def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]) -> _EquationFit:
-    """Fit the nuisance coefficients of one equation and the offset z of p_A - p_B by Gauss-Newton steps.
+    """Fit the nuisance coefficients of one equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
-    The tested coefficient g takes its own value in each block. The leakage is g (p_A - p_B - z): a change of g between
-    blocks also changes the bias, by -g z. z is small, as it is relative to the offset that is already removed from the
-    sums (`pressure_offset.remove_pressure_offset`).
+    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z), so a change of g between blocks
+    also changes the constant flow, by -g z. z is small, since a first estimate of the offset is already removed from
+    the sums (`pressure_offset.remove_pressure_offset`).
+
+    `gram` (K, m, m): Gram matrices of the equation in K blocks; `test`: index of the column of g; `nuisance`: indices
+    of the nuisance columns.
     """
     offset, deviation = 0.0, roles.offset_deviation(test, blocks)
     polynomials, minutes = _drift_polynomials(blocks)
@@ -445,9 +491,11 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
 
 
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
-    """Subtract an offset from the pressure of the tested column in Gram matrices (K, m, m), and append its derivative.
+    """Subtract a sensor offset from the pressure of the tested column, and append a column for the offset's error.
 
-    The appended column is that of the offset's error: -g dt, with the tested coefficient g (K,) of each block.
+    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the tested column; `coefficients` (K,): coefficient
+    g of that column in each block; `offset` [Pa]. The result has the shape (K, m + 1, m + 1). The appended column -g
+    dt is the derivative of the balance with respect to the offset.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -461,10 +509,12 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
 def _eliminate_nuisance(
     gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nuisance: list[int]
 ) -> tuple[Array, Array]:
-    """Compute precision (K, K) and vector (K,) of the tested coefficient by one equation's Gram matrices (K, m, m).
+    """Compute the likelihood of the tested coefficient in K blocks by one equation: precision (K, K) and vector (K,).
 
-    Schur complement of the nuisance coefficients with their prior precision P: (energy - C (G + P)^-1 C') / variance,
-    G the Gram matrix of the nuisance columns and C their coupling to the tested one.
+    `gram` (K, m, m): Gram matrices of the blocks; `test`: index of the tested column; `nuisance`: indices of the
+    columns to eliminate. The precision is the Schur complement (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix
+    of the tested column's sums of squares, G the Gram matrix of the nuisance columns, P their prior precision, C
+    their products with the tested column, and s^2 the variance of a row.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -475,21 +525,26 @@ def _eliminate_nuisance(
 
 
 def _nuisance_columns(roles: ColumnRoles) -> list[int]:
-    """Return the indices of the nuisance columns other than the leak's."""
+    """Return the indices of the columns whose coefficients are unknown in any machine, except for the leak's."""
     return [k for k in roles.nuisance if k != roles.leak]
 
 
 def offset_cost(offset: float) -> float:
-    """Compute -2 log of the prior density of an offset of p_A - p_B [Pa], relative to that of no offset.
+    """Compute -2 log of the prior density of a sensor offset of p_A - p_B [Pa], relative to that of no offset.
 
-    The prior is a normal density for good sensors, with small odds of a wide one for sensors far off.
+    The prior is a normal density for good sensors or, with small odds, a wide one for sensors that are far off
+    (`zero` in `priors.toml`); the more favourable of the two counts.
     """
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return float(min((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds)))
 
 
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Estimate the offset of p_A - p_B [Pa], averaged over the equations; near 0 if the leak does not change."""
+    """Estimate the sensor offset of p_A - p_B [Pa] in a recording, as a mean over the equations.
+
+    Only changes of the leak between blocks show the offset; without them the estimate stays near the one that is
+    already removed from `blocks`.
+    """
     fits = [
         _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
         for e, roles in enumerate(columns)
@@ -498,10 +553,10 @@ def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
 
 
 class LeakAndBias(NamedTuple):
-    """Likelihood of leak and flow offset in K blocks: `precision` (2 K, 2 K) and `vector` (2 K,), the leaks first.
+    """Joint likelihood of the leak coefficient and the flow offset in K blocks, the K leaks first.
 
-    The flow offset is that at the mean pressure difference `pressure` (K,) [Pa] of each block, where both are
-    uncorrelated within the block.
+    `precision` (2 K, 2 K) and `vector` (2 K,) are as in `onset.Information`. The flow offset is the flow at the mean
+    pressure difference `pressure` (K,) [Pa] of each block; there leak and offset are uncorrelated within the block.
     """
 
     precision: Array
@@ -510,7 +565,10 @@ class LeakAndBias(NamedTuple):
 
 
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
-    """Estimate the leak's coefficient and the flow's offset in each block, with all other coefficients eliminated."""
+    """Compute the joint likelihood of leak coefficient and flow offset in each block, for the first equation.
+
+    `roles`: roles of its columns, among them one of the flow offset. All other coefficients are eliminated.
+    """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
     gram = blocks.gram[:, 0].copy()
@@ -518,7 +576,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false in a block at rest, but for rounding errors
     pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(gram, blocks, roles, leak, _nuisance_columns(roles))
-    # the leak's column about its mean in the block, so that leak and bias are uncorrelated there
+    # subtract from the leak's column its mean in the block, so that leak and bias are uncorrelated there
     gram[:, leak] -= pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
@@ -536,10 +594,10 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
-    """Estimate a weighted mean of nuisance coefficients and its standard error.
+    """Estimate a weighted mean of coefficients of the first equation, and its standard error.
 
-    `weights` maps the index of a column to its weight; the weights sum to 1. Only the constant part of each coefficient
-    is averaged, not its drift.
+    `weights` maps the index of a nuisance column to its weight; the weights sum to 1. Only the constant part of each
+    coefficient is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
@@ -553,7 +611,7 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 
 
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Sum the Gram matrices of a recording's blocks for each equation, (E, m, m), divided by the variance of a row."""
+    """Compute the Gram matrix of a whole recording for each equation, divided by the variance of a row, (E, m, m)."""
     grams = []
     for e, roles in enumerate(columns):
         fit = _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))

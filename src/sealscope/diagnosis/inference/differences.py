@@ -1,16 +1,16 @@
-"""Tests of a difference between a number of a recording and those of healthy recordings of unknown scatter.
+"""Tests whether a number of a recording differs from that of healthy recordings, whose scatter is unknown.
 
 *Without a prior on the scatter* (`compare_with_healthy`): n healthy values are normal about an unknown mean with an
 unknown standard deviation, at least the error e of a single value (Jeffreys prior). The next value then follows
-Student's law of n - 1 degrees of freedom,
+Student's t with n - 1 degrees of freedom,
 
     t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
 
 Five values that agree to a thousandth thus show that a sixth differs by a few thousandths; two show next to nothing.
 
-*With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i of its own and varies about an
-unknown mean mu by the scatter s, y_i ~ N(mu, s^2 + e_i^2), and s^2 has a scaled inverse chi-square prior: the scatter
-s_0 counts as much as that of m recordings. On a grid of s, with the weights w_i = 1/(s^2 + e_i^2) and W = sum w_i,
+*With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean
+mu by the scatter s, y_i ~ N(mu, s^2 + e_i^2). s^2 has a scaled inverse chi-square prior, with the weight of m
+recordings whose scatter is s_0. On a grid of s, with the weights w_i = 1/(s^2 + e_i^2) and W = sum w_i,
 
     p(s | y) ~ p(s) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
 
@@ -31,23 +31,25 @@ from sealscope.diagnosis.priors.inference import StepSize
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
-#: Number of grid points of the scatter, and its largest ratio to the prior's, either way, and to that of the values.
+#: Number of grid points of the scatter, and the largest factor between it and the prior's, up or down. The grid also
+#: reaches a multiple of the standard deviation of the healthy values.
 NODES, MAX_RATIO, MAX_RATIO_TO_VALUES = 64, 100.0, 10.0
 #: Smallest positive number that is divided by.
 TINY = float(np.finfo(float).tiny)
 
 
 class Estimate(NamedTuple):
-    """An estimate and its standard deviation."""
+    """An estimate `value` and its standard error `deviation`."""
 
     value: float
     deviation: float
 
 
 class PriorScatter(NamedTuple):
-    """Prior on the scatter of a number between recordings.
+    """Prior on the scatter of a number between recordings of one machine.
 
-    `deviation`: its standard deviation; `recordings`: number of recordings with the same weight.
+    `deviation`: expected standard deviation of the number; `recordings`: number of recordings that would tell as much
+    about the scatter as this prior.
     """
 
     deviation: float
@@ -64,12 +66,29 @@ def compare_with_healthy(
     above: bool = False,
     prior_change: float = np.inf,
 ) -> Observable | None:
-    """Compare a value with those of healthy recordings by Student's t, as an observable.
+    """Test by Student's t whether a value differs from those of healthy recordings.
 
-    Return None for fewer than `MIN_HEALTHY` recordings, or if a number is not finite. `name`, `data`: of the
-    observable; `error`: standard error of a single value; `above`: only a value above the healthy ones counts;
-    `prior_change`: standard deviation of a true change. The chance is at least the inverse of the Bayes factor of such
-    a change: it is 1 if a true change explains the value no better than scatter does.
+    Parameters
+    ----------
+    name, data : str
+        Name of the observable, and of the data it is computed from.
+    value : float
+        Value of the judged recording.
+    healthy : sequence of float
+        Values of the healthy recordings, in the same unit.
+    error : float
+        Standard error of a single value.
+    above : bool
+        Count only a value above the healthy ones.
+    prior_change : float
+        Standard deviation of a true change. The chance is then at least the inverse of the Bayes factor of such a
+        change, and 1 if a true change explains the value no better than scatter does.
+
+    Returns
+    -------
+    Observable or None
+        Its size is the difference from the healthy mean, its score the square of t. None for fewer than `MIN_HEALTHY`
+        healthy recordings, or if a number is not finite.
     """
     from scipy.special import stdtr
 
@@ -103,11 +122,26 @@ def compare_estimates(
     *,
     above: bool = False,
 ) -> Observable | None:
-    """Compare an estimate with those of healthy recordings, each with its own error, as an observable.
+    """Test whether an estimate differs from those of healthy recordings, where each has a known standard error.
 
-    Return None for fewer than `MIN_HEALTHY` recordings, or if a number is not finite. `name`, `data`: of the
-    observable; `prior`: scatter between recordings; `above`: only a value above the healthy ones counts. The size is
-    the difference from their weighted mean, the score its square over its variance.
+    Parameters
+    ----------
+    name, data : str
+        Name of the observable, and of the data it is computed from.
+    judged : Estimate
+        Estimate from the judged recording.
+    healthy : sequence of Estimate
+        Estimates from the healthy recordings.
+    prior : PriorScatter
+        Prior on the scatter between recordings.
+    above : bool
+        Count only an estimate above the healthy ones.
+
+    Returns
+    -------
+    Observable or None
+        Its size is the difference from the weighted mean of the healthy estimates, its score the square of the size
+        over its variance. None for fewer than `MIN_HEALTHY` healthy recordings, or if a number is not finite.
     """
     from scipy.special import ndtr
 
@@ -135,10 +169,11 @@ def compare_estimates(
 
 
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
-    """Compute the part of a standard error that the scatter of the healthy values does not contain.
+    """Compute the part of a value's standard error that must be added to the scatter of healthy values.
 
-    The scatter contains the median of `healthy_errors`, the standard errors of the healthy values. The result is
-    sqrt(`error`^2 - median^2), at least 0; it is `error` if there are no healthy values.
+    The scatter already contains an error as large as the median of `healthy_errors`, the standard errors of the
+    healthy values. The result is sqrt(`error`^2 - median^2), or 0 for a smaller error. It is `error` if there are no
+    healthy values.
     """
     if not healthy_errors:
         return error
@@ -146,9 +181,10 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
 
 
 def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
-    """Compute -2 log of the log-normal prior density of log(abs(`step`)), relative to its maximum.
+    """Compute the penalty on an improbable size of a step: -2 log of its prior density relative to the maximum.
 
-    `above`: penalise only steps that are larger than the most probable size, `prior.size`.
+    The prior is normal in log(abs(`step`)) about log(`prior.size`), with the standard deviation `prior.spread`. With
+    `above`, only steps larger than `prior.size` are penalised.
     """
     deviation = float(np.log(max(abs(step), TINY) / prior.size)) / prior.spread
     return float(max(deviation, 0.0) ** 2 if above else deviation**2)

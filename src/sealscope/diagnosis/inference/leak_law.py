@@ -1,15 +1,15 @@
-"""Flow of a leak under laws between laminar and orifice, from the conductance in blocks.
+"""Mean flow of a leak, averaged over laws between laminar flow and an orifice, from the conductance in blocks.
 
-A leak c |p_A - p_B|^e, in addition to the healthy leakage, changes a block's conductance by c r_k, with r_k the
-regression of its flow on the pressure difference within the block. A step test with a size proportional to r_k in each
-block thus covers every law, and the healthy laminar leakage does not enter. A seal that continues to wear leaks more
-towards the end: the step grows by a fraction of itself. The flow of a step is a mixture over laws, growths and onsets,
-each weighted by its likelihood and prior.
+A leak c |p_A - p_B|^e, in addition to the healthy leakage, changes a block's conductance by c r_k. Here r_k is the
+regression coefficient of the law's flow on the pressure difference within the block. A step test with a size
+proportional to r_k in each block thus covers every law, and the healthy laminar leakage does not enter. A seal that
+continues to wear leaks more towards the end: the step grows by a fraction of itself. The flow of a step is a mixture
+over laws, growths and onsets, each weighted by its likelihood and prior.
 
-A rise g beyond the healthy recordings is the regression of the leak's flow on p_A - p_B over the whole recording. Under
-another law the flow is g <|dp|^e> / b_e, with b_e the regression of that law's flow on p_A - p_B, all else eliminated.
-A leak that began within the recording had a larger flow while it lasted: if a fraction s of the recording's
-information lies after the onset, the step is g / s.
+A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow
+on p_A - p_B over the whole recording. Under another law the flow is g <|dp|^e> / b_e, with the regression coefficient
+b_e of that law's flow on p_A - p_B after elimination of all other terms. A leak that began within the recording had a
+larger flow while it lasted: if a fraction s of the recording's information lies after the onset, the step is g / s.
 """
 
 from __future__ import annotations
@@ -27,22 +27,23 @@ from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
-#: Exponents e of the leak laws.
+#: Exponents e of the leak laws: 1 is laminar flow, 0.5 an orifice.
 EXPONENTS = (1.0, 0.75, 0.5)
-#: Number of growths above zero.
+#: Number of relative growths of a step that are tried, besides zero.
 N_GROWTHS = 6
-#: Probability of an onset over the largest below which it is omitted.
+#: Probability of an onset, relative to the most probable one, below which it is omitted.
 NEGLIGIBLE = 1e-3
-#: Minimum fraction of the information after an onset, for a flow since then.
+#: Minimum fraction of a recording's information that must lie after an onset.
 MIN_FRACTION = 0.1
 _TINY = np.finfo(float).tiny
 
 
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
-    """Compute the conductance (K,) that a leak of unit coefficient adds in each block, by leak law.
+    """Compute the apparent conductance in each of K blocks of a leak |p_A - p_B|^e of unit coefficient.
 
-    The keys are `EXPONENTS`. For an orifice it is the regression coefficient of the flow on p_A - p_B; for the laws
-    between laminar and orifice flow its logarithm is interpolated.
+    It is the regression coefficient of the leak's flow on p_A - p_B: 1 for laminar flow, and from the Gram matrices
+    for an orifice; between the two its logarithm is interpolated. The result maps each exponent e of `EXPONENTS` to
+    an array (K,). `columns`: roles of the columns in each equation.
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -52,23 +53,27 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
-    """Compute the mean flow (K,) in each block of a leak of unit coefficient, for each of `EXPONENTS`.
+    """Compute the mean flow in each of K blocks of a leak |p_A - p_B|^e of unit coefficient.
 
-    The mean of |p_A - p_B|^e is interpolated between those for e = 1 and e = 1/2, in its logarithm.
+    It is the mean of |p_A - p_B|^e, whose logarithm is interpolated between e = 1 and e = 1/2. The result maps each
+    exponent e of `EXPONENTS` to an array (K,).
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each of `EXPONENTS`: that of laminar flow, the rest shared equally."""
+    """Return the prior probability of each exponent of a leak's law, in the order of `EXPONENTS`.
+
+    Laminar flow has the probability `size.laminar` of `priors.toml`; the other laws are equally probable.
+    """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
     return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
 
 
 def _growth_priors() -> list[tuple[float, float]]:
-    """List the possible relative growths of a step after its onset, with their prior probabilities."""
+    """List the possible relative growths of a leak from its onset to the end, each with its prior probability."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     return [(0.0, prior.steady), *((float(growth), (1.0 - prior.steady) / N_GROWTHS) for growth in growths)]
@@ -77,13 +82,19 @@ def _growth_priors() -> list[tuple[float, float]]:
 def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
     """Convert indices of a step test's onsets to positions, counted in blocks from the start of the first block.
 
-    A prior on the level counts in the test as one block before the first.
+    `leak`: likelihood on which the test was made. If it has a prior on the level, the test counts that prior as one
+    block before the first.
     """
     return EDGE + onsets / PARTS - float(np.isfinite(leak.level))
 
 
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
-    """Estimate the mean flow of a step of the leak after its onset, averaged over laws, growths and onsets."""
+    """Estimate the mean flow of a leak that begins within a recording, from its onset to the end.
+
+    The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`:
+    roles of the columns in each equation; `leak`: likelihood of the leak's coefficient in the blocks; `test`: test
+    for a step of it.
+    """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)
     n_rows_after = np.maximum(rows @ step_shapes(len(blocks), positions), _TINY)
@@ -102,7 +113,11 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 
 
 class LawWeight(NamedTuple):
-    """A law of the leak: mean `flow` of a unit rise of the coefficient, and the logarithm of its probability."""
+    """Weight of one law of the leak's flow, such as laminar.
+
+    `flow`: mean flow [m^3/s] under this law if the leak's coefficient rises by 1 m^3/(s Pa); `log_weight`: logarithm
+    of the law's probability, up to a constant.
+    """
 
     flow: float
     log_weight: float
@@ -113,9 +128,24 @@ def estimate_rise_flow(
 ) -> Flow:
     """Estimate the mean flow of a leak after its onset, from its rise over healthy recordings.
 
-    The value is that of the most probable law; the other laws contribute to its standard deviation. `leak`: likelihood
-    of the coefficient in the blocks; `test`: of its step, or None; `value`, `deviation`: mean rise over the whole
-    recording and its standard deviation; `laws`: of `EXPONENTS`; `max_flow`: mean flow of the pump [m^3/s].
+    The value is that of the most probable law; the other laws contribute to its standard deviation.
+
+    Parameters
+    ----------
+    leak : Information
+        Likelihood of the leak's coefficient in the blocks of the recording.
+    test : StepTest, optional
+        Test for a step of that coefficient; without it the leak counts from the start.
+    value, deviation : float
+        Mean rise of the coefficient over the whole recording, and its standard deviation [m^3/(s Pa)].
+    laws : sequence of LawWeight
+        Weight of each law of `EXPONENTS`.
+    max_flow : float
+        Mean flow of the pump [m^3/s]; onsets and laws with a larger leak are excluded.
+
+    Returns
+    -------
+    Flow
     """
     log_weights, fractions = _weigh_rise_onsets(leak, test, value)
     unit_flows, law_log_weights = np.array(laws).T
@@ -131,11 +161,13 @@ def estimate_rise_flow(
 
 
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
-    """Compute the log weight of each possible onset of a rise, and the fraction of information after it.
+    """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
-    The first onset is the recording's start, with fraction 1. `value`: rise of the coefficient over the whole
-    recording, which is the step after the onset times this fraction. The weight is the likelihood of such a step,
-    relative to no step, over the number of onsets.
+    Returns the log weight of each onset, and the fraction of the recording's information after it, (o,) each. The
+    first onset is the recording's start, with the fraction 1. A leak that begins later must cause a step of `value`
+    over this fraction. The weight is the likelihood of such a step relative to no step, divided by the number of
+    onsets. Without a `test`, or if `value` is not positive, only the first onset remains. `leak`: likelihood of the
+    coefficient in the blocks.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
@@ -150,9 +182,10 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
-    """Compute the mean and the standard deviation of a mixture of k flows.
+    """Average k alternative estimates of a flow, or of another size of a leak, by their weights.
 
-    `weights`, `flows` (or other sizes of a leak) and their standard `deviations`: (k,) each.
+    `weights`, `flows` and their standard `deviations`: (k,) each; the sum of the weights need not be 1. The result is
+    the mean and the standard deviation of the mixture.
     """
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)

@@ -1,7 +1,7 @@
-"""Report of a provider on a recording: observables, each with a test, and measurements of the leak.
+"""Report of a detector on a recording: observables, i.e. tests of numbers for a change, and measurements of the leak.
 
-A provider (`detector.Detector`) estimates numbers over a recording, without a verdict or a threshold. The meaning of
-the numbers is in `decision/events.toml`, and `decision.decide` weighs them.
+A provider (`detector.Detector`) estimates numbers from a recording, without a verdict or a threshold. What a change
+of each number means is stated in `decision/events.toml`, and `decision.decide` weighs the reports.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 
 @dataclass(frozen=True, kw_only=True)
 class Observable:
-    """Test of a change of one number that a provider estimates.
+    """Result of a test whether one number that a detector estimates has changed.
 
     Parameters
     ----------
@@ -27,19 +27,20 @@ class Observable:
         What changed: a term of the balance, "noise of the pressures", "RMS of d3 of p_A".
     data : str
         What it is computed from: "volumes", "response", "noise", "hum", "duty", "sense", "levels", "details", or the
-        name of a plug-in. Observables of the same data are rival descriptions of it.
+        name of a plug-in. Observables of the same data are alternative descriptions of one change in it.
     score : float
         Twice the logarithm of the likelihood ratio of the change.
     chance : float
-        Probability that a healthy recording scores as high, by the provider's own law.
+        Probability that a healthy recording scores as high, as stated by the detector.
     onset : Interval, optional
         Time of the change [s]; None for a comparison with other recordings.
     size : float
         The change, in the observable's own unit; negative for a fall.
     advantage : float
-        Twice the log odds of this description over its rivals from other sources, such as priors on its size.
+        Twice the log odds of this description over the alternative ones, from sources other than the score, such as a
+        prior on its size.
     log_ratio_to_leak : float, optional
-        Log likelihood ratio of a rise described by this number to one of the leak.
+        Log likelihood ratio of this description of a difference from healthy recordings to its description by a leak.
     """
 
     name: str
@@ -53,9 +54,9 @@ class Observable:
 
     @property
     def surprisal(self) -> float:
-        """Minus the natural logarithm of the chance.
+        """Minus the natural logarithm of `chance`, the probability that a healthy recording scores as high.
 
-        In a healthy machine it is exponentially distributed if the provider's law is right.
+        In a healthy machine it is exponentially distributed if the chance is stated correctly.
         """
         return float(-np.log(max(self.chance, np.finfo(float).tiny)))
 
@@ -63,9 +64,11 @@ class Observable:
     def from_test(
         cls, name: str, data: str, test: StepTest, *, n_tests: float = 1.0, sign: float = 1.0, advantage: float = 0.0
     ) -> Observable:
-        """Make the observable of a step within the recording, whose `test` is the best of `n_tests` (Bonferroni).
+        """Make the observable of a step, a sudden lasting change, within the recording.
 
-        `sign`: -1 for a step down, whose size the test states as positive.
+        `test`: the best of `n_tests` tests, whose chance is therefore multiplied by their number (Bonferroni);
+        `sign`: -1 for a step down, whose size the test states as positive. `name`, `data` and `advantage` are those
+        of the observable.
         """
         return cls(
             name=name,
@@ -79,24 +82,24 @@ class Observable:
 
 
 class Flow(NamedTuple):
-    """A leakage flow [m^3/s] and its standard error, without the uncertainty of the machine's size."""
+    """A leakage flow and its standard error [m^3/s]; the error excludes the uncertainty of the machine's size."""
 
     value: float
     deviation: float
 
 
 class Remark(NamedTuple):
-    """Remark on a recording: the key of a text in `decision/texts.toml`, and the values to fill in."""
+    """Remark on a recording: `key` of a text in `decision/texts.toml`, and the `values` to fill in by name."""
 
     key: str
     values: Mapping[str, float]
 
 
 class LeakRise(NamedTuple):
-    """Rise of the leakage over healthy recordings.
+    """Rise of the leakage, i.e. the leakage above that of healthy recordings, and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two sizes of the rise, the one that the step within the recording would
-    cause and zero.
+    `step_log_ratio`: log likelihood ratio of two sizes of the rise: the size that the step found within the recording
+    would cause, and zero.
     """
 
     rise: Rise
@@ -104,116 +107,130 @@ class LeakRise(NamedTuple):
 
 
 class RiseTest(Protocol):
-    """Test of a rise of the leakage, with its distribution in a healthy machine."""
+    """Interface of a test for increased leakage, with the distribution of its score in a healthy machine."""
 
     @property
     def score(self) -> float:
-        """Statistic of the test."""
+        """Statistic of the test; it grows with the leakage."""
 
     @property
     def chance(self) -> float:
         """Probability that a healthy machine scores as high."""
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with a probability."""
+        """Return the score that a healthy machine exceeds with the probability `chance`."""
 
 
 class DatedTest(RiseTest, Protocol):
-    """Test of a step of the leakage at an unknown instant."""
+    """Interface of a test for a step of the leakage, i.e. a leak that begins at an unknown time of the recording."""
 
     def onset(self) -> Interval:
-        """Return the most likely onset [s] with its 95 % interval."""
+        """Return the most likely onset of the leak [s] with its 95 % interval."""
 
     def detectable_step(self, chance: float) -> float:
-        """Return the conductance of a step that is detected at a false-alarm probability `chance`."""
+        """Return the smallest reliably detected step of the conductance, at a false-alarm probability `chance`."""
 
 
 class LeakMeasure(Protocol):
-    """The leakage of a recording as one provider measures it: tests, flows and sizes, no verdict."""
+    """Interface of the leakage that one detector measures in a recording: tests, flows and sizes, but no verdict."""
 
     @property
     def provider(self) -> str:
-        """Name of the detector."""
+        """Name of the detector that measured the leakage."""
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak, as far as the channels separate causes."""
+        """Cause of a leak, e.g. "piston or pump leak", as precise as the recorded channels allow."""
 
     @property
     def step(self) -> DatedTest | None:
-        """Test of a step of the leakage within the recording."""
+        """Test for a leak that begins within the recording; None if the recording is too short."""
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of the step while it lasts."""
+        """Mean flow of a leak that begins within the recording, from its onset to the end."""
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest factor on the stated flow, for other paths and laws of the leak."""
+        """Smallest and largest factor by which the stated flow changes for other paths and laws of the leak."""
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa)."""
+        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
 
     @property
     def rise(self) -> RiseTest | None:
-        """Rise of the mean leakage beyond the healthy recordings; None without any."""
+        """Test of the mean leakage against that of healthy recordings; None if there are none."""
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow of the rise [m^3/s], or the total leakage without healthy recordings; None if unknown."""
+        """Mean flow of the leakage above that of healthy recordings, or, without any, the total; None if unknown."""
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset of the rise if it began within the recording; None if nothing dates it."""
+        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows when it began."""
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit in the rig's file, in standard deviations; None if no limit applies."""
+        """Total leakage minus the limit in the rig's file, in standard deviations; None if no limit applies."""
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the leak's mean flow [m^3/s]."""
+        """95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested."""
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s], over the recording and while it delivers."""
+        """Mean flow of the pump [m^3/s]: over the whole recording, and while the pump delivers."""
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Rise over healthy recordings, with the step's contribution; None without healthy recordings."""
+        """Leakage above that of healthy recordings, and whether a step within the recording explains it.
+
+        None without healthy recordings.
+        """
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """L/min of a flow of 1 m^3/s, None where the machine's size is not stated."""
+        """Factor from a flow of this report [m^3/s] to L/min; None if the machine's size is not stated."""
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's size."""
+        """Relative standard deviation of the machine's size, which scales all flows."""
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured ratio of displacement to area, relative to the assumed one; None if it is not measured."""
+        """Measured ratio of the pump's displacement to the piston's area, relative to the assumed ratio.
+
+        None if it is not measured.
+        """
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Notes on sizes, sensor offsets and delays."""
+        """Remarks for the reader of the verdict, on sizes, sensor offsets and delays."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return a flow relative to the pump's flow and the piston's area."""
+        """Return `flow` relative to the pump's flow and to the piston's area; None if these are unknown."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the total leakage; `detectable_flow`: the smallest step that would have been found [m^3/s]."""
+        """Return the total leakage of the recording; None if it is unknown.
+
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would have been found had it begun within the
+        recording; None if unknown.
+        """
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the history of the leakage: its growth since an onset, else the total leakage."""
+        """Return the leakage over the time of the recording; None if it is unknown.
+
+        With an onset `onset_s` [s] it is the growth since then, without one (None) the total leakage.
+        """
 
 
 class Ringing(NamedTuple):
-    """Precision of the measured ringing of the pressures, if the leak itself is not measured.
+    """Precision of the measured ringing of the pressures, for a recording without a measured leakage.
 
-    `bound`: 95 % bound of the size of a change of its log RMS; `rate` [Hz]; `healthy`: number of recordings it was
-    compared with; `is_dated`: whether their dates are known; `unused`: recorded columns without a channel.
+    `bound`: 95 % upper bound of a change of the ringing, as the logarithm of its RMS; `rate`: sampling rate [Hz];
+    `healthy`: number of healthy recordings it was compared with; `is_dated`: true if their dates are known; `unused`:
+    recorded columns that are not assigned to a channel.
     """
 
     bound: float
@@ -225,23 +242,26 @@ class Ringing(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Report of a provider on a recording.
+    """Report of one detector on a recording.
 
     Parameters
     ----------
     provider : str
         Name of the detector.
     observables : tuple of Observable
+        Tests of the numbers that the detector estimates.
     leak : LeakMeasure, optional
+        The leakage, if the detector measures it.
     ringing : Ringing, optional
+        Precision of the ringing, if the detector compares that instead.
     lack : str
-        Reason for an empty report, else empty.
+        Reason for an empty report, else "".
     share : float
         Fraction of the recording's samples that were used.
     judged_until : float
         Time of the last judged sample, as a fraction of the recording.
     has_failed : bool
-        Whether it raised an error.
+        True if the detector raised an error.
     """
 
     provider: str

@@ -1,27 +1,30 @@
-"""Test of a step of a coefficient within a recording: likelihood ratio over all onsets, with a random walk.
+"""Test for a step of a coefficient within a recording: likelihood ratio over all onsets, against a random walk.
 
-The likelihood of one coefficient g in K blocks is `Information`(Lambda, eta). In a healthy machine g has a level, a
-slope and a random walk; with a leak also a step from its onset on:
+A step is a sudden, lasting change, as by a leak that begins within the recording. The likelihood of one coefficient g
+in K blocks of time is `Information`(Lambda, eta). In a healthy machine g has a level, a slope and a random walk; with
+a leak also a step from its onset on:
 
     g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
 
-kappa the inflation of the noise by the correlation of the rows. F is projected out; (q, kappa) are estimated with
-the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm of the ratio of
-the likelihoods, for steps > 0. An onset within a block is a part of a step there.
+where kappa is the inflation of the noise by the correlation of the rows. F is projected out. (q, kappa) are estimated
+with the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm of the
+likelihood ratio, for steps > 0. If the onset lies within a block, that block shows a fraction of the step.
 
-Its chance under the null follows from geometry, without a simulation: for a known q the whitened z is uniform on a
-sphere in n = K - 2 dimensions, steps over all onsets form a curve of length L on it, and the chance that z lies within
-the angle of its best onset, cos^2 = 1 - exp(-score/n), of that curve is that of a tube about it,
+The probability of the score in a healthy machine follows from geometry, without a simulation. For a known q the
+whitened z is uniform on a sphere in n = K - 2 dimensions, and steps over all onsets form a curve of length L on it.
+The best onset is at the angle cos^2 = 1 - exp(-score/n) from z. The probability that z lies that close to the curve
+is that of a tube about it,
 
     P = I_{1-c^2}((m - 1)/2, 1/2) / 2 + L / (2 pi) (1 - c^2)^((m - 2)/2),    1 - c^2 = exp(-score/m),    m = n.
 
-q is not known, and a walk can pass for a step: taking the step out makes the fitted walk smaller. Two things follow.
-L is the largest over the walks that the recording allows, those within `ALLOWED` of the largest likelihood, without the
-step or with it (R. L. Berger and D. D. Boos: the supremum over a confidence set): it grows with q, from 26 for no walk
-to 88 for nothing but a walk (60 blocks). And the residuals estimate two variances, noise and walk: half of the degrees
-of freedom at worst go to each, m = min(n, n/2 + 2). That this is enough was found by drawing. Chances below 1 %, in
-percent of 2 800 to 12 000 healthy draws a cell, block precisions log-normal of width 0.5, over the walk's variance per
-noise's (in brackets m = n and L of the fitted walks, as if q were known):
+q is not known, and a walk can look like a step: removing the step makes the fitted walk smaller. This has two
+consequences. First, L is the largest length over the walks that the recording allows, i.e. those whose likelihood is
+within `ALLOWED` of the largest, without the step or with it (R. L. Berger and D. D. Boos: the supremum over a
+confidence set). L grows with q, from 26 for no walk to 88 for nothing but a walk (60 blocks). Second, the residuals
+estimate two variances, of noise and walk. At worst half of the degrees of freedom go to each: m = min(n, n/2 + 2).
+Random draws showed that this is enough. The table gives the percentage of healthy draws (2 800 to 12 000 for each
+entry) with a probability P below 1 %, against the variance of the walk over that of the noise. The precisions of the
+blocks were log-normal with a width of 0.5. In brackets: m = n and L of the fitted walks, as if q were known.
 
     blocks      none         0.3          1            3            10           100
     5           0.2 (0.2)    0.2 (0.2)    0.1 (0.1)    0.2 (0.2)    0.1 (0.1)    0.2 (0.2)
@@ -54,21 +57,22 @@ from sealscope.recordings.recording import Array
 WITHIN_95, UPPER_95 = 1.96, 1.645
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.
 MIN_BLOCKS = 5
-#: Number of possible onsets per block, and blocks at either end without one.
+#: Number of possible onsets per block, and number of blocks at either end without an onset.
 PARTS, EDGE = 5, 2
 #: Grid of the variance q of the random walk over that of the noise, from none.
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
-#: Maximum log-likelihood ratio of the walks over which the null law is the largest: 99.7 % of chi square(1).
+#: Log likelihood by which an allowed walk may be less likely than the best one: 99.7 % of chi square(1).
 ALLOWED = 4.5
 #: Eigenvalues below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-9
 
 
 class Information(NamedTuple):
-    """Likelihood of one coefficient g_k in K blocks: exp(vector g - g precision g / 2).
+    """Likelihood of one coefficient g (K,) in K blocks of a recording: exp(vector g - g precision g / 2).
 
-    `time` (K,) [s], `precision` (K, K), `vector` (K,). Priors, infinite if there is none: `level`, standard deviation
-    before the first block; `slope`, that of a linear change over all blocks; `walk`, scale of a half-Cauchy law of the
+    `time` (K,): middles of the blocks [s]; `precision` (K, K) and `vector` (K,) as in the formula. Scales of priors
+    in the unit of g, infinite if there is none: `level`, standard deviation of the coefficient before the first
+    block; `slope`, standard deviation of a linear change over all blocks; `walk`, scale of a half-Cauchy prior on the
     standard deviation that a random walk reaches over all blocks.
     """
 
@@ -81,7 +85,7 @@ class Information(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """An estimate with its 95 % interval."""
+    """An estimate `value` with its 95 % interval from `low` to `high`."""
 
     value: float
     low: float
@@ -89,7 +93,7 @@ class Interval(NamedTuple):
 
 
 class FittedStep(NamedTuple):
-    """A step of a coefficient and its standard error."""
+    """Fitted `size` of a step of a coefficient, and its standard error `deviation`."""
 
     size: float
     deviation: float
@@ -97,7 +101,7 @@ class FittedStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StepTest:
-    """Test of a step of one coefficient over all onsets, from `step_test`.
+    """Result of the test for a step, a sudden lasting change, of one coefficient at an unknown onset (`step_test`).
 
     Parameters
     ----------
@@ -140,10 +144,10 @@ class StepTest:
         return np.asarray(weights / weights.sum())
 
     def onset(self, probability: float = 0.95) -> Interval:
-        """Return the most likely onset [s] and the interval that contains it with a probability.
+        """Return the most likely onset of the step [s] and the interval that contains it with a probability.
 
-        Rows of the block of the onset are weighted as if it leaked throughout or not at all: the resolution is half a
-        block.
+        The interval is widened by half a block at both ends, since the rows within the block of the onset are
+        weighted as if the whole block leaked or none of it.
         """
         tail = 0.5 - 0.5 * probability
         low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)
@@ -153,18 +157,24 @@ class StepTest:
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the quantile of the step's size at a `probability`, given that the size is > 0."""
+        """Compute the upper bound of the step's size: its quantile at `probability`, given that the size is > 0."""
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
-        """Return the size of a step that is detected with probability `power` at a false-alarm probability `chance`."""
+        """Compute the size of a step that is detected with probability `power` at a false-alarm probability `chance`.
+
+        The size is in the unit of the coefficient.
+        """
         from scipy.special import ndtri
 
         threshold_z = np.sqrt(self.threshold(chance))  # the score is about the square of a z score
         return float((threshold_z + ndtri(power)) * np.median(self.deviation))
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a coefficient without a step exceeds with the probability `chance`."""
+        """Compute the score that a coefficient without a step exceeds with the probability `chance`.
+
+        The score is twice the logarithm of a likelihood ratio; it is searched from 0 to 10 000.
+        """
         max_score = 1e4  # upper end of the search, with a probability of practically zero
         if not self.law.chance(0.0) > chance > self.law.chance(max_score):
             return 0.0 if self.law.chance(0.0) <= chance else max_score
@@ -172,9 +182,10 @@ class StepTest:
 
 
 def bound_steps(weights: Array, size: Array, deviation: Array, probability: float) -> float:
-    """Compute the quantile of a step's size at a `probability`, given that the size is > 0.
+    """Compute the upper bound of a step's size: its quantile at `probability`, given that the size is > 0.
 
-    `weights`, `size`, `deviation` (k,): probability, step and its standard error for each onset.
+    `weights`, `size`, `deviation` (k,): for each of k onsets its probability, and the size of the step there with its
+    standard error.
     """
     from scipy.special import ndtr
 
@@ -192,27 +203,32 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
 
 
 class History(NamedTuple):
-    """Estimate of a coefficient over K blocks: `mean` (K,) and `covariance` (K, K)."""
+    """Estimate of a coefficient in each of K blocks: `mean` (K,) and `covariance` (K, K)."""
 
     mean: Array
     covariance: Array
 
     def average(self, weights: Array) -> Interval:
-        """Average the coefficient with `weights` (K,) of sum 1; return the mean with its 95 % interval."""
+        """Compute the mean of the coefficient over the blocks, with its 95 % interval.
+
+        `weights` (K,): weight of each block; their sum is 1.
+        """
         value = float(weights @ self.mean)
         half_width = WITHIN_95 * float(np.sqrt(np.maximum(weights @ self.covariance @ weights, 0.0)))
         return Interval(value, value - half_width, value + half_width)
 
     def relative_to(self, before: NDArray[np.bool_]) -> History:
-        """Subtract the mean of the coefficient over the blocks flagged in `before` (K,)."""
+        """Return the history relative to its mean over the blocks flagged in `before` (K,)."""
         transform = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return History(transform @ self.mean, transform @ self.covariance @ transform.T)
 
 
 def fit_history(information: Information, test: StepTest | None, *, with_step: bool) -> History:
-    """Estimate a coefficient in each block, as the sum of level, slope and random walk.
+    """Estimate a coefficient in each block of a recording, as the sum of a level, a slope and a random walk.
 
-    `test` gives the variances of walk and noise; without it there is no walk. `with_step` adds the best step of `test`.
+    `information`: likelihood of the coefficient; `test`: source of the variances of walk and noise. Without a test
+    there is no walk, and with fewer than `MIN_BLOCKS` blocks no slope. `with_step`: add a step at the best onset of
+    `test`.
     """
     count, time = len(information.time), information.time
     noise = 1.0 if test is None else test.noise[with_step]  # indexed by False or True
@@ -237,19 +253,23 @@ def fit_history(information: Information, test: StepTest | None, *, with_step: b
 
 
 def _inverse(matrix: Array) -> Array:
-    """Invert a positive semidefinite matrix, scaled to a unit diagonal."""
+    """Compute the pseudoinverse of a positive semidefinite matrix, scaled to a unit diagonal against rounding."""
     scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
     return np.asarray(np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale))
 
 
 class NullLaw(NamedTuple):
-    """Null distribution of the score: degrees of freedom m, and length L of the curve of steps on the unit sphere."""
+    """Distribution of the score of a step test in a healthy machine, i.e. without a step.
+
+    `dimensions`: degrees of freedom m; `length`: length L of the curve that the whitened steps over all onsets form
+    on the unit sphere (see the module).
+    """
 
     dimensions: float
     length: float
 
     def chance(self, score: float) -> float:
-        """Compute the probability that a coefficient without a step has a higher score (P of the module)."""
+        """Compute the probability P (see the module) that a coefficient without a step has a higher score."""
         from scipy.special import betainc
 
         m = self.dimensions
@@ -259,23 +279,32 @@ class NullLaw(NamedTuple):
 
 
 def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None) -> StepTest | None:
-    """Return the test with the highest score among `step_tests`; None if too few blocks have information.
+    """Test a coefficient for a step, a sudden lasting change, at an unknown onset.
 
-    With two signs the probability of a false alarm is twice the `chance` of the test.
+    `information`: likelihood of the coefficient in K blocks; `signs`: 1 to test for a step up, -1 for a step down;
+    `shape` (K,): change of the coefficient in each block by a unit step, by default 1. With two signs the test with
+    the higher score is returned, and the probability of a false alarm is twice its `chance`. Return None if too few
+    blocks have information.
     """
     return max(step_tests(information, signs, shape), key=lambda test: test.score, default=None)
 
 
 def step_tests(information: Information, signs: Sequence[float], shape: Array | None = None) -> list[StepTest]:
-    """Test for a step with each of the `signs`; return no test if too few blocks have information.
+    """Test a coefficient for a step up, a step down, or both, each at an unknown onset.
 
     Parameters
     ----------
     information : Information
+        Likelihood of the coefficient in K blocks.
     signs : sequence of float
         1 for steps up, -1 for steps down.
     shape : array of float, shape (K,), optional
-        Change of the coefficient in each block by a unit step, by default one.
+        Change of the coefficient in each block by a unit step, by default 1.
+
+    Returns
+    -------
+    list of StepTest
+        One for each sign; empty if too few blocks have information.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
@@ -286,7 +315,7 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
 
 
 class StepSizes(NamedTuple):
-    """Steps at given onsets (o,): log likelihood, size and its standard error."""
+    """Steps fitted at each of o onsets: log `likelihood`, `size` and its standard error `deviation`, (o,) each."""
 
     likelihood: Array
     size: Array
@@ -294,7 +323,7 @@ class StepSizes(NamedTuple):
 
 
 def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
-    """Fit an upward step of a coefficient at each onset, with the likeliest variance of its random walk.
+    """Estimate the size of a step up of a coefficient at each onset, with the likeliest variance of its random walk.
 
     Parameters
     ----------
@@ -305,7 +334,7 @@ def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array,
     shape : array of float, shape (K,)
         Change of the coefficient in each block by a unit step.
     growth : float
-        Relative growth of the step from its onset to the end.
+        Relative growth of the step from its onset to the end of the recording.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None
@@ -323,10 +352,11 @@ def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array,
 
 
 class _StepFits(NamedTuple):
-    """Least-squares fits of a step up at each of o onsets, for each of the w `WALKS`.
+    """Least-squares fits of a step up to whitened readings z (n,), for each of o onsets and w random walks.
 
-    `weight` (w, n): inverse variances of z, times that of the noise; `total` (w,): weighted sum of squares of z;
-    `moments`, `energies` (w, o): products of the steps with z and with themselves; `residual_squares` (w, o).
+    The walks have the variances `WALKS`. `weight` (w, n): variance of the noise over that of each z; `total` (w,):
+    weighted sum of squares of z; `moments` and `energies` (w, o): weighted products of the steps with z and with
+    themselves; `residual_squares` (w, o): weighted sum of squares after the fit.
     """
 
     weight: Array
@@ -336,7 +366,7 @@ class _StepFits(NamedTuple):
     residual_squares: Array
 
     def upside_down(self) -> _StepFits:
-        """Return the fits of a step up to the negative of z."""
+        """Return the fits to -z instead of z: a step up of -z is a step down of z."""
         return self._replace(
             moments=-self.moments, residual_squares=_residual_squares(self.total, -self.moments, self.energies)
         )
@@ -345,8 +375,8 @@ class _StepFits(NamedTuple):
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
 
-    `z` (n,): whitened readings; `steps` (n, o): unit steps, whitened likewise; `eigen` (n,): eigenvalues of the walk's
-    covariance (`_Whitened`). A negative step does not reduce the residual.
+    `z` (n,): whitened readings of the coefficient; `steps` (n, o): unit steps, whitened in the same way; `eigen`
+    (n,): eigenvalues of the walk's covariance (`_Whitened`). A step down does not reduce the residual.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -355,19 +385,20 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute the residual sums of squares (w, o) after the fit of a step up at each onset.
+    """Compute the residual sum of squares after the fit of a step up, for w random walks and o onsets, shape (w, o).
 
-    `total` (w,), `moments` and `energies` (w, o): see `_StepFits`.
+    `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
+    readings and with themselves.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
 class _Whitened(NamedTuple):
-    """Readings z (n,) of a coefficient without level and slope, in the eigenvectors of the walk.
+    """Readings z (n,) of a coefficient with unit noise, without level and slope, along the eigenvectors of the walk.
 
-    `transform` (n, K): from the coefficient in blocks to z; `eigen` (n,): eigenvalues of the walk's covariance, times
-    `unit`; `positions` (o,) of onsets in blocks, and their times `onsets` (o,) [s]; `walk_log_priors`: log prior of
-    each of `WALKS`.
+    `transform` (n, K): matrix from the coefficient in K blocks to z; `eigen` (n,): eigenvalues of the random walk's
+    covariance, times the scale `unit`; `positions` (o,): possible onsets, counted in blocks; `onsets` (o,): their
+    times [s]; `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
 
     z: Array
@@ -379,7 +410,11 @@ class _Whitened(NamedTuple):
     walk_log_priors: Array
 
     def step_shapes(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
-        """Build unit steps at positions (o,) over the blocks, (K, o), times a `shape` (K,)."""
+        """Compute the change of the coefficient in each of K blocks by a unit step at each of o onsets, shape (K, o).
+
+        `positions` (o,): onsets, counted in blocks from the start; `shape` (up to K,): factor on the step in each of
+        the last blocks, by default 1; `growth`: relative growth of the step from its onset to the end.
+        """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
         if shape is not None:
@@ -388,10 +423,11 @@ class _Whitened(NamedTuple):
 
 
 def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
-    """Build unit steps (K, o) over `count` = K blocks, with onsets at `positions` (o,) in blocks from the start.
+    """Compute the mean of a unit step in each of `count` = K blocks, for each of o onsets, shape (K, o).
 
-    The block of an onset contains the fraction of it after the onset. From there the step grows linearly, to
-    1 + `growth` at the end of the last block.
+    `positions` (o,): onsets, counted in blocks from the start. The block of the onset shows only the fraction of the
+    step after the onset. From the onset on the step grows linearly from 1 to 1 + `growth` at the end of the last
+    block.
     """
     end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # of each block
     steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
@@ -400,12 +436,12 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Matrices that whiten K blocks of a coefficient; they do not depend on the readings (`whiten`).
+    """Matrices that whiten the readings of a coefficient in K blocks; they depend on the precision only.
 
-    `transform` to `walk_log_priors`: as in `_Whitened`. `root` (r,) and `vectors` (K, r): square roots of the
-    eigenvalues of the precision that have information, and their eigenvectors; `complement` (n, r + s): directions
-    orthogonal to level and slope, with s = 1 reading for a prior on the slope, else 0; `basis` (n, n): eigenvectors of
-    the walk's covariance.
+    `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their
+    eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 if a prior on the
+    slope adds a reading, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. The other fields are
+    those of `_Whitened`.
     """
 
     root: Array
@@ -419,7 +455,10 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, time: Array, vector: Array) -> _Whitened:
-        """Whiten the readings of blocks: their middles `time` (K,) [s] and `vector` (K,)."""
+        """Transform the readings of a coefficient in K blocks to independent ones, without its level and slope.
+
+        `time` (K,): middles of the blocks [s]; `vector` (K,): precision times coefficient, as in `Information`.
+        """
         z = (self.vectors.T @ vector) / self.root
         z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # the prior on the slope is one more reading
         return _Whitened(
@@ -434,7 +473,10 @@ class _Whitening(NamedTuple):
 
 
 def _whiten_blocks(information: Information) -> _Whitened | None:
-    """Whiten the blocks of a coefficient and project out level and slope; None if too few blocks have information."""
+    """Transform the readings of a coefficient in blocks to independent ones (whitening), without its level and slope.
+
+    Return None if too few blocks have information, or if the precision is not finite.
+    """
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
@@ -447,15 +489,18 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
 
 @lru_cache(maxsize=16)
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the whitening of `count` blocks with independent readings of unit variance.
+    """Build the matrices that whiten `count` blocks with independent readings of unit variance; None if too few.
 
-    It is cached, as many tests share it.
+    `slope`, `walk`: scales of the priors, as in `Information`. The result is cached, since many tests share it.
     """
     return _build_whitening(np.eye(count), slope, walk)
 
 
 def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
-    """Build the whitening of blocks with a precision (K, K); None if too few have information."""
+    """Build the matrices that whiten K blocks with a given precision (K, K); None if too few have information.
+
+    `slope`, `walk`: scales of the priors on the linear change and on the random walk, as in `Information`.
+    """
     count = len(precision)
     # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information
     values, vectors = np.linalg.eigh(precision)
@@ -472,7 +517,7 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
     complement = np.linalg.qr(fixed, mode="complete")[0][:, 2:].T  # orthogonal to level and slope
     transform = complement @ design
     covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T  # of the walk: min(k, l)
-    # in this unit of its variance the walk changes z as much as the noise does, on average
+    # scale of the walk's variance at which walk and noise change z equally on average
     unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
     eigen, basis = np.linalg.eigh(unit * covariance)
     return _Whitening(
@@ -489,12 +534,19 @@ def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening 
 
 
 def two_sided_step_test(information: Information) -> StepTest | None:
-    """Return the test of a step up or that of a step down, whichever has the higher score (`step_test`)."""
+    """Test a coefficient for a step up or down at an unknown onset; None if too few blocks have information.
+
+    The direction with the higher score is returned, so the probability of a false alarm is twice the test's `chance`.
+    """
     return step_test(information, (1.0, -1.0))
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return time, precision and vector of the blocks, preceded by a block that stands for the prior on the level."""
+    """Return time, precision and vector of the blocks, with the prior on the level as an extra block.
+
+    The shapes are (K,), (K, K) and (K,). The extra block precedes the others, which makes K larger by one. Without
+    such a prior, or with fewer than `MIN_BLOCKS` blocks, there is none.
+    """
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector
@@ -514,10 +566,10 @@ def _onset_times(time: Array, positions: Array) -> Array:
 
 
 def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTest:
-    """Test whitened readings z (n,) for a step up at any of o onsets, by the likelihood ratio to no step.
+    """Test the readings of a coefficient for a step up at any of o onsets, by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps; `fits`: of z or its negative. Both likelihoods are maximised over the variances
-    of walk and noise, with the prior on the walk.
+    `steps` (n, o): whitened unit steps; `fits`: their fits to the readings z, or to -z to test for a step down. Both
+    likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit
     weight, total, moments, energies, residual_squares = fits

@@ -1,18 +1,19 @@
-"""Offset of the pressure difference that the sensors add, estimated from a change of the leakage and removed.
+"""Constant error of the recorded pressure difference, estimated from a change of the leakage and removed.
 
-Sensors with a constant error z turn a leak g (p_A - p_B) into g (d - z), d the recorded difference: a change of g then
-changes the flow's offset by -g z. Near z = 0 it is a term of every fit (`blocks`); an offset larger than the pressure
-difference itself is estimated here. In block k the Gram matrix determines two numbers: g_k, from how the flow depends
-on d within the block, and the flow's offset o_k at the block's mean difference d_k. With a step delta of the leak's
-coefficient at the onset s, a random walk w of unknown size q, and a drift of the flow's offset,
+With a constant error z of the sensors, the flow of a leak is g (d - z), where d is the recorded difference p_A - p_B.
+A change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here z is
+estimated even if it is larger than the pressure difference itself. In block k the Gram matrix determines two numbers:
+g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k. With
+a step delta of the leak's coefficient at the onset s, a random walk w of unknown size q, and a drift of the constant
+flow,
 
     g = F a + w + delta s,    o = (d_k - z) g + B b,    cov w = kappa q min(k, l);
 
-F (level and slope) and B (level, slope and curvature) are projected out. z maximises the restricted likelihood, over
-onsets and (q, kappa), times its prior: a normal density for good sensors, with small odds of a wide one. The walk may
-be no larger than that fitted without z; else z and a free walk would describe changes that no leak explains. If the
-leak does not change, there is no information on z; it stays near zero, and nothing depends on it. Behind a servo valve
-both chambers have the same leak, step and z: their whitened rows are stacked.
+F (level and slope) and B (level, slope and curvature) are projected out. z maximises its prior times the restricted
+likelihood, over onsets and (q, kappa). The prior is a normal density for good sensors, with small odds of a wide one.
+The walk may be no larger than the one fitted without z; otherwise z and a free walk would describe changes that no
+leak explains. If the leak does not change, there is no information on z. It then stays near zero, and no result
+depends on it. Behind a servo valve both chambers have the same leak, step and z, so their whitened rows are stacked.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
@@ -36,9 +37,11 @@ N_GRID = 21
 
 
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
-    """Subtract the most probable sensor offset of p_A - p_B from the blocks' sums (maximum a posteriori).
+    """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    Return the blocks unchanged if the balance has no flow offset, or too few blocks have information.
+    `columns`: roles of the columns in each equation. The offset is that of maximum a posteriori probability; it is
+    subtracted in the Gram matrices and added to `zero`. Return the blocks unchanged if the balance has no flow
+    offset, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -64,9 +67,9 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> float:
     """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
 
-    A unit step of the leak from block k on changes the whitened residuals `z` (n,) by column k of `leak_steps` (n, K),
-    less offset times column k of `offset_steps` (n, K). The search is over asinh of the offset, which is linear near
-    zero and logarithmic far off.
+    `z` (n,): whitened residuals. A unit step of the leak from block k on changes them by column k of `leak_steps`
+    (n, K), minus the offset times column k of `offset_steps` (n, K). The search is over asinh of the offset, which is
+    linear near zero and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
     # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains
@@ -87,9 +90,10 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
 
 
 class _WhitenedSteps(NamedTuple):
-    """Whitened residuals z (n,), and effects (n, K) on z of unit steps of leak and flow offset from each block on.
+    """Whitened residuals `z` (n,), and their changes by unit steps that begin with each of K blocks.
 
-    The effect of the leak's step includes the recorded mean pressure difference.
+    `leak` (n, K): changes by a step of the leak's coefficient, including the flow at the recorded mean pressure
+    difference; `flow_offset` (n, K): changes by a step of the constant flow.
     """
 
     leak: Array
@@ -98,11 +102,12 @@ class _WhitenedSteps(NamedTuple):
 
 
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
-    """Whiten the effects of steps of leak and flow offset; None if the blocks have too little information.
+    """Compute whitened residuals of leak and constant flow in blocks, and their changes by unit steps of both.
 
-    With the precision P of leak and flow offset in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit
-    noise, and `design` = P^(1/2) are the effects on them. The leak's level and slope and the quadratic drift of the
-    flow's offset (F and B of the module) are projected out.
+    `roles`: roles of the columns of the first equation. With the precision P of leak and constant flow in K blocks,
+    (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2) converts changes of the coefficients to
+    changes of z. The leak's level and slope and the quadratic drift of the constant flow (F and B of the module) are
+    projected out. Return None if the blocks have too little information.
     """
     count = len(blocks)
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)
@@ -129,11 +134,12 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
 
 
 def _walk_likelihoods(steps: Array, z: Array, walks: Array) -> Array:
-    """Compute the log likelihood of z (n,) for each variance q of the random walk.
+    """Compute the log likelihood (w,) of whitened residuals z (n,) for each of w variances q of the random walk.
 
-    The best step up and the variance kappa of the noise are fitted for each q. cov z = kappa (I + q S S'), S = `steps`
-    (n, K): a walk is a unit step of independent size in each block. Along the eigenvectors of S' S it is diagonal.
-    `walks`: values of q; a walk of q = 1 changes z as much as the noise does, on average.
+    For each q the best step up and the variance kappa of the noise are fitted. A walk consists of steps of
+    independent sizes in all blocks: cov z = kappa (I + q S S'), with S = `steps` (n, K), the changes of z by unit
+    steps. Along the eigenvectors of S' S it is diagonal. `walks` (w,): values of q, scaled so that a walk with q = 1
+    changes z as much as the noise does on average.
     """
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)

@@ -1,14 +1,15 @@
 """Two hypotheses on the valves while the pump rests: they connect it to the cylinder (open), or cut it off (shut).
 
-Open, leakage of pump and piston is in the balance at rest as in motion. Shut, leakage and flow offset of the pump
-count in motion only: at rest only the piston leaks. Both balances are linear in the same columns, so that one set
-of sums serves both. Let g be the leakage in motion and r at rest, coefficients of p_A - p_B, with the covariance of
-blocks whose errors differ. Open, r lies about g; shut and healthy, about zero,
+If they are open, the leakage of pump and piston is in the balance at rest as in motion. If they are shut, leakage and
+flow offset of the pump count in motion only: at rest only the piston leaks. Both balances are linear in the same
+columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B) in motion and r that at rest;
+their covariance allows for errors that differ from block to block. With open valves r scatters about g; with shut
+valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
-and the odds of the recordings of one machine multiply. A leaking piston moves r towards g, so that the
-healthy recordings decide.
+where V are the variances of the estimates, and s and w the relative scatters of the prior. The odds of the recordings
+of one machine multiply. Since a leaking piston moves r towards g, the healthy recordings decide.
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -27,10 +28,11 @@ from sealscope.recordings.recording import Array
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
-    """Reduce the Gram matrices of blocks to the balance for valves that are open, or `shut`, while the pump rests.
+    """Convert blocks to the balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: columns of `blocks`, with those of leak and flow offset at rest (`terms.with_rests`). Open, these two are
-    dropped; shut, they are combined with the others (`shut_at_rest_matrix`).
+    `roles`: columns of `blocks`, among them leakage and flow offset at rest (`terms.with_rests`). For open valves
+    these two columns are dropped from the Gram matrices; for shut valves they are combined with the others
+    (`shut_at_rest_matrix`).
     """
     if shut:
         transform = shut_at_rest_matrix(roles.names)
@@ -40,11 +42,12 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 
 
 def shut_at_rest_matrix(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) from a balance's m columns to the n columns for a pump cut off at rest.
+    """Build the matrix (m, n) that converts the m columns of a balance to the n columns for a pump cut off at rest.
 
-    With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`): the column of
-    the offset becomes bias - rest bias, that of the leak at rest becomes leak - rest leak, and the rest bias is left
-    out. `names` (m - 1,) of the columns; the last column is the left side.
+    With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`). The column of
+    the offset becomes the offset minus the offset at rest, that of the leak at rest becomes the leak minus the leak
+    at rest, and the offset at rest is dropped: n = m - 1. `names` (m - 1,): names of the columns without the left
+    side, which is the last column.
     """
     columns = []
     for k, name in enumerate((*names, "left")):
@@ -60,10 +63,11 @@ def shut_at_rest_matrix(names: Sequence[str]) -> Array:
 
 
 def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
-    """Repeat the leak's row and column in Gram matrices (E, m, m) of a recording without rests.
+    """Add the column for the leakage of the turning pump to Gram matrices (E, m, m) of a recording without rests.
 
-    The balance with the pump cut off at rest has one more column, the leakage of the turning pump. Without rests it
-    equals the leak's column. `names` (m - 1,) of the columns, without the left side; the result is (E, m + 1, m + 1).
+    The balance for a pump that is cut off at rest has this additional column (`terms.shut_at_rest`). In a recording
+    without rests it equals the leak's column, which is therefore repeated. `names` (m - 1,): names of the columns
+    without the left side. The result has the shape (E, m + 1, m + 1).
     """
     index = [*range(len(names) + 1)]
     index.insert(names.index(LEAK), names.index(LEAK))
@@ -71,13 +75,20 @@ def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Test whether the pump rests in any block; `roles`: columns of `blocks`, with those at rest (`apply_regime`)."""
+    """Return True if the pump or the piston rests in any block.
+
+    `roles`: columns of `blocks`, among them those at rest (`terms.with_rests`).
+    """
     bias = roles.names.index(REST_BIAS)
     return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)  # its column is zero in motion
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
-    """Compute the log odds that valves cut the pump off at rest, from blocks as in `apply_regime`; 0 if unknown."""
+    """Compute the log odds that valves cut the pump off from the cylinder while it rests.
+
+    `roles`: columns of `blocks`, among them those at rest (`terms.with_rests`). The odds are limited by `rest.most`
+    in `priors.toml`, and 0 if the recording says nothing about the valves.
+    """
     gram = blocks.gram[:, 0]
     at_rest, bias = (roles.names.index(name) for name in RESTS)
     if not has_rests(blocks, roles) or len(blocks) < 2:
@@ -96,9 +107,10 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 
 
 def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
-    """Compute the log odds that a quantity is zero at rest rather than equal to its value in `motion`.
+    """Compute the log odds that a leakage is about zero at rest rather than about equal to that in motion.
 
-    `value`, `variance`: the quantity at rest; `difference_variance`: that of `value` - `motion`.
+    `value`, `variance`: estimated leakage at rest and the variance of its error; `motion`: leakage in motion;
+    `difference_variance`: variance of the error of `value` - `motion`.
     """
     prior = INFERENCE.rest
     shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)
@@ -106,9 +118,10 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
 
 
 def _fit_with_robust_covariance(grams: Array, moments: Array) -> tuple[Array, Array]:
-    """Fit coefficients (c,) to the normal equations of K blocks; return them with White's covariance (c, c).
+    """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `grams` (K, c, c): products of the columns; `moments` (K, c): their products with the left side.
+    `grams` (K, c, c): sums of the products of the columns in each block; `moments` (K, c): sums of their products
+    with the left side.
     """
     total = grams.sum(axis=0)
     coefficients = solve(total, moments.sum(axis=0))
@@ -119,5 +132,5 @@ def _fit_with_robust_covariance(grams: Array, moments: Array) -> tuple[Array, Ar
 
 
 def _normal_log_density(value: float, variance: float) -> float:
-    """Compute the log density of a normal law of mean zero at `value`, up to a constant."""
+    """Compute the log density of a normal distribution with mean zero at `value`, up to a constant."""
     return -0.5 * value * value / variance - 0.5 * float(np.log(variance))

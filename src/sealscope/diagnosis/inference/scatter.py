@@ -1,26 +1,26 @@
-"""Rise of a recording's leakage beyond that of healthy recordings, whose scatter is estimated.
+"""Rise of a recording's leakage, i.e. the leakage above that of healthy recordings, whose scatter is estimated.
 
 The Gram matrices of the healthy recordings, without the flow's offset, are added up and give the coefficients of all
-terms. The residual of a recording under these coefficients, projected on the leak's column, is its rise; its other
-coefficients are free within a prior on the differences between recordings. The rise r_j of each healthy recording
-against the n - 1 others measures the scatter, with all that the model does not describe: y_j = r_j (n - 1)/n. For the
-judged recording y is its rise.
+terms of the balance. A recording's residual under these coefficients, projected on the leak's column, is its rise.
+Its other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy recording over
+the n - 1 others measures the scatter, including all effects that the model does not describe: y_j = r_j (n - 1)/n.
+For the judged recording y is its rise.
 
-The width of that prior is known to within a factor only: a machine held at one temperature repeats its coefficients to
-a thousandth, another changes by a tenth from run to run. Too narrow a prior makes rises scatter, too wide a one makes
-them imprecise; so y is computed for several widths, each weighted by its prior and by the likelihood of the healthy
-recordings, p(y_1 .. y_n).
+The width of that prior is known only to within a factor: one machine, held at one temperature, repeats its
+coefficients to a thousandth; another changes by a tenth from run to run. With too narrow a prior the rises scatter,
+with too wide a prior they are imprecise. Therefore y is computed for several widths, each weighted by its prior and
+by the likelihood of the healthy recordings, p(y_1 .. y_n).
 
-Leakage is proportional to the inverse of the oil's viscosity, so that levels are compared as logarithms where they
-are clearly above zero: z = asinh(a / 2 c) of the level a = mean level + y, with c from the errors of a. For each
-width all z are normal about an unknown mean, each with the variance sigma^2, plus one of several candidate covariances
-between them. sigma has a log-uniform prior from a recording's standard error to a tenth of the flow: five recordings
-that agree tell what two do not. Recordings of one session (by date; undated ones form one session) share oil and
-set-up: their deviation tau has a half-normal prior. If the oil's temperature T is known for all, z has a slope in T,
-with a prior, so that a recording with oil outside of the known range is less certain; otherwise the viscous pressure
-drop of the motion (`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect. Load and speed
-outside of the known range make a recording less certain, too. The rise follows the mixture over all of these. The
-priors are in `priors.toml`.
+Leakage is proportional to the inverse of the oil's viscosity. Levels that are clearly above zero are therefore
+compared as logarithms: z = asinh(a / 2 c) of the level a = mean level + y, with c from the errors of a. For each
+width all z are normal about an unknown mean. Their covariance is sigma^2 on the diagonal plus one of several
+candidates. sigma has a log-uniform prior from a recording's standard error to a tenth of the flow, so five recordings
+that agree allow a smaller sigma than two do. Recordings of one session share oil and set-up (sessions are told by
+date; undated recordings form one session): the deviation tau of a session has a half-normal prior. If the oil's
+temperature T is known for all recordings, z has a slope in T with a prior, and a recording with oil outside of the
+known range is less certain. Otherwise the viscous pressure drop of the motion (`changes.viscous_drop`) may show the
+oil's viscosity, or tau covers its effect. Load and speed outside of the known range also make a recording less
+certain. The rise follows the mixture over all of these. The priors are in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -58,21 +58,21 @@ MIN_WITH_HOLDS = 2
 MAX_LOG = 4.0
 #: Lower limit of divisors and of arguments of logarithms.
 TINY = 1e-300
-#: Normal laws that a law of z is split into, their relative width, limit of abs(z), and negligible log weight.
+#: Number of narrower normal laws that replace one of z, their relative width, limit of abs(z), negligible log weight.
 PARTS, PART_WIDTH, MAX_Z, NEGLIGIBLE = 7, 0.5, 30.0, 16.0
-#: Number of normal laws of a large mixture whose quantile begins the search for its own, and the step of their slope.
+#: Size of the sample of a large mixture's laws whose quantile starts the search, and step for the slope there.
 SAMPLED, SLOPE_STEP = 1000, 1e-3
 
 
 class Mixture(NamedTuple):
-    """Mixture of k normal laws: their `weights`, standard `deviations` and `centres`, (k,) each."""
+    """Mixture of k normal distributions: their `weights`, standard `deviations` and `centres`, (k,) each."""
 
     weights: Array
     deviations: Array
     centres: Array
 
     def quantile(self, probability: float) -> float:
-        """Return the value below which the mixture lies with a probability."""
+        """Compute the quantile of the mixture: the value below which it lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
@@ -97,9 +97,10 @@ class Mixture(NamedTuple):
 
 
 class Rise(NamedTuple):
-    """Rise of the leak's coefficient beyond the healthy recordings: estimate `value` and its standard `deviation`.
+    """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
 
-    In a healthy recording `value` has the distribution `mixture`, or without one that of `deviation` times Student's t.
+    `value`: the estimate; `deviation`: its standard deviation. In a healthy recording `value` has the distribution
+    `mixture`; if that is None, it is `deviation` times a Student's t variable of `degrees_of_freedom`.
     `may_be_partial`: the leak may have begun within the recording, whose mean then contains only a part of the rise.
     """
 
@@ -110,9 +111,10 @@ class Rise(NamedTuple):
     may_be_partial: bool = False
 
     def widen(self, variance: float) -> Rise:
-        """Add a variance to that of the rise and of each normal law of its mixture.
+        """Return the rise with an additional error of the given variance.
 
-        Return the rise unchanged if it has no mixture, or if the variance is not positive.
+        The variance is added to that of the rise and of each normal distribution of its mixture. The rise remains
+        unchanged if it has no mixture, or if the variance is not positive.
         """
         if self.mixture is None or not variance > 0.0:
             return self
@@ -121,12 +123,12 @@ class Rise(NamedTuple):
 
     @property
     def score(self) -> float:
-        """The rise over its standard deviation."""
+        """The estimated rise, `value`, divided by its standard deviation."""
         return self.value / self.deviation
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording has a higher score."""
+        """Probability that a healthy recording has a higher score (estimated rise over its standard deviation)."""
         from scipy.special import ndtr, stdtr
 
         if self.mixture is None:
@@ -135,7 +137,10 @@ class Rise(NamedTuple):
         return min(float(weights @ ndtr((centres - self.score * self.deviation) / deviations)), 1.0)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy recording exceeds with a given probability."""
+        """Compute the score that a healthy recording exceeds with the probability `chance`.
+
+        The score is the estimated rise of the leakage over its standard deviation.
+        """
         from scipy.special import stdtrit
 
         if self.mixture is None:
@@ -143,9 +148,10 @@ class Rise(NamedTuple):
         return self.mixture.quantile(1.0 - chance) / self.deviation
 
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
-        """Compute the log likelihood ratio of the estimated value: for a true rise of size `rise` against none.
+        """Compute the log likelihood ratio of a true rise of the leakage of size `rise` to no rise.
 
-        `log_deviation`: standard deviation of log(true rise) about log(`rise`); 0 if the rise is exact.
+        Both are compared with the estimate `value`, in whose unit `rise` is. `log_deviation`: standard deviation of
+        the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -154,16 +160,20 @@ class Rise(NamedTuple):
         return self._log_density(self.value - rise) - self._log_density(self.value)
 
     def _log_ratio_partial(self, rise: float) -> float:
-        """Compute `log_ratio` if the recording shows an unknown fraction of the rise, by averaging over fractions."""
+        """Compute the log likelihood ratio of a true rise to none, if the recording shows only a fraction of it.
+
+        `rise`: size of the true rise. The likelihood is averaged over fractions from 0 to 1.
+        """
         densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
-        if 0.0 < self.value < rise:  # the likeliest part, which the grid may miss
+        if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
             densities.append(self._log_density(0.0))
         return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
-        """Compute `log_ratio` with both densities limited from below to the density at the `tail` quantiles.
+        """Compute the log likelihood ratio of a true rise of size `rise` to no rise, robust to outlying estimates.
 
-        So a value that no healthy recording predicts is evidence neither for nor against a rise.
+        Neither density may fall below the density at the quantiles `tail` and 1 - `tail` of a healthy recording. Thus
+        an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
         """
         tail_rises = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(rise) for rise in tail_rises)
@@ -171,9 +181,11 @@ class Rise(NamedTuple):
         return log_densities[0] - log_densities[1]
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
-        """Compute `log_ratio` with the true rise integrated over a log-normal prior about `rise`.
+        """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
 
-        The grid resolves both the prior and the likelihood.
+        It is integrated over a grid of true rises.
+        `log_deviation`: standard deviation of the logarithm of the true rise. The grid resolves both the prior and
+        the likelihood.
         """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
@@ -188,10 +200,10 @@ class Rise(NamedTuple):
         return log_max + float(np.log(max(np.trapezoid(np.exp(logarithms - log_max), grid), TINY)))
 
     def _log_density(self, value: float) -> float:
-        """Compute the log density of a healthy recording's rise, up to a constant."""
+        """Compute the log density of the estimated rise of a healthy recording at `value`, up to a constant."""
         if self.mixture is None:
             z = value / self.deviation
-            if np.isinf(self.degrees_of_freedom):  # Student's law is the normal one
+            if np.isinf(self.degrees_of_freedom):  # Student's t is then normal
                 return -0.5 * z * z
             return float(-0.5 * (self.degrees_of_freedom + 1.0) * np.log1p(z * z / self.degrees_of_freedom))
         weights, deviations, centres = self.mixture
@@ -199,23 +211,27 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
     def bound(self, probability: float = 0.95) -> float:
-        """Return the upper bound of the rise for a probability; a negative estimate counts as zero."""
+        """Compute the upper bound of the true rise of the leakage for a probability, in the unit of the estimate.
+
+        A negative estimate counts as zero, so the bound is not below that of an estimate of zero.
+        """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the central interval of the rise for a probability."""
+        """Compute the central interval (low, high) that contains the true rise with a probability."""
         tail = 0.5 - 0.5 * probability
         high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
         return self.value - high, self.value - low
 
 
 class RecordingSums(NamedTuple):
-    """Sums over a recording of one machine, to be added to those of other recordings.
+    """Summary of one recording, for the comparison with other recordings of the same machine.
 
-    `sums` (E, m, m): Gram matrix of each equation over the variance of a row, the flow's offset eliminated; mean `flow`
-    of the pump [m^3/s] and `pressure` [Pa], both absolute; `start_s`: date [s since 1970];
-    `oil_degC`: temperature of the oil; `held`: leaks during holds (`locked_holds.HeldLeaks`); `viscous_drop`:
-    logarithm of the pressure drop over the speed, and its standard error. The last four are None if unknown.
+    `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the variance of a row, with the
+    flow's offset eliminated. `flow`: mean magnitude of the pump's flow [m^3/s]; `pressure`: mean magnitude of p_A -
+    p_B [Pa]. The others are None if unknown: `start_s`, date [s since 1970]; `oil_degC`, temperature of the oil;
+    `held` (6,), leaks during holds with shut valves, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of
+    the pressure drop due to motion over the speed, and its standard error.
     """
 
     sums: Array
@@ -234,7 +250,10 @@ class RecordingSums(NamedTuple):
         start_s: float | None = None,
         oil_degC: float | None = None,
     ) -> RecordingSums:
-        """Add up the Gram matrices of a recording's blocks, and average flow and pressure."""
+        """Summarise a recording from its `blocks`: add up the Gram matrices, and average flow and pressure.
+
+        `columns`: roles of the columns in each equation; `start_s` and `oil_degC` are stored as they are.
+        """
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (
             float(np.average(values, weights=weights)) for values in (blocks.flow, blocks.mean_pressure())
@@ -243,21 +262,22 @@ class RecordingSums(NamedTuple):
 
 
 def _conductance_of_flow(recording: RecordingSums) -> float:
-    """Return the conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 without pressure."""
+    """Compute the conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 without pressure."""
     return recording.flow / recording.pressure if recording.pressure > 0.0 else 0.0
 
 
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
-    """Estimate the rise of a recording's leak coefficient beyond healthy recordings of the same machine.
+    """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `columns`: of each equation, the same for all recordings.
+    `judged`: the recording; `baseline`: the healthy ones; `columns`: roles of the columns in each equation, the same
+    for all recordings. The rise is in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa).
     """
     healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
     prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
     exponents = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
     widths = prior.between**exponents
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
-    if count > 1:  # of each healthy recording over the others, scaled to one over the mean of all
+    if count > 1:  # of each healthy recording over the others, scaled to its rise over the mean of all
         projections = [
             _project_on_leak(recording.sums, healthy_sums - recording.sums, columns, widths) for recording in baseline
         ]
@@ -272,10 +292,11 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the piston's leakage from holds with shut valves.
+    """Estimate the rise of the leakage past the piston over healthy recordings, from holds with shut valves.
 
-    The leak may have begun within the recording, whose mean then contains only a part of it. Return None if too few
-    recordings have holds.
+    `judged`: the recording; `baseline`: the healthy ones. The leak may have begun within the recording, whose mean
+    then contains only a part of it. Return None if the judged recording has no holds, or fewer than `MIN_WITH_HOLDS`
+    healthy ones have any.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
@@ -300,10 +321,11 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
 
 
 class _Estimates(NamedTuple):
-    """Rises estimated with s widths of the prior: `values` (s,) of the judged, `rises` (s, n) of healthy recordings.
+    """Rises of the leak coefficient, each estimated with s widths of the prior on differences between recordings.
 
-    `errors` (s,): standard error of a rise; `level`: mean coefficient of the healthy recordings, with its error;
-    `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero.
+    `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
+    `errors` (s,): standard error of one rise; `level`: mean coefficient of the healthy recordings; `level_error`: its
+    standard error; `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero.
     """
 
     values: Array
@@ -315,10 +337,10 @@ class _Estimates(NamedTuple):
 
 
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
-    """Estimate the rise of the judged recording's level beyond the level that the healthy recordings predict for it.
+    """Estimate by how much the judged leak coefficient exceeds the one that the healthy recordings predict.
 
-    z = asinh(level / 2 c) (`_LevelScale`) is normal about an unknown mean, with an unknown scatter sigma of each
-    recording and the covariances of sessions, oil and unusual conditions.
+    z = asinh(level / 2 c) of a leak coefficient `level` (`_LevelScale`) is normal about an unknown mean. Each
+    recording has an unknown scatter sigma; sessions, oil and unusual conditions add covariances (see the module).
     """
     values, rises, errors, level, level_error, min_crossover = estimates
     prior = INFERENCE.scatter
@@ -363,11 +385,25 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
 def _candidate_covariances(
     sessions: Sequence[int], oil: _Oil, relative_slope: float, *, session_deviation: float, condition_deviation: float
 ) -> tuple[Array, Array]:
-    """Build candidate covariances of z between recordings, with their log priors.
+    """Build the candidate covariances of z between recordings, and the log prior of each.
 
-    Shapes (g, n + 1, n + 1) and (g,); the judged recording is the last. `relative_slope`: dz over a relative change of
-    the level. Standard deviations of z: `session_deviation`, between sessions by the prior; `condition_deviation`, of
-    the judged recording by its unusual load and speed.
+    Parameters
+    ----------
+    sessions : sequence of int, length n + 1
+        Session number of each recording, the judged one last.
+    oil : _Oil
+        Hypothesis on the oil of the recordings.
+    relative_slope : float
+        Change of z per relative change of the leak coefficient.
+    session_deviation : float
+        Prior standard deviation of z between sessions with the same oil.
+    condition_deviation : float
+        Standard deviation of the judged z due to unusual load and speed.
+
+    Returns
+    -------
+    covariances : array of float, shape (g, n + 1, n + 1)
+    log_priors : array of float, shape (g,)
     """
     # grid of the deviation between sessions over its prior, denser near zero; half-normal prior, times the spacing
     ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
@@ -376,13 +412,13 @@ def _candidate_covariances(
         ratios, log_priors = np.zeros(1), np.zeros(1)
     by_unknown_oil = relative_slope * oil.session_deviation
     session_variances = (np.hypot(by_unknown_oil, session_deviation) * ratios) ** 2
-    # recordings of one session share its deviation; the oil's known effect has an error of its slope and of each value
+    # recordings of one session share its deviation; the predicted effect of the oil has errors of slope and value
     covariances = session_variances[:, None, None] * np.equal.outer(np.array(sessions), np.array(sessions))
     covariances = covariances + np.outer(oil.thinning, oil.thinning) * (relative_slope * oil.slope_deviation) ** 2
     covariances += np.diag(relative_slope**2 * oil.variances)
     covariances[:, -1, -1] += condition_deviation**2
     if by_unknown_oil > 0.0 and sessions[-1] not in sessions[:-1]:
-        # the judged recording's day has oil like that of the known days, or unlike it
+        # the oil of the judged recording's day is like that of the known days, or unlike it
         unlike = INFERENCE.scatter.unlike
         log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
         covariances = np.tile(covariances, (2, 1, 1))
@@ -391,27 +427,31 @@ def _candidate_covariances(
 
 
 class _LevelScale(NamedTuple):
-    """Transform z = asinh(a / 2 c) of levels a of a coefficient: logarithmic far above c, linear far below.
+    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic far above c, linear far below.
 
-    `level`: mean of the healthy recordings; `crossover`: c.
+    `level`: mean coefficient of the healthy recordings; `crossover`: c. Both are in the unit of the coefficient.
     """
 
     level: float
     crossover: float
 
     def transform(self, excess: Array) -> Array:
-        """Compute z of levels that exceed the healthy recordings' mean, `level`, by `excess`."""
+        """Compute z = asinh(a / 2 c) of leak coefficients a = `level` + `excess`, of any shape.
+
+        `level` is the mean coefficient of the healthy recordings.
+        """
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
-        """Compute the derivative dz/da at the level a = `level`."""
+        """Compute the derivative dz/da of the transform z = asinh(a / 2 c) at a leak coefficient a = `level`."""
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
-        """Convert a mixture of normal laws of z to one of levels, relative to the healthy recordings' mean `level`.
+        """Convert a distribution of z to that of the leak coefficient, relative to the healthy mean `level`.
 
-        `predicted`: (s, ...) with log weights and centres relative to `transformed` (s,), the judged z. Each normal law
-        is split into `PARTS` narrower ones, along a new last axis, within which the level is nearly linear in z.
+        `predicted`: mixture of normal distributions of z, shape (s, g, nodes), whose weights are logarithms and whose
+        centres are relative to `transformed` (s,), the z of the judged recording. Each normal distribution is split
+        into `PARTS` narrower ones, along a new last axis, within which the coefficient is nearly linear in z.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
         centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
@@ -424,7 +464,11 @@ class _LevelScale(NamedTuple):
 
 
 def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
-    """Estimate the rise of judged levels `values` (s,) over the healthy ones `predicted` (s, ...), with log weights."""
+    """Estimate the rise of a judged value over the value that healthy recordings predict for it.
+
+    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of shape (s, ...), whose weights
+    are logarithms.
+    """
     offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
     logs, deviations, centres = (
         part.ravel() for part in (predicted.weights, predicted.deviations, predicted.centres - offset)
@@ -437,10 +481,11 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
 
 
 class UnusualCondition(NamedTuple):
-    """Condition of a recording outside of the range `low` to `high` of the healthy ones.
+    """Operating condition of a recording that lies outside of the range `low` to `high` of the healthy recordings.
 
-    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `log_excess`: log
-    ratio of load or speed to the end of the range, 0 for oil, whose slope has an uncertainty that covers it.
+    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: that of
+    the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0 for oil, since the
+    uncertain slope in temperature already covers it.
     """
 
     name: str
@@ -451,7 +496,11 @@ class UnusualCondition(NamedTuple):
 
 
 def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
-    """Find the conditions (load, speed, oil) of a recording outside of the range of the healthy ones."""
+    """List the conditions (load, speed, oil temperature) of a recording that no healthy recording has covered.
+
+    A condition counts once it lies outside of the healthy range by more than a tolerance (`conditions` in
+    `priors.toml`).
+    """
     allowed, unusual = INFERENCE.conditions, list[UnusualCondition]()
     loads_and_speeds = (
         ("load", judged.pressure, [healthy.pressure for healthy in baseline]),
@@ -473,9 +522,10 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 
 
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
-    """Compute the deviation (n,) of each recording's leak coefficient from the mean of all n.
+    """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    That is (n - 1)/n of its rise beyond the other n - 1; other coefficients differ by their usual prior.
+    It is (n - 1)/n of the amount by which the coefficient exceeds that of the other n - 1 recordings. The other
+    coefficients may differ between recordings within their usual prior.
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)
@@ -486,19 +536,20 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
 
 
 class Population:
-    """Normal values about an unknown mean, the last of them judged.
+    """Joint normal distribution of n healthy values and a judged one about an unknown common mean.
 
     Parameters
     ----------
     candidates : array of float, shape (g, n + 1, n + 1)
-        Candidate covariances between the values, in addition to the variance sigma^2 of each; n may be 0.
+        Candidate covariances between the values, the judged one last. They are in addition to the variance sigma^2 of
+        each value; n may be 0.
     log_priors : array of float, shape (g,)
-        Log prior of each candidate.
+        Log prior probability of each candidate.
     """
 
     def __init__(self, candidates: Array, log_priors: Array) -> None:
         n = candidates.shape[1] - 1
-        # evenly spaced healthy values, which limits the time; covariances along the eigenvectors of theirs
+        # a sample of the healthy values, which limits the time; covariances along the eigenvectors of the sample's
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
@@ -508,11 +559,22 @@ class Population:
         self._judged_variance, self._log_priors = candidates[:, n, n, None], log_priors[:, None]
 
     def rise(self, values: Array, healthy_values: Array, prior_sigma: float, freedom: float) -> Rise:
-        """Estimate the rise of the judged value beyond its prediction from the healthy ones, of unknown scatter sigma.
+        """Estimate by how much the judged value exceeds its prediction from the healthy values, of unknown scatter.
 
-        `values` (s,) and `healthy_values` (s, n): the same quantity estimated in s ways, weighted by the likelihood of
-        the healthy ones. sigma^2 has a scaled inverse chi-squared prior with scale `prior_sigma`^2 and `freedom`
-        degrees of freedom.
+        Parameters
+        ----------
+        values : array of float, shape (s,)
+            The judged value by s alternative estimates, which are weighted by the likelihood of the healthy values.
+        healthy_values : array of float, shape (s, n)
+            The healthy values by the same estimates.
+        prior_sigma, freedom : float
+            Scale and degrees of freedom of the prior on the scatter sigma of the values: sigma^2 has a scaled inverse
+            chi-squared prior with scale `prior_sigma`^2.
+
+        Returns
+        -------
+        Rise
+            In the unit of the values; with an infinite deviation if the squares would overflow.
         """
         count = len(self._sample)
         healthy = healthy_values[:, self._sample]
@@ -536,13 +598,29 @@ class Population:
         log_priors: Array,
         sigma_log_prior: Array | float = 0.0,
     ) -> Mixture:
-        """Predict the judged value from the healthy ones by kriging, as a mixture of normal laws.
+        """Predict the judged value from the healthy ones by kriging, as a mixture of normal distributions.
 
-        `values` (s,): the judged value by s alternative estimates, which have log priors `log_priors` (s,);
-        `healthy_values` (s, n): the values x of the healthy recordings by the same; `sigma` (s, nodes): log-spaced grid
-        of the scatter, with log prior densities `sigma_log_prior` (s, nodes). Returns log weights, deviations and
-        centres (s, g, nodes) for g candidate covariances, the centres relative to `values`. The prediction is
-        m + c' V^-1 (x - m): V covariance of x, c that of x with the judged value, m the generalised least-squares mean.
+        The prediction is m + c' V^-1 (x - m) for the healthy values x: V is their covariance, c their covariance with
+        the judged value, and m the generalised least-squares mean.
+
+        Parameters
+        ----------
+        values : array of float, shape (s,)
+            The judged value by s alternative estimates.
+        healthy_values : array of float, shape (s, n)
+            The healthy values x by the same estimates.
+        sigma : array of float, shape (s, nodes)
+            Log-spaced grid of the scatter of the values.
+        log_priors : array of float, shape (s,)
+            Log prior of each alternative estimate.
+        sigma_log_prior : array of float, shape (s, nodes), or float
+            Log prior density of log sigma at the grid points.
+
+        Returns
+        -------
+        Mixture
+            Log weights, deviations and centres of shape (s, g, nodes), for g candidate covariances. The centres are
+            relative to `values`.
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -566,18 +644,23 @@ class Population:
 
 
 def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
-    """Return the session number of each recording, -1 if undated; a gap above `pause` [s] separates sessions."""
+    """Assign each recording to a session: a gap above `pause` [s] between two dates begins a new one.
+
+    `starts` (n,): dates of the recordings [s since 1970], None if unknown. Return the session number of each
+    recording, from 1 on in the order of the dates; -1 if it is undated.
+    """
     dates = sorted(start for start in starts if start is not None)
     session_starts = [date for before, date in zip([-np.inf, *dates], dates, strict=False) if date - before > pause]
     return [-1 if start is None else int(np.searchsorted(session_starts, start, "right")) for start in starts]
 
 
 class _Oil(NamedTuple):
-    """Hypothesis on the oil of n + 1 recordings, the judged one last: its effect on the logarithm of their leakage.
+    """Hypothesis on how the oil's viscosity changed the leakage of n + 1 recordings, the judged one last.
 
-    `thinning` (n + 1,): predicted logarithm relative to the mean of all but the last, proportional to a slope with a
-    relative `slope_deviation`; `variances` (n + 1,) of each prediction; `session_deviation`: standard deviation between
-    sessions.
+    `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings. It is
+    proportional to an uncertain slope with the relative standard deviation `slope_deviation`. `variances` (n + 1,):
+    of the further error of each prediction; `session_deviation`: standard deviation of the logarithm between
+    sessions, 0 if the oil is known; `log_probability`: log prior probability of the hypothesis.
     """
 
     thinning: Array
@@ -588,14 +671,19 @@ class _Oil(NamedTuple):
 
 
 def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
-    """List the hypotheses on the oil's effect: by its temperature, else by the viscous pressure drop, or unknown."""
+    """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last.
+
+    If all recordings have an oil temperature, it predicts the effect. Otherwise there are two hypotheses if all have
+    a viscous pressure drop: the drop shows the viscosity, or the oil is unknown. Without the drop only the latter
+    remains.
+    """
     prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
     temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
     if len(temperatures) == len(recordings):
         warmer = np.array(temperatures) - np.mean(temperatures[:-1])
         slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
         return [_Oil(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
-    # the difference of two sessions has a standard deviation of half the range, each session sqrt(1/2) of that
+    # half the range is the standard deviation of the difference of two sessions; that of one is smaller by sqrt(2)
     unknown = _Oil(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
     drops = [recording.viscous_drop for recording in recordings if recording.viscous_drop is not None]
     if len(drops) < len(recordings):
@@ -613,9 +701,10 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
 
 
 def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
-    """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices (E, m, m).
+    """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
-    The other coefficients are eliminated from each equation (Schur complement), and the equations added up.
+    The other coefficients are eliminated from each equation (Schur complement), and the equations are added up. Both
+    results are 0 if the matrices have no information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -628,13 +717,15 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Compute the log ratio of the flow explained by motion to that of healthy recordings, with its error.
+    """Compare the flow that the piston's motion takes with that of healthy recordings.
+
+    Returns the logarithm of the ratio of the two flows, and its standard error from the recording alone. The ratio
+    differs from 1 if area over displacement changed: another machine, or another scale of a sensor.
 
     `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones. The flow is the sum
     of the coefficients of motion, weighted by the energies of their columns in the recording. The leak is fitted
-    together with the motion, which otherwise takes the part that leaks in proportion to the speed; the other
-    coefficients differ from the healthy ones by a normal prior (`between`). The ratio differs from 1 if area over
-    displacement changed: another machine, or another scale. The standard error is that of the recording alone.
+    together with the motion, which would otherwise absorb leakage in proportion to the speed. The other coefficients
+    differ from the healthy ones by a normal prior (`between` in `priors.toml`).
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -652,9 +743,10 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
-    """Make a rise of the size `value` with Student's t as its law, by the scatter of n healthy recordings.
+    """Make a rise of size `value` whose error follows Student's t, scaled by the scatter of n healthy recordings.
 
-    `deviations` (n,): of each healthy recording from the mean of the others; `prior_scatter`: prior standard deviation.
+    `deviations` (n,): deviation of each healthy recording from the mean of the others; `prior_scatter`: prior
+    standard deviation of a recording. All are in the unit of `value`.
     """
     prior, count = INFERENCE.scatter, len(deviations)
     sum_of_squares = prior.freedom * prior_scatter * prior_scatter
@@ -666,9 +758,10 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
 
 
 def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
-    """Eliminate the coefficients without a prior across recordings, such as the flow's offset (Schur complement).
+    """Eliminate the coefficients that recordings do not share, such as the flow's offset, from their equations.
 
-    `gram` (E, m, m); in the result their rows and columns are zero.
+    `gram` (E, m, m): Gram matrices. They are those with an infinite prior deviation between recordings. The result is
+    the Schur complement of the same shape, in which their rows and columns are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -680,10 +773,11 @@ def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
 
 
 class LawFit(NamedTuple):
-    """Fit of a rise by an orifice's law instead of the laminar one.
+    """Comparison of an orifice's law with the laminar law, for leakage above that of healthy recordings.
 
-    `regression` of its flow on p_A - p_B [Pa^-0.5], all else eliminated; `log_ratio`: log likelihood ratio to the
-    laminar law per independent reading, from the residual sums of squares.
+    `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all
+    other terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak per independent
+    reading, from the residual sums of squares.
     """
 
     regression: float
@@ -693,10 +787,11 @@ class LawFit(NamedTuple):
 def compare_laws(
     judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
 ) -> LawFit | None:
-    """Fit a recording's residual by a leak through an orifice and by a laminar one, and compare the fits.
+    """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
-    The residual is that under the coefficients of the healthy recordings, `baseline`. Return None if the balance has no
-    column of an orifice, or the recording has no information on one of the two leaks.
+    Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
+    `baseline`. `columns`: roles of the columns in each equation. Return None if the balance has no column of an
+    orifice, or the recording has no information on one of the two leaks.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -720,11 +815,12 @@ def compare_laws(
 def compare_with_leak(
     judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles], rival: str
 ) -> float | None:
-    """Compute the log likelihood ratio of a rise of the column `rival` to a rise of the leak.
+    """Compare how well the leak and another term of the balance, `rival`, explain a recording's excess flow.
 
-    The ratio is that of one independent reading, from the residual sums of squares. With the rival, the leak may differ
-    as it does between healthy recordings. Return None if the balance has no such column, or the recording has no
-    information on the leak or on the rival.
+    Returns the log likelihood ratio of the rival to the leak, for one independent reading, from the residual sums of
+    squares under the coefficients of the healthy recordings, `baseline`. While the rival (for example an external
+    leak) is fitted, the leak may differ as it does between healthy recordings. Return None if the balance has no
+    column of that name, or the recording has no information on the leak or on the rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None
@@ -748,10 +844,11 @@ def compare_with_leak(
 
 
 class _Residual(NamedTuple):
-    """Residual of a recording under the coefficients of healthy recordings.
+    """Residual of a recording's balance under the coefficients of healthy recordings.
 
-    `products` (m,): with all columns, with itself last; `nuisance`: indices of the c columns whose coefficients may
-    differ between recordings; `prior_precision` (c,) of their differences.
+    `products` (m,): scalar products of the residual with each column, and last with itself; `nuisance`: indices of
+    the c columns whose coefficients may differ between recordings; `prior_precision` (c,): precisions of the priors
+    on these differences.
     """
 
     products: Array
@@ -760,10 +857,11 @@ class _Residual(NamedTuple):
 
 
 def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> _Residual:
-    """Compute the products of each column with a recording's residual under the coefficients of others.
+    """Compute the residual of a recording under the coefficients fitted to other recordings (`_Residual`).
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the others, whose `compared` coefficients are
-    used. All but the leak's may differ by a prior (`nuisance`); with `has_leak` the leak's may, too, by `between.pump`.
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others. The coefficients of
+    `roles.compared` may differ from those of the others within a prior, except for the leak's. With `has_leak` the
+    leak's may differ, too, by the prior `between.pump`.
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -782,10 +880,12 @@ def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has
 def _project_on_leak(
     gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
 ) -> tuple[Array, Array]:
-    """Estimate the rise (s,) of a recording's leak coefficient beyond that of `reference`, and its errors (s,).
+    """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
 
-    `gram`, `reference` (E, m, m). The other coefficients differ by a normal prior, scaled with each of `widths` (s,),
-    and are eliminated (Schur complement): rise = moment / precision, summed over the equations.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the others, for each equation. The
+    other coefficients differ by a normal prior, scaled by each of `widths` (s,), and are eliminated (Schur
+    complement): rise = moment / precision, both summed over the equations. Both results have the shape (s,) and are 0
+    where there is no information.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):

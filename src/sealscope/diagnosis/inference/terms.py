@@ -1,17 +1,20 @@
-"""The terms of a machine's volume balance, as rows of data.
+"""The terms of a machine's volume balance, computed from recorded channels.
 
-A balance is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
+A balance states where the volume of oil goes that the pump delivers: into motion of the piston, compression, air and
+leakage. It is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
 
     D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
 
 with the pump's displacement D [m^3/rad], the leakage conductance G [m^3/(s Pa)] and a coefficient c_j for each term;
-f_j and g_j are functions of the recorded channels. A term gives its increment f_j dg_j over each sampling interval, so
-that nothing is differentiated (`weak_form`). Behind a servo valve each chamber has a balance of its own: its left side
-is the volume displaced by the piston, its terms are the orifice flows of the valve's edges; G is the same in both.
+f_j and g_j are functions of the recorded channels. A term computes its increment f_j dg_j over each sampling
+interval, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance: its left side
+is the volume displaced by the piston, its terms are the orifice flows of the valve's metering edges; G is the same in
+both.
 
 The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
-Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the edges).
+Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of the
+edges).
 """
 
 from __future__ import annotations
@@ -36,23 +39,25 @@ if TYPE_CHECKING:
 MIN_ABSOLUTE_PRESSURE: float = INFERENCE.pressure.least
 #: Half the time of the central difference for speed and direction [s]: a few encoder counts at slow motion.
 HALF_DIFFERENCE = 0.025
-#: Averaging time of the speeds by which rests are found, and minimum length of a rest [s].
+#: Averaging time of the speeds from which rests (standstills) are found, and minimum length of a rest [s].
 AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
 
 
 class RestLimits(NamedTuple):
-    """Maximum mean rates at rest: of the `pump`'s volume [m^3/s] and of the `piston` [m/s]."""
+    """Speeds below which a machine counts as resting: flow of the `pump` [m^3/s] and speed of the `piston` [m/s]."""
 
     pump: float
     piston: float
 
 
 class Signals:
-    """Samples of the channels that terms read, and signals derived from them, each computed once.
+    """Samples of recorded channels, and signals derived from them, each computed once.
 
-    `channels` (n,) in SI units; `to_absolute`: absolute minus gauge pressure [Pa] by the channel's name, by default the
-    atmosphere; `offset`: sensor offset that is subtracted from p_A - p_B [Pa]; `rest_limits`: None to find no rests.
-    `step(name)` returns the increments of a channel, and `mean(name)` the means of neighbouring samples, (n - 1,).
+    `channels`: samples (n,) of each channel by name, in SI units; `rate`: sampling rate [Hz]; `to_absolute`: absolute
+    minus gauge pressure [Pa] by the name of the channel, by default the atmosphere; `offset`: sensor offset that is
+    subtracted from p_A - p_B [Pa]; `rest_limits`: speeds below which the machine rests, None to find no rests.
+    `step(name)` returns the increments of a channel between samples, and `mean(name)` the means of neighbouring
+    samples, (n - 1,) each.
     """
 
     def __init__(
@@ -87,17 +92,17 @@ class Signals:
 
     @cached_property
     def pressure_difference(self) -> Array:
-        """p_A - p_B [Pa] in the middle of each interval, sensor offset removed."""
+        """p_A - p_B [Pa] in the middle of each sampling interval, without the sensor offset, shape (n - 1,)."""
         return self.mean("p_A") - self.mean("p_B") - self._offset
 
     @property
     def pressure_root(self) -> Array:
-        """sign(dp) sqrt(abs(dp)) of `pressure_difference` dp [Pa^0.5]."""
+        """sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure difference dp = p_A - p_B, shape (n - 1,)."""
         return _signed_root(self.pressure_difference)
 
     @cached_property
     def port_difference(self) -> Array:
-        """p_1 - p_2 [Pa] in the middle of each interval."""
+        """p_1 - p_2 [Pa], between the pump's or the valve's ports, in the middle of each interval, shape (n - 1,)."""
         return self.mean("p_1") - self.mean("p_2")
 
     @cached_property
@@ -110,7 +115,7 @@ class Signals:
 
     @cached_property
     def speed(self) -> Array:
-        """Speed of the piston [m/s] at each sample, by a central difference."""
+        """Speed of the piston [m/s] at each sample, by a central difference of the position."""
         half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
         x = self._channels["x"]
         padded = np.concatenate([x[:1].repeat(half_width), x, x[-1:].repeat(half_width)])
@@ -118,13 +123,14 @@ class Signals:
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """1 if side A carries the load (p_A > p_B), else 0, at each sample."""
+        """Flag of each sample: 1 if side A carries the load (p_A > p_B without the sensor offset), else 0."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
-        """Return the increments of x [m] in one direction of motion while one side has the higher pressure.
+        """Return the increments of the position x [m] in one direction while one side has the higher pressure.
 
-        Standstill counts as outward motion.
+        `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true while p_A > p_B.
+        In all other intervals the increments (n - 1,) are 0, or halved at a change between two samples.
         """
         is_counted = (self._is_outward == outward) & (self.carried_by_A == by_A)
         return _interval_means(is_counted.astype(float)) * self.step("x")
@@ -135,9 +141,10 @@ class Signals:
         return np.asarray(self.speed >= 0.0)
 
     def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag the sampling intervals (n - 1,) in which the piston or the pump stands still, by 1 or 0.
+        """Compute a flag of each sampling interval, shape (n - 1,): 1 if the piston or the pump stands still, else 0.
 
-        `pump_volume` computes the increments of the pump's volume. Without `rest_limits` all flags are 0.
+        `pump_volume` computes the increments of the pump's volume [m^3] from these signals. Without `rest_limits` all
+        flags are 0.
         """
         limits = self._rest_limits
         if limits is None:
@@ -149,9 +156,10 @@ class Signals:
 
 
 def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_]:
-    """Flag the sampling intervals at rest: the mean rate over `AVERAGING_TIME` is below `limit` for `MIN_REST` or more.
+    """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `MIN_REST`.
 
-    `increments` (n,) of the pump's volume or of x; missing samples are no rests.
+    `increments` (n,): increments of the pump's volume [m^3] or of the position [m]; `rate`: sampling rate [Hz];
+    `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Missing samples (NaN) are not at rest.
     """
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
     if len(increments) < window + min_length:
@@ -160,14 +168,17 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     sums, n_missing = (
         np.concatenate([[0], np.cumsum(values)]) for values in (np.where(is_known, increments, 0.0), ~is_known)
     )
-    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate  # for the window from each sample on
+    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate  # in the window that begins at a sample
     is_slow &= n_missing[window:] == n_missing[:-window]
     n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
     return _extend_flags(n_moving[min_length:] == n_moving[:-min_length], min_length)
 
 
 def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Flag the `length` samples from each flagged start (n,) on, shape (n + length - 1,)."""
+    """Flag each run of `length` samples that begins at a flagged sample of `starts` (n,).
+
+    The result has the shape (n + length - 1,).
+    """
     changes = np.zeros(len(starts) + length, dtype=int)  # of the number of runs that cover a sample
     changes[: len(starts)] += starts
     changes[length:] -= starts
@@ -175,14 +186,14 @@ def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
 
 
 def _interval_means(values: Array) -> Array:
-    """Average neighbouring samples (n,): the values in the middle of each interval, (n - 1,)."""
+    """Compute the means of neighbouring samples (n,), i.e. the values in the middle of each interval, (n - 1,)."""
     means = values[1:] + values[:-1]
     means *= 0.5
     return means
 
 
 def _signed_root(values: Array) -> Array:
-    """Compute the root of the magnitude, with the sign of the value."""
+    """Compute sign(v) sqrt(abs(v)) of each value v."""
     return np.asarray(np.sign(values) * np.sqrt(np.abs(values)))
 
 
@@ -191,12 +202,26 @@ Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "p
 
 
 class Term(NamedTuple):
-    """A term of a balance.
+    """A term of a volume balance: an unknown coefficient times a function of recorded channels.
 
-    `unit` of the coefficient: m^3 over that of the increments; `increments` computes f dg over each sampling interval,
-    shape (n - 1,); `cause`: meaning of a step of the coefficient; `drift`: the entry of `priors.toml` with the prior on
-    the coefficient, or "" if it is zero unless that cause is present; `needs`: channels; `driver` of the flow: a
-    "pressure" or its "root", so that sensor offsets affect it, or "".
+    Parameters
+    ----------
+    name : str
+        Name of the term, for example "compliance A".
+    unit : str
+        Unit of the coefficient: m^3 over the unit of the increments.
+    increments : callable
+        Computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,).
+    cause : str
+        What a sudden change of the coefficient means, for example "external leak".
+    drift : str
+        Entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless `cause`
+        is present.
+    needs : tuple of str
+        Channels from which the increments are computed.
+    driver : str
+        "pressure" or "root" if the flow is driven by a pressure or by its root, so that sensor offsets affect it;
+        else "".
     """
 
     name: str
@@ -209,21 +234,33 @@ class Term(NamedTuple):
 
     @property
     def nuisance(self) -> bool:
-        """True if the coefficient is unknown within a recording of any machine."""
+        """True if the coefficient is fitted in any recording, since its size is unknown even in a healthy machine."""
         return bool(self.drift) and not self.compared
 
     @property
     def compared(self) -> bool:
-        """True if the coefficient is unknown only when recordings with different duties are compared."""
+        """True if the coefficient is fitted only to compare recordings, whose duties differ."""
         return self.drift == "speed"
 
 
 class Equation(NamedTuple):
-    """A balance: function of the increments of its left side [m^3], and its terms, those of the leak last.
+    """A volume balance of a machine: its left side equals the sum of its terms.
 
-    `healthy`: standard deviation of a healthy machine's conductance [m^3/(s Pa)], infinite if unknown; `by_command`: no
-    channel gives the flow, so that `balance.derive_drive_signals` computes a speed from the command; `flow_sign`: 1 if
-    a flow into A is positive on the left side, -1 if negative.
+    Parameters
+    ----------
+    name : str
+        Name of the balance, for example "cylinder".
+    left : callable
+        Computes the increments of the left side [m^3] from `Signals`, shape (n - 1,).
+    terms : tuple of Term
+        The terms, those of the leak last.
+    healthy : float
+        Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
+    by_command : bool
+        True if no channel gives the pump's flow. A speed is then computed from the command u
+        (`balance.derive_drive_signals`).
+    flow_sign : float
+        1 if a flow into A is positive on the left side, -1 if it is negative.
     """
 
     name: str
@@ -234,21 +271,22 @@ class Equation(NamedTuple):
     flow_sign: float = 1.0
 
 
-#: The leak past the piston, laminar and as through an orifice; the first names the coefficient that is tested.
+#: The leak past the piston or in the pump, laminar and through an orifice; the first is the one that is tested.
 LEAK, ORIFICE = "leak", "leak through an orifice"
 #: Free air in both chambers at once, instead of the coefficients of each chamber.
 AIR = "free air"
-#: The pump's own leakage, by the pressures at its ports; if a valve cuts it off at rest, in motion only.
+#: The pump's leakage, driven by the pressures at its ports; and its leakage while it turns, if a valve cuts the pump
+#: off at rest.
 PUMP, TURNING = "pump leak", "pump leak while it turns"
-#: Constant flow or offset of the flow; an offset of the pressures changes it.
+#: Constant flow, as by an offset of a flow sensor; an offset of the pressure sensors changes it, too.
 BIAS = "bias"
 #: Suffix of the name of an external leak that a check valve compensates.
 MADE_UP = ", made up"
 #: A delay between position and flow.
 LAG = "lag"
-#: Loss of the pump that grows with speed: incomplete filling, and slip that no recorded pressure drives.
+#: Loss of the pump that grows with speed: incomplete filling, and slip that depends on no recorded pressure.
 SPEED_LOSS = "loss over speed"
-#: The balance with a position of a pump-controlled cylinder, and that of a load that shut valves hold, by name.
+#: Names of the balance of a pump-controlled cylinder with a recorded position, and of that of a load held by valves.
 CYLINDER, LOCKED = "cylinder", "locked"
 #: Decay of the speed loop's unknown initial state (time constant 19 s for the thesis's drive).
 START = "start"
@@ -265,7 +303,10 @@ def _conductance_term(
     needs: tuple[str, ...] = _PRESSURES,
     drift: Coefficient | Literal[""] = "",
 ) -> Term:
-    """Make a term whose flow is a conductance times a pressure."""
+    """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
+
+    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are those of `Term`.
+    """
     return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
 
 
@@ -276,15 +317,18 @@ _LEAKS = (
 
 
 def _motion_term(outward: bool, by_A: bool) -> Term:
-    """Make the term of the motion in one direction while one side has the higher pressure: dx."""
+    """Make the term dx of the piston's motion in one direction while one side has the higher pressure.
+
+    `outward`: true for motion towards B; `by_A`: true while p_A > p_B. The coefficient is an area [m^2].
+    """
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
     return Term(name, "m^2", lambda s: s.directed_step(outward, by_A), "sensor fault", "motion", ("x",))
 
 
 def _chamber_terms(side: str) -> tuple[Term, ...]:
-    """Make the terms of the compliance of one chamber and of the air in its oil.
+    """Make the terms of the compliance of one chamber, `side` "A" or "B", and of the air in its oil.
 
-    Increments: dp and x dp of the compliance, d(1/p) of free air, d ln p of air that dissolves.
+    Their increments are dp and x dp (compliance), d(1/p) (free air) and d ln p (air that dissolves).
     """
     p, name = f"p_{side}", f"compliance {side}"
     cause: Cause = "air in the oil"
@@ -297,7 +341,11 @@ def _chamber_terms(side: str) -> tuple[Term, ...]:
 
 
 def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
-    """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B), w = `weight_A`."""
+    """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
+
+    w is the weight of chamber A in the balance, computed by `weight_A`; V_A and V_B are the volumes of the chambers
+    at the current position, from the rig's file.
+    """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
     cylinder = rig.cylinder
@@ -305,8 +353,8 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
     areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def expansion(s: Signals, side: str) -> Array:
-        """Compute V d(1/p) of one chamber."""
-        # at least a tenth of that at mid-stroke: x of an unknown origin may exceed the stroke
+        """Compute V d(1/p) [m^3/Pa] of one chamber, shape (n - 1,)."""
+        # at least a tenth of the volume at mid-stroke: x of an unknown origin may exceed the stroke
         volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
         return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
 
@@ -318,7 +366,10 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
 
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term of one side's external leak: max(p, 0) dt times its signed `weight` in the balance."""
+    """Make the term of an external leak from one side of the cylinder: max(p, 0) dt times `weight`.
+
+    `weight`: effect of a flow out of that side on the balance, with its sign; `p`: gauge pressure of the side.
+    """
     p = f"p_{side}"
 
     def lost_volume(s: Signals) -> Array:
@@ -328,9 +379,10 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
 
 
 def _compensated_leak_term(side: str) -> Term:
-    """Make the term of one side's external leak in a circuit whose check valve refills the side of lower pressure.
+    """Make the term of an external leak from one side in a circuit whose check valve refills the low-pressure side.
 
-    The leak thus changes the balance only while its side has the higher pressure. The term of B is negative.
+    The leak changes the balance only while its side has the higher pressure: max(p, 0) dt for A, and -max(p, 0) dt
+    for B. In all other intervals the term is 0.
     """
 
     def lost_volume(s: Signals) -> Array:
@@ -346,7 +398,8 @@ _SPEED_LOSS = Term(
     SPEED_LOSS, "m s", lambda s: _interval_means(np.abs(s.speed)) * s.step("x"), "sensor fault", "speed", ("x",)
 )
 _PUMP = _conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", ("p_1", "p_2"))
-#: With it the leak's coefficient is that of pump and piston; the lines' pressure drop acts on the pump only.
+#: The pressure drop of the lines acts on the pump's leakage only. With this term the leak's coefficient remains that
+#: of pump and piston together.
 _LINES = _conductance_term(
     "pump leak by the lines",
     lambda s: (s.port_difference - s.pressure_difference) * s.dt,
@@ -372,7 +425,12 @@ _CYLINDER = (
 
 
 def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float) -> tuple[Term, ...]:
-    """Make the terms of a valve's metering edge, open while `sign` u > 0: gain, delay by the spool's lag, overlap."""
+    """Make the terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
+
+    `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
+    command u that opens it. The flow is the gain times abs(u) times the signed root of the pressure drop, with a
+    delay from the lag of the spool, and reduced by an overlap.
+    """
 
     def unit_flow(s: Signals) -> Array:
         return _signed_root(s.mean(upstream) - s.mean(downstream))
@@ -394,10 +452,11 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
 
 
 def _chamber_equation(side: str, rig: Rig) -> Equation:
-    """Make the balance of one chamber behind a valve: the piston displaces the flow of its edges.
+    """Make the balance of one chamber of a cylinder behind a servo valve.
 
-    An overlap of the edges reduces the flow in both directions like a leak under the pressure of friction. Only the
-    prior on a healthy piston separates the two, and a leak from a change of friction.
+    The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An
+    overlap of the edges reduces the flow in both directions, just as a leak does under the pressure of friction. Only
+    the prior on a healthy piston separates a leak from an overlap and from a change of friction.
     """
     area, is_A = (rig.cylinder.A_A, True) if side == "A" else (rig.cylinder.A_B, False)
     sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
@@ -415,10 +474,11 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
-    """Return the balances of a machine that its recorded channels allow; empty if there is none.
+    """Return the volume balances of a machine that can be computed from the recorded channels.
 
-    Behind a servo valve there is one for each chamber; else there is one of the cylinder, with the flow from the pump's
-    angle, its speed, a flow meter or, without these, the command.
+    Behind a servo valve there is one for each chamber. Otherwise there is one of the cylinder, with the pump's flow
+    from its angle, its speed, a flow meter or, without these, the command. `channels`: names of the recorded
+    channels. The result is empty if they do not suffice.
     """
     if rig.circuit.valve_controlled and {"x", "u", "p_1", "p_2"} <= channels:
         if not channels.issuperset(_PRESSURES):
@@ -447,10 +507,10 @@ _STANDSTILL = (
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of a pump's delivery while the piston displaces nothing.
+    """Return the volume balance of a pump while the piston displaces no net volume.
 
-    It is used over whole cycles or at standstill, where motion and position do not enter. An offset of the flow cannot
-    be separated from leakage under a steady load, and is assumed to be zero. None if the pump does not feed the
+    It holds over whole cycles or at standstill, so the position need not be known. An offset of the flow cannot be
+    separated from leakage under a steady load, and is assumed to be zero. Return None if the pump does not feed the
     chambers, or if its delivery or a chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
@@ -460,10 +520,11 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the balance of a load held by shut valves: the piston moves by the leakage of the loaded side.
+    """Return the volume balance of a load that is held by shut valves.
 
-    The channels do not separate leaks of seal, valve and line. A constant command means shut valves; x grows as A
-    fills. None for a pump-controlled machine, or if position, command or a pressure is missing.
+    The piston moves only as far as oil leaks from the loaded side. The channels do not separate leaks of seal, valve
+    and line. A constant command means shut valves; x grows as A fills. Return None for a circuit without
+    such valves, as a pump-controlled one, or if position, command or a pressure is missing.
     """
     if not rig.circuit.holds_load or not {"x", "u", *_PRESSURES} <= channels:
         return None
@@ -476,10 +537,11 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return the function of the increments of the pump's delivered volume [m^3]; None if no channel gives them.
+    """Return a function that computes the increments of the pump's delivered volume [m^3] from `Signals`.
 
-    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command. A scale
-    error of a flow meter in either direction changes the fitted area in that direction.
+    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command,
+    whichever is recorded; return None if none is. If a flow meter has different scale errors in the two directions,
+    the fitted areas of the two directions differ.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -492,7 +554,10 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Add the columns of leakage and flow offset at rest to a pump's balance, before those of the leak."""
+    """Return a pump's balance with additional terms for leakage and flow offset while the pump or the piston rests.
+
+    They are inserted before the terms of the leak.
+    """
     left = equation.left
     return _insert_before_leaks(
         equation,
@@ -502,7 +567,10 @@ def with_rests(equation: Equation) -> Equation:
 
 
 def shut_at_rest(equation: Equation) -> Equation:
-    """Return a pump's balance for a valve that shuts at rest: pump leakage and offset count in motion only."""
+    """Return a pump's balance for valves that cut the pump off from the cylinder while it rests.
+
+    The pump's leakage, as an additional term, and the flow offset count in motion only.
+    """
     left = equation.left
 
     def leaked_volume(s: Signals) -> Array:
@@ -518,11 +586,11 @@ def shut_at_rest(equation: Equation) -> Equation:
 
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
-    """Insert terms before those of the leak, which are the last."""
+    """Return a balance with additional terms, inserted before those of the leak, which remain the last."""
     first_leak = len(equation.terms) - len(_LEAKS)
     return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
 
 
 def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:
-    """Drop the terms whose channels are not recorded."""
+    """Return a balance without the terms that need a channel outside of `channels`."""
     return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))

@@ -1,1 +1,1 @@
-"""The inference on a stream: blocks as they are closed, and a sequential test at a stated rate."""
+"""Watch a running machine: estimate its leakage block by block, and alarm at a stated rate of false alarms."""

@@ -1,8 +1,8 @@
-"""The volume balance of a running machine: the leakage conductance of each block.
+"""The volume balance of a running machine: the leakage conductance in each block of a few seconds.
 
-The blocks are those of a recording (`balance.BlockStream`). All coefficients but the leak's are estimated recursively
-from the last blocks (`coefficients`). The conductance is that of piston and pump, which lie in parallel; `sequential`
-tests it for a step.
+The blocks are cut as in a recording (`balance.BlockStream`). All coefficients of the balance but the leak's are
+estimated recursively from the last blocks (`coefficients`). The conductance is that of piston and pump together,
+which lie in parallel; `sequential` tests it for a step.
 """
 
 from __future__ import annotations
@@ -58,11 +58,22 @@ N_WAKING: int = _PRIORS.wakes
 class BlockConductance(NamedTuple):
     """Leakage conductance and duty of the machine in one block.
 
-    `begin`, `end`: times of its samples [s]; `g`, `sd`: conductance of pump and piston and its standard error [m^3/(s
-    Pa)]. Values of `g` are comparable between blocks, as later estimates of the other coefficients do not shift them.
-    `total`: conductance by the latest estimates of the other coefficients; `offset`: standard error common to all
-    blocks, due to these coefficients and the machine's size; `pressure`: mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean
-    absolute flow that moves the piston [m^3/s].
+    Attributes
+    ----------
+    begin, end : float
+        Times at which the samples of the block begin and end [s].
+    g, sd : float
+        Conductance of pump and piston together, and its standard error [m^3/(s Pa)]. Values of `g` can be compared
+        between blocks, as they do not shift when later blocks improve the other coefficients of the balance.
+    total : float
+        Conductance by the latest estimates of the other coefficients [m^3/(s Pa)].
+    offset : float
+        Standard error of the conductance that is common to all blocks, due to the other coefficients and to the
+        machine's size [m^3/(s Pa)].
+    pressure : float
+        Mean of abs(p_A - p_B) [Pa].
+    pump_flow : float
+        Mean absolute flow that moves the piston [m^3/s].
     """
 
     begin: float
@@ -76,20 +87,28 @@ class BlockConductance(NamedTuple):
 
     @property
     def lpm(self) -> float:
-        """Flow per unit of conductance at the mean pressure difference [L/min over m^3/(s Pa)]."""
+        """Leakage flow of a unit conductance at the block's mean pressure difference [L/min per m^3/(s Pa)]."""
         return self.pressure / LITRE_PER_MINUTE
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of the mean pressure difference [Pa] and the mean flow [m^3/s], finite also for zero values."""
+        """Logarithms of the mean pressure difference [Pa] and the mean flow [m^3/s]; finite even if these are 0."""
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
 class NotJudged(NamedTuple):
-    """Reason why the block up to the time `end` [s] has no estimate.
+    """Reason why a block has no estimate of its leakage.
 
-    `status`: reason as text; `counter`: counter to increase by one, "" for none; `restarts`: True if later blocks
-    cannot be compared with earlier ones.
+    Attributes
+    ----------
+    end : float
+        End of the block [s].
+    status : str
+        The reason in words; "" for samples before the first block.
+    counter : str
+        Name of the counter to increase by one, "" for none.
+    restarts : bool
+        True if later blocks cannot be compared with earlier ones.
     """
 
     end: float
@@ -99,7 +118,11 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Make a reason that increases the counter named after its status."""
+        """Make a NotJudged with the reason `status`, whose counter is named after the reason.
+
+        `end` is the end of the block [s], and `restarts` tells whether later blocks cannot be compared with earlier
+        ones.
+        """
         return cls(end, status, f"blocks: {status}", restarts)
 
 
@@ -109,7 +132,11 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 
 @kernel
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
-    """Fit a model's coefficients to K blocks together, by their Gram matrices (K, m, m) and counts of `rows` (K,)."""
+    """Fit a balance's coefficients to K blocks together and store them in `model`.
+
+    `grams` (K, m, m) are the blocks' Gram matrices, and `rows` (K,) the number of rows in each block. `column_order`
+    (n + 2,) holds the indices of the n nuisances, the leak and the left side in these matrices.
+    """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
         add_block(model, rows[k], 1.0, False)  # full weight, no step of the leak
@@ -120,16 +147,20 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
 def _estimate_leak(
     model: Coefficients, gram: Any, column_order: Any, rows: float, is_learned: bool
 ) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient from a block's Gram matrix (m, m); arguments and result as of `estimate_leak`."""
+    """Estimate the leak's coefficient in one block from its Gram matrix (m, m).
+
+    `column_order` (n + 2,) holds the indices of the n nuisances, the leak and the left side in the matrix. Other
+    arguments and the result are those of `coefficients.estimate_leak`.
+    """
     load_block(model, gram, column_order)
     return estimate_leak(model, rows, is_learned)  # type: ignore[no-any-return]
 
 
 class LiveBalance:
-    """Estimate the leakage conductance of a running machine block by block, by the balance of volumes.
+    """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
-    `rig`: states displacement and circuit; `names`: channels of the samples. Raises InputError if they allow no
-    balance. The estimates do not depend on how the samples are divided into calls.
+    `rig` states displacement and circuit, and `names` are the channels of the samples. Raises InputError if these
+    channels allow no balance. The estimates do not depend on how the samples are divided into calls.
     """
 
     method, data, states_level = "volumes", VOLUMES, True
@@ -137,7 +168,11 @@ class LiveBalance:
     block_seconds, has_begun = BLOCK_SECONDS, True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
-        """Start without blocks; `litres`: the rig states the sizes that L/min need, by default found from it."""
+        """Start without blocks.
+
+        `litres` tells whether the rig states the sizes that are needed for L/min; by default this is found from the
+        rig.
+        """
         self._balances = live_equations(rig, names, with_tested_terms=True)
         if not self._balances:
             needed = "x, u, p_A, p_B, p_1 and p_2" if _has_valve(rig) else "x, p_A, p_B and theta or omega"
@@ -170,14 +205,15 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Test whether a rig states the sizes needed for a leak in L/min."""
+        """Test whether a rig states the sizes that are needed to give a leak in L/min."""
         return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _has_valve(rig) else ("pump.q_b",)))
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples; yield the result of each block they complete before the next block is processed.
+        """Process the next samples, and yield the result of each block that they complete.
 
-        The first `LEARNED` blocks are estimated together. After a gap the estimates of the coefficients stay; samples
-        before the gap that fill no block are dropped.
+        The next block is processed only when its result is asked for. The first `LEARNED` blocks are estimated
+        together. After a gap the coefficients are kept, and samples before the gap that do not fill a block are
+        dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -193,7 +229,7 @@ class LiveBalance:
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _make_stream(self) -> BlockStream:
-        """Make the stream that cuts samples at the present rate into blocks, and stores each block's samples."""
+        """Make the object that cuts samples at the present sampling rate into blocks and stores their samples."""
 
         def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
             self._closed_samples.append((begin, samples, self._rate))
@@ -201,14 +237,14 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process completed blocks, each with its stored samples; yield the result of each."""
+        """Process completed blocks together with their stored samples, and yield the result of each block."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
             yield self._take_block(block)
 
     def _take_block(self, block: Blocks) -> BlockResult:
-        """Estimate the conductance of a block; without coefficients, store it until they can be fitted."""
+        """Estimate the conductance in a block, or store the block until the coefficients can be fitted."""
         end = self._sample_times(block)[1]
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")
@@ -230,7 +266,10 @@ class LiveBalance:
         return self._estimate_first_blocks(blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit coefficients and usual precision to the first blocks; return the estimates of those not at standstill."""
+        """Fit the coefficients to the first blocks, and return the estimates of these blocks.
+
+        Blocks at standstill are left out. The median precision of these blocks becomes the usual one.
+        """
         for e, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             _fit_to_blocks(model, np.ascontiguousarray(blocks.gram[:, e]), column_order, blocks.rows)
         solutions = [self._solve_block(part, is_learned=False) for part in _split(blocks)]
@@ -240,19 +279,29 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time between two rows [s], by which a block's samples reach beyond its first and last row."""
+        """Half the time between two rows of the balance [s].
+
+        The samples of a block reach beyond its first and last row by this much.
+        """
         return 0.5 * stride_samples(self._rate) / self._rate
 
     def _sample_times(self, block: Blocks) -> tuple[float, float]:
-        """Return the begin and end of a block's samples [s]."""
+        """Return the times at which the samples of a block begin and end [s]."""
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the mean square of a block's left side, relative to that of earlier blocks (`relative_motion`)."""
+        """Compute how strongly the machine moves in a block, relative to earlier blocks.
+
+        The measure is the mean square of the left side of the balance (`coefficients.relative_motion`).
+        """
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
-        """Estimate the leak in a block by all equations: add up the weighted results of `estimate_leak` (4,)."""
+        """Estimate the leak in a block from all equations of the balance together.
+
+        Returns the four results of `coefficients.estimate_leak`, each summed over the equations. With `is_learned`,
+        the block also updates the coefficients.
+        """
         rows, equation_parts = float(block.rows[0]), zip(self._models, block.gram[0], self._column_orders, strict=True)
         results = [
             _estimate_leak(model, gram, column_order, rows, is_learned) for model, gram, column_order in equation_parts
@@ -260,7 +309,10 @@ class LiveBalance:
         return tuple(sum(values) for values in zip(*results, strict=True))
 
     def _estimate_block(self, block: Blocks, is_learned: bool = True) -> BlockConductance | NotJudged:
-        """Estimate the conductance in a block, or report a standstill; with `is_learned`, update the coefficients."""
+        """Estimate the conductance in a block; return a NotJudged if a standstill tells too little of it.
+
+        With `is_learned`, the block also updates the coefficients.
+        """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
         precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, is_learned)
@@ -273,7 +325,10 @@ class LiveBalance:
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop all coefficients, as after a repair, and learn them anew from the blocks begun `since` a time [s]."""
+        """Drop all coefficients, for example after a repair.
+
+        They are then learned anew from the blocks that begin at `since` [s] or later, including stored ones.
+        """
         for model in self._models:
             for values in model:
                 values[:] = 0.0
@@ -281,9 +336,10 @@ class LiveBalance:
         self._waiting = 0 if self._stored is None else int(np.count_nonzero(self._stored.start >= since))
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
-        """Test terms and signals for changes in the blocks from the clock `since` to the one that ends at `end` [s].
+        """Test the terms of the balance and the signals of the last blocks for changes.
 
-        None if these blocks are not stored back to `onset`; empty if they are too few.
+        The blocks are those from the time `since` to the block that ends at `end` [s]. The result is None if the
+        stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
         """
         stored = self._stored
         if stored is None:
@@ -298,7 +354,7 @@ class LiveBalance:
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON."""
+        """Return the state as plain values for JSON, which `load_state` restores."""
         return {
             **save_attributes(self, _SAVED),
             "known": [save_attributes(model, _MODEL) for model in self._models],
@@ -307,7 +363,10 @@ class LiveBalance:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        """Restore a state saved by `state`, so that later results are identical to the last bit.
+
+        Raises InputError if the state does not fit this rig and these channels.
+        """
         restore_attributes(self, _SAVED, state)
         saved_models = require_part(state, "known", list)
         if len(saved_models) != len(self._models):
@@ -328,7 +387,7 @@ _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__
 
 
 def _split(blocks: Blocks) -> list[Blocks]:
-    """Split blocks into parts of a single block each."""
+    """Split several blocks into a list of single ones."""
     return [blocks[k : k + 1] for k in range(len(blocks))]
 
 
@@ -338,15 +397,16 @@ def _has_valve(rig: Rig) -> bool:
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of a flow due to the rig's sizes."""
+    """Return the relative standard error of flows that is due to the uncertain sizes of the machine."""
     return float(INFERENCE.size.area if _has_valve(rig) else INFERENCE.size.displacement)
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
-    """Build the balances for live use from the channels `names`, except those driven by the command.
+    """Build the volume balances that can be watched from the channels `names`.
 
-    The pump's leakage is left out, as it cannot be told from the piston's. `with_tested_terms`: include terms that are
-    zero in a healthy machine and only tested.
+    Balances whose flow is computed from the command are left out, and so is the pump's leakage, which cannot be told
+    from the piston's. `with_tested_terms` includes terms that are zero in a healthy machine and are only tested for a
+    change.
     """
     return [
         balance._replace(

@@ -1,13 +1,15 @@
-"""Recursive estimate of a balance's coefficients from sums over the last blocks, compiled.
+"""Estimate a balance's coefficients recursively, from sums over the last blocks; compiled.
 
-Columns are in the order nuisances (n), leak, left side. With C (n, n) the products of the nuisances with each other
-and m (n,) those with the left side, summed over the blocks, the leak's column eliminated from both,
+The columns are ordered as n nuisances (coefficients other than the leak's), leak, left side. C (n, n) are the
+products of the nuisances' columns with each other and m (n,) those with the left side, summed over the blocks, with
+the leak's column eliminated from both. Then
 
     c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
 
-N_k, n_k, b_k the products of the leak's column with itself, the left side and the nuisances over the rows of block k,
-s^2 the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step of the leak. No law
-allocates memory: a unit for other simulators (`fmu.sensor`) runs the same laws in C.
+where N_k, n_k and b_k are the products of the leak's column with itself, the left side and the nuisances over the
+rows of block k, and s^2 is the long-run variance of a row. A leak does not enter c, so that a step of g_k is a step
+of the leak. No function allocates memory, as a simulation unit for other programs (`fmu.sensor`) runs the same
+functions in C.
 """
 
 from __future__ import annotations
@@ -36,11 +38,22 @@ ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
 
 
 class Coefficients(NamedTuple):
-    """Nuisance coefficients of a balance, the sums they are computed from, and work arrays.
+    """Nuisance coefficients of a balance, the sums they are computed from, and work arrays; n is their number.
 
-    For n nuisances: `sums` (n + 2, n + 2): weighted products of nuisances, leak and left side; `values` (n,):
-    coefficients; `leak_products` (n,): products of the leak's column with the nuisances; `numbers` (6,): entries `ROWS`
-    to `MISFIT`. Work arrays: `block` (n + 2, n + 2): sums of one block; `matrix` (n, n + 3): normal equations.
+    Attributes
+    ----------
+    sums : array, (n + 2, n + 2)
+        Weighted products of the columns of nuisances, leak and left side.
+    values : array, (n,)
+        The coefficients.
+    leak_products : array, (n,)
+        Products of the leak's column with the nuisances' columns.
+    numbers : array, (6,)
+        Single numbers, at the indices `ROWS` to `MISFIT`.
+    block : array, (n + 2, n + 2)
+        Work array: the products of one block.
+    matrix : array, (n, n + 3)
+        Work array: the normal equations.
     """
 
     sums: Any
@@ -52,13 +65,17 @@ class Coefficients(NamedTuple):
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the `Coefficients` of n nuisances."""
+    """Return the shapes of the arrays in `Coefficients` for n nuisances."""
     return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
 
 
 @law
 def load_block(model: Any, gram: Any, column_order: Any) -> None:
-    """Copy a block's Gram matrix (m, m) into `model.block`; `column_order`: indices of nuisances, leak, left side."""
+    """Copy a block's Gram matrix (m, m) to `model.block`, ordered as nuisances, leak, left side.
+
+    `model` is a `Coefficients`. Nuisances are the coefficients other than the leak's. `column_order` (n + 2,) holds
+    the indices of these columns in the Gram matrix.
+    """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
             model.block[i, j] = gram[column_order[i], column_order[j]]
@@ -66,10 +83,11 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
 
 @large_law
 def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
-    """Add the sums in `model.block` to those of earlier blocks, which are given less weight.
+    """Add the sums in `model.block` to those of earlier blocks, whose weight decreases.
 
-    `rows`: number of rows in the block; `weight`: weight of the block, 0 to 1. Between blocks the leak takes a random
-    step with the variance of a block's estimate, or of any size if `has_stepped`.
+    `model` is a `Coefficients`, `rows` the number of rows in the block, and `weight` the weight of the block, 0 to 1.
+    Between blocks the leak may take a random step, with the variance of a block's estimate, or of any size if
+    `has_stepped`.
     """
     sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
     leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
@@ -90,7 +108,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
 @large_law
 def _solve(model: Any) -> None:
-    """Solve the normal equations C x = r for the three right-hand sides r in `model.matrix[:, n:]`, in place.
+    """Solve the normal equations C x = r in place, for the three right-hand sides r in `model.matrix[:, n:]`.
 
     C (n, n) and the first right-hand side m are computed here from the sums, with the leak's column eliminated.
     """
@@ -106,9 +124,10 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute the residual sum of squares for given nuisance coefficients, minimised over the leak coefficient.
+    """Compute a balance's residual sum of squares with given nuisance coefficients and the best leak coefficient.
 
-    `sums` (n + 2, n + 2): products of nuisances, leak and left side; `solution` (n, k): coefficients in column 0.
+    `sums` (n + 2, n + 2) are the products of the columns of n nuisances (coefficients other than the leak's), leak
+    and left side. Column 0 of `solution` (n, k) holds the nuisance coefficients.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     for i in range(n + 2):
@@ -126,7 +145,10 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute the nuisance coefficients and the variance of a row from the sums, and store them in `model`."""
+    """Compute the balance's coefficients other than the leak's, and the variance of a row, from the sums in `model`.
+
+    `model` is a `Coefficients`, in which both results are stored.
+    """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
     solution[:] = 0.0
@@ -140,10 +162,12 @@ def fit_coefficients(model: Any) -> None:
 
 @large_law
 def _learn_block(model: Any, rows: float, g: float) -> float:
-    """Add `model.block` to the sums and update the usual noise; return the block's weight.
+    """Add `model.block` to the sums, update the usual noise, and return the weight that the block was given.
 
-    `g`: leak estimated in the block. The weight is reduced if the residual variance is over `JUMP`^2 times the usual
-    one. A step of the leak by over `JUMP` standard deviations is not constrained by earlier blocks.
+    `model` is a `Coefficients`, `rows` the number of rows in the block, and `g` the leak's coefficient in it. The
+    weight is below 1 if the residual variance is more than `JUMP`^2 times the usual one. If g differs from the
+    earlier estimate by more than `JUMP` standard deviations, the leak has stepped and earlier blocks do not constrain
+    it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -162,12 +186,13 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 
 @large_law
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in `model.block`; with `is_learned`, add the block to the earlier ones.
+    """Estimate the leak's coefficient in `model.block`; with `is_learned`, also add the block to the earlier ones.
 
-    Returns (w, w g, w s, w^2 V): estimate g, its precision w, the shift s to subtract from g, which keeps the series
-    continuous when the nuisance estimates improve, and the variance V due to the nuisances. In the body `energy` is the
-    sum of squares of the leak's column, N_k of the module; `usual_slope` is the regression of a nuisance's column on it
-    over the last blocks.
+    `model` is a `Coefficients`, and `rows` the number of rows in the block. Returns (w, w g, w s, w^2 V). g is the
+    estimate and w its precision. Subtracting the shift s from g keeps the series of estimates continuous while the
+    nuisances (the coefficients other than the leak's) improve. V is the variance due to the nuisances. In the code
+    `energy` is the sum of squares of the leak's column, N_k of the module's docstring, and `usual_slope` the
+    regression of a nuisance's column on the leak's column over the last blocks.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
@@ -197,9 +222,10 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 
 @law
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
-    """Divide the mean `square` of a block's left side by that of earlier blocks.
+    """Compute the mean square of a block's left side, divided by that of earlier blocks.
 
-    Returns inf if only this block moved, and 1 if none moved.
+    `square` is the sum of squares over the block's `rows` rows, and `numbers` are those of `Coefficients`. Returns
+    inf if only this block moved, and 1 if none moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -1,6 +1,6 @@
-"""Estimates of a watch: of every block, of a leak, and of the healthy machine that they are compared with.
+"""Results of a watch: estimates of each block, a detected leak, and the healthy machine that both are compared with.
 
-The baseline is learned over stated hours of healthy running, then frozen, with a version.
+The baseline is learned over a stated number of hours of healthy running. It is then frozen and has a version number.
 """
 
 from __future__ import annotations
@@ -28,12 +28,22 @@ GROUP: int = LIVE.watch.group
 
 @dataclass(frozen=True)
 class BlockEstimate:
-    """Estimate of one block.
+    """Leakage of a running machine in one block.
 
-    `number`: count of blocks, including this one; `t`: end of the block [s]; `status`: "learning", "watched", "alarm",
-    or the reason why it is not judged ("at standstill", "missing values", ...); `total_lpm`: flow past pump and piston
-    together [L/min]; `leak_lpm`: its rise over the healthy machine [L/min]. Each has a 95 % interval that allows for
-    warmer oil, and is None if unknown.
+    Flows and their 95 % intervals are None if unknown. The intervals allow for warmer oil.
+
+    Attributes
+    ----------
+    number : int
+        Number of blocks so far, including this one.
+    t : float
+        End of the block [s].
+    status : str
+        "learning", "watched" or "alarm", or the reason why the block is not judged, such as "at standstill".
+    total_lpm, total_interval_lpm : float and pair of floats, or None
+        Flow past pump and piston together, and its interval [L/min].
+    leak_lpm, leak_interval_lpm : float and pair of floats, or None
+        Increase of that flow over the healthy machine, and its interval [L/min].
     """
 
     number: int
@@ -46,18 +56,36 @@ class BlockEstimate:
 
     @property
     def judged(self) -> bool:
-        """True if the block has an estimate that is tested, also while the baseline is learned."""
+        """True if the leakage of the block was estimated and tested, also while the baseline is learned."""
         return self.status in ("learning", "watched", "alarm")
 
 
 @dataclass(frozen=True)
 class WatchedLeak:
-    """A leak that a test has detected, present until `dismiss` or `relearn` is called.
+    """A leak that a test has detected; it stays until `Watch.dismiss` or `Watch.relearn` is called.
 
-    `raised_s`: time of the alarm [s]; `onset_s`: start of the leak [s], `leak_lpm`: its size at the alarm [L/min], both
-    with 95 % intervals; `conductance_before`: conductance before the onset, `rise`: increase of it, `rise_sd`: standard
-    deviation of the increase [m^3/(s Pa)]; `pressure`: mean pressure difference [Pa]; `test`: "step" or "level";
-    `cause`: path of the leaking oil; `reason`: one line of text; `score`, `threshold`: of the test (`rise.LiveRise`).
+    Attributes
+    ----------
+    raised_s : float
+        Time of the alarm [s].
+    onset_s, onset_interval_s : float and pair of floats
+        Time at which the leak began, and its 95 % interval [s].
+    leak_lpm, leak_interval_lpm : float and pair of floats, or None
+        Size of the leak at the alarm, and its 95 % interval [L/min].
+    conductance_before : float
+        Leakage conductance before the onset [m^3/(s Pa)].
+    rise, rise_sd : float
+        Increase of the conductance, and its standard deviation [m^3/(s Pa)].
+    pressure : float
+        Mean absolute pressure difference p_A - p_B [Pa].
+    test : str
+        Test that detected the leak, "step" or "level".
+    cause : str
+        Path of the leaking oil.
+    reason : str
+        Reason for the alarm, in one line.
+    score, threshold : float
+        Score of the test and its threshold (`rise.LiveRise`).
     """
 
     raised_s: float
@@ -77,28 +105,34 @@ class WatchedLeak:
 
     @property
     def estimate(self) -> LiveRise:
-        """The rise with its test."""
+        """The increase of the conductance with its onset and its test."""
         onset = Onset(self.onset_s, *self.onset_interval_s)
         return LiveRise(self.test, self.score, onset, self.rise, self.rise_sd)
 
     @property
     def allowed(self) -> float:
-        """False-alarm probability of the test."""
+        """False-alarm probability for which the threshold of the test was set."""
         return LiveRise(self.test, self.threshold).chance
 
     @property
     def rarity(self) -> float:
-        """Chance of the score in a healthy machine, as a fraction of the test's allowed chance, 1e-9 to 1."""
+        """Chance of the score in a healthy machine over the test's false-alarm probability, limited to 1e-9 to 1."""
         exponent = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(exponent, math.log(1e-9))))
 
 
 @dataclass(frozen=True)
 class HealthyLevel:
-    """Leakage conductance of a healthy machine in `count` recordings, or means of successive blocks.
+    """Leakage conductance of a healthy machine, from recordings or from groups of blocks.
 
-    `level`, `low`, `high`, `deviation`: mean, minimum, maximum and standard deviation of these [m^3/(s Pa)]; `known_s`:
-    time until which the machine is known to be healthy [s], with recordings the start of the last one.
+    Attributes
+    ----------
+    level, low, high, deviation : float
+        Mean, minimum, maximum and standard deviation over recordings or groups [m^3/(s Pa)].
+    known_s : float
+        Time until which the machine is known to be healthy [s]; for recordings the start of the last one.
+    count : int
+        Number of recordings or groups.
     """
 
     level: float
@@ -111,11 +145,19 @@ class HealthyLevel:
 
 @dataclass(frozen=True)
 class WatchBaseline(HealthyLevel):
-    """Leakage and duty of the healthy machine while the baseline was learned.
+    """Leakage and duty of the healthy machine, measured while the baseline was learned.
 
-    `version`: 1 for the first baseline, increased by one after each repair; `hours`: learning time in operating hours;
-    `lpm`: `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated; `duty_low`,
-    `duty_high`: minima and maxima of the logarithms of mean pressure difference [Pa] and mean flow of the pump [m^3/s].
+    Attributes
+    ----------
+    version : int
+        1 for the first baseline, increased by one after each repair.
+    hours : float
+        Operating time over which it was learned [h].
+    lpm : float or None
+        The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
+    duty_low, duty_high : tuple of float
+        Minimum and maximum over the blocks of the logarithms of mean pressure difference [Pa] and mean pump flow
+        [m^3/s].
     """
 
     version: int
@@ -128,12 +170,13 @@ class WatchBaseline(HealthyLevel):
 def find_level_rise(
     healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
 ) -> LiveRise | None:
-    """Estimate the rise of a mean conductance over a healthy level; None if it is not significant.
+    """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
 
-    `g`, `deviation`: conductance and its standard error [m^3/(s Pa)]; `onset`: onset to state for the rise. Two tests
-    must both be significant at the false-alarm `probability`. The first compares g with the lowest healthy mean,
-    increased for the warmest oil. The second compares g with the average of the healthy means by their scatter
-    (Student's t, Welch's degrees of freedom). None also for fewer than two healthy means.
+    `g` and `deviation` are the conductance and its standard error [m^3/(s Pa)], and `onset` is the onset to state in
+    the result. Two tests must both be significant at the false-alarm `probability`. The first compares g with the
+    lowest healthy mean, increased for the warmest oil. The second compares g with the average of the healthy means,
+    given their scatter (Student's t with Welch's degrees of freedom). The result is None if a test is not
+    significant, or if there are fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -155,9 +198,10 @@ def find_level_rise(
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
-    """Return the conductance before a leak, with its possible range at time `t` [s] due to oil temperature.
+    """Return the conductance before a leak began, and the range it may have at time `t` [s] without the leak.
 
-    The range widens from the onset on. After `shift` hours it spans from the coldest to the warmest oil.
+    The range allows for colder and warmer oil. The range widens from the onset on. After `shift` hours
+    (`priors.toml`) it spans from the coldest to the warmest oil.
     """
     oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
@@ -166,14 +210,17 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 
 
 def mean_flow(flows: Array, errors: Array) -> Flow:
-    """Average the flows of blocks [L/min]; the standard error covers their own standard `errors` and their scatter."""
+    """Average the flows of several blocks (n,) [L/min].
+
+    The standard error of the mean covers both their standard `errors` (n,) and their scatter.
+    """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
     return Flow(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether a duty is between `low` and `high`, extended by a margin.
+    """Test whether a duty lies between the limits `low` and `high`, extended by a margin.
 
     The margin towards low pressures is larger, as a leak lowers the pressure difference.
     """
@@ -184,12 +231,26 @@ def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
 
 @dataclass
 class BaselineLearning:
-    """Running sums from which the baseline is computed.
+    """Running sums over blocks, from which the baseline of a watch is computed.
 
-    Over all `blocks` blocks: `total`, sum of the conductances; `flow`, sum of the flows of a unit conductance;
-    `duty_low`, `duty_high`, range of the duty. Over the `count` complete groups of `GROUP` blocks: `mean` of the group
-    means, sum `squares` of their squared deviations, and their extremes `low`, `high`. `group`: conductances of the
-    incomplete group.
+    Attributes
+    ----------
+    blocks : int
+        Number of blocks.
+    total : float
+        Sum of their conductances [m^3/(s Pa)].
+    flow : float
+        Sum of their flows of a unit conductance [L/min per m^3/(s Pa)].
+    duty_low, duty_high : tuple of float, or None
+        Smallest and largest duty of a block so far.
+    group : list of float
+        Conductances of the group of blocks that is not yet complete. A complete group has `GROUP` blocks.
+    count : int
+        Number of complete groups.
+    mean, squares : float
+        Mean of the group means, and sum of their squared deviations from it.
+    low, high : float or None
+        Smallest and largest group mean.
     """
 
     blocks: int = 0
@@ -205,7 +266,7 @@ class BaselineLearning:
     high: float | None = None
 
     def add(self, g: float, flow: float, duty: Duty) -> None:
-        """Add a block: its conductance `g` [m^3/(s Pa)], the `flow` of a unit conductance [L/min], and its duty."""
+        """Add a block with its conductance `g` [m^3/(s Pa)], the `flow` of a unit conductance, and its duty."""
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -225,8 +286,8 @@ class BaselineLearning:
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
         """Compute the baseline from the sums, which must contain at least `GROUP` blocks.
 
-        `version`, `hours`: as in `WatchBaseline`; `end`: end of the last block [s]; `states_lpm`: state the level as a
-        flow [L/min], too.
+        `version` and `hours` are those of the new `WatchBaseline`, and `end` is the end of the last block [s]. With
+        `states_lpm`, the baseline also states its level as a flow [L/min].
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks

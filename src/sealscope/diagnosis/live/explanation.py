@@ -1,7 +1,7 @@
-"""Explain a rise of the leakage in the last blocks of a running machine by an event.
+"""Explain an increase of the leakage of a running machine by a leak or by another event.
 
-The e-detector (`sequential`) shows the rise at its rate of false alarms. The probability that a leak, a sensor or the
-duty caused it is computed as for a recording, from the same observables and the same table of events.
+The e-detector (`sequential`) detects the increase at its rate of false alarms. The probability that a leak, a sensor
+or the duty caused it is computed as for a recording, from the same observables and the same table of events.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ ALARMING = (*LEAK_EVENTS, *(event.name for event in load_events() if event.cause
 
 
 class RiseExplanation(NamedTuple):
-    """Explanation of a rise of the leakage.
+    """Explanation of an increase of the leakage.
 
-    `is_leak`: True if a leak explains the rise; `is_outside`: True if the leak is almost surely to the outside;
-    `other_events`: events that explain the rise instead, in words, "" if there are none.
+    `is_leak` is True if a leak explains it, and `is_outside` if oil leaks almost surely to the outside.
+    `other_events` names the events that explain the increase instead of a leak, "" if there are none.
     """
 
     is_leak: bool
@@ -42,10 +42,12 @@ UNKNOWN = RiseExplanation(is_leak=False)
 
 
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
-    """Explain a rise of the leakage by the observables of the blocks around it.
+    """Explain an increase of the leakage by the changes that were observed in the blocks around it.
 
-    `data`: kind of data that the leakage is estimated from; changes in these data outside the interval `onset` [s] are
-    ignored. `is_settled`: True if enough blocks have followed to distinguish a leak to the outside from a sensor fault.
+    `observables` are the quantities that were tested for a change. `data` is the kind of data that the leakage is
+    estimated from; changes in these data outside the interval `onset` [s] are ignored. `is_settled` tells whether
+    enough blocks have followed to distinguish a leak to the outside from a sensor fault. The result is `UNKNOWN` if
+    nothing explains the increase yet.
     """
     names = ALARMING if is_settled else LEAK_EVENTS
     events = [event for event in load_events() if event.name in names]
@@ -66,6 +68,6 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
 
 
 def _coincides(observable: Observable, onset: Interval) -> bool:
-    """Test whether the interval of an observable's onset overlaps another."""
+    """Test whether the 95 % interval of an observable's onset overlaps the interval `onset`; False if it has none."""
     change = observable.onset
     return change is not None and change.low <= onset.high and change.high >= onset.low

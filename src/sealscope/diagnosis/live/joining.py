@@ -1,4 +1,4 @@
-"""Join samples in the order of their clock, and count gaps, repeated and late samples, clocks set back, other rates.
+"""Join incoming samples in the order of their clock, and count gaps, late samples and changes of the clock.
 
 The result depends on the samples and their order, not on how they are divided into messages.
 """
@@ -30,9 +30,10 @@ _MAX_RATE_ERROR: float = _PRIORS.rate
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels that suffice to watch an actuator, the best first.
+    """Return the sets of channels from which an actuator can be watched, the best set first.
 
-    A balance of volumes reads the position; the response of the pressures needs none, but a cylinder of equal areas.
+    The volume balance reads the position. The pressure response needs no position, but works only for a cylinder with
+    equal areas and without a servo valve.
     """
     if rig.valve.spool == "present":
         return (("p_A", "p_B", "p_1", "p_2", "u", "x"),)
@@ -41,26 +42,29 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:
-    """Format the sets of channels of `ways_to_watch` for a message."""
+    """Format the sets of channels from `ways_to_watch` as words for a message."""
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
 def are_successive(steps: Any, rate: float) -> Any:
-    """Test whether samples follow each other without a gap.
+    """Test whether each sample directly follows the sample before it; False for a gap and for a copy.
 
-    `steps`: time between neighbours [s]; `rate`: sampling rate [Hz]. False for a gap and for a copy of the sample
-    before.
+    `steps` are the times between neighbours [s], a number or an array, and `rate` is the sampling rate [Hz].
     """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
 
 def is_same_rate(rate: float, rate_before: float) -> bool:
-    """Test whether two sampling rates [Hz] agree within the error of clocks."""
+    """Test whether two sampling rates [Hz] are equal to within the error of clocks."""
     return abs(rate / rate_before - 1.0) < _MAX_RATE_ERROR
 
 
 class SampleRun(NamedTuple):
-    """Samples without a gap: times `t` [s], `channels`, sampling `rate` [Hz]; `follows`: no gap before them."""
+    """Samples without a gap between them.
+
+    `t` (n,) are their times [s], `channels` their values by channel, and `rate` is the sampling rate [Hz]. `follows`
+    is True if there is no gap between these samples and those before them.
+    """
 
     t: Array
     channels: Mapping[str, Array]
@@ -72,10 +76,25 @@ class SampleRun(NamedTuple):
 class SampleJoiner:
     """Divide the samples of an actuator into runs without a gap.
 
-    `ways`: sets of channels that suffice (`ways_to_watch`); `names`: set in use, replaced by a better one if a position
-    is recorded later, unless `is_final`. Samples up to `late_s` [s] older than the `newest` one are late or repeated,
-    and dropped; older ones show that the clock was set back. `changed`: True if the `rate` differs from that of the
-    last run. `counters`: numbers of dropped samples and of interruptions, by reason.
+    Attributes
+    ----------
+    ways : tuple of tuple of str
+        Sets of channels from which the actuator can be watched (`ways_to_watch`).
+    late_s : float
+        Samples up to this much older than the newest one [s] are late or repeated, and are dropped. Older ones show
+        that the clock was set back.
+    is_final : bool
+        True if the set of channels must not be replaced any more.
+    names : tuple of str
+        Set of channels in use. A better set replaces it if a position is recorded later.
+    rate : float
+        Sampling rate [Hz].
+    newest : float
+        Time of the newest sample [s].
+    changed : bool
+        True if `rate` differs from that of the last run.
+    counters : dict of str to int
+        Numbers of dropped samples and of interruptions, by reason.
     """
 
     ways: tuple[tuple[str, ...], ...]
@@ -88,16 +107,16 @@ class SampleJoiner:
     counters: dict[str, int] = field(default_factory=dict)
 
     def count(self, reason: str, number: int = 1) -> None:
-        """Add a number to the counter of a reason."""
+        """Add `number` to the counter called `reason`."""
         self.counters[reason] = self.counters.get(reason, 0) + number
 
     def restart(self, reason: str) -> None:
-        """Accept any time of the next sample, as the recorder or its clock was restarted; count the reason."""
+        """Count the reason, and accept any time for the next sample, as the recorder or its clock was restarted."""
         self.count(reason)
         self.newest = -math.inf
 
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
-        """Yield the samples in runs without a gap; drop and count those that cannot be used or are late."""
+        """Divide samples into runs without a gap; drop and count those that are late or cannot be used."""
         names = self._choose_names(samples)
         if lack := _find_lack(samples, names):
             self.count(lack if names else f"samples without {format_ways(self.ways)}", len(samples))
@@ -119,15 +138,16 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels to use: the best recorded set, at first or once a position appears, else `names`."""
+        """Choose the channels to use: the best recorded set first or when a position appears, else those in use."""
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names
 
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
-        """Yield first index and end (exclusive) of each run of successive times `t` [s] later than the newest sample.
+        """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
-        Times that are missing, late or repeated are counted; `newest` is to be updated after each run.
+        Only times later than the newest sample are used. Times that are missing, late or repeated are counted. The
+        caller must update `newest` after each run.
         """
         with np.errstate(all="ignore"):  # NaN and infinity follow nothing
             is_one_run = t.size > 1 and t[0] > self.newest and bool(are_successive(np.diff(t), self.rate).all())
@@ -151,11 +171,11 @@ class SampleJoiner:
                 indices = indices[n_samples:]
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values."""
+        """Return the state as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Continue from a `state`; raises InputError where it does not fit."""
+        """Restore a saved `state`; raise InputError if it does not fit."""
         restore_attributes(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
         if self.names not in ((), *self.ways):
             raise InputError(f"saved state's names must be {format_ways(self.ways)}, got {', '.join(self.names)}")
@@ -165,7 +185,7 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Return the reason why an actuator cannot be watched by these channels of the samples; "" if it can."""
+    """Describe why an actuator cannot be watched from the channels `names` of these samples; "" if it can."""
     for name in names:
         if name not in samples:
             return f"samples without {name}"
@@ -176,5 +196,5 @@ def _find_lack(samples: Recording, names: Sequence[str]) -> str:
 
 
 def _count_leading(flags: NDArray[np.bool_]) -> int:
-    """Count the leading True values."""
+    """Count the True values at the beginning of an array (n,), before the first False."""
     return int(np.argmin(flags)) if not flags.all() else flags.size

@@ -1,8 +1,9 @@
-"""Watch an actuator by both chamber pressures and the command, without a position.
+"""Watch an actuator from both chamber pressures and the command, without a position.
 
-The response of p_A - p_B to the command is estimated along with the machine (`diagnosis.inference.pressures.response`),
-block by block, so that changes of friction, stiffness and gain as the oil warms are not taken for a leak. Changes of
-the conductance are stated, levels are not. Blocks are not compared across a pause, or after the fit was lost.
+A model of the response of p_A - p_B to the command is fitted block by block
+(`diagnosis.inference.pressures.response`). It follows changes of friction, stiffness and gain as the oil warms, so
+that these are not taken for a leak. Only changes of the leakage conductance are stated, not its level. Blocks are not
+compared across a pause, or after the fit was lost.
 """
 
 from __future__ import annotations
@@ -55,11 +56,20 @@ _MAX_SD: float = PRESSURE.response["G"][1]
 class PressureEstimator:
     """Estimate the leakage conductance block by block from the response of the pressures to the command.
 
-    The counterpart of `LiveBalance` without a position. `rig`: prior of the machine; `litres`: True if it states the
-    sizes that L/min need. Only changes of the conductance are stated (`states_level`), with a relative error
-    `size_error`. An orifice of the same apparent conductance passes `orifice_factor` times the flow of a laminar leak,
-    which widens the upper end of an interval; `min_internal_fraction`: smallest fraction of an apparent leak that is
-    internal.
+    It does the same as `LiveBalance` where no position is recorded, but states only changes of the conductance. `rig`
+    is the assumed machine, and `litres` tells whether it states the sizes that are needed for L/min.
+
+    Attributes
+    ----------
+    states_level : bool
+        False, as the level of the conductance is not stated.
+    size_error : float
+        Relative standard error of changes of the conductance.
+    orifice_factor : float
+        Flow of a leak through an orifice over that of a laminar leak with the same estimated conductance. It widens
+        the upper end of an interval.
+    min_internal_fraction : float
+        Smallest fraction of an estimated leak that is inside the actuator.
     """
 
     method, data, states_level = "pressures", RESPONSE, False
@@ -70,7 +80,7 @@ class PressureEstimator:
     states_flow = staticmethod(states_flow)
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
-        """Start without blocks; arguments as of the class."""
+        """Start without blocks; `rig` and `litres` are described at the class."""
         self._rig = rig
         self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
@@ -83,11 +93,14 @@ class PressureEstimator:
 
     @property
     def has_begun(self) -> bool:
-        """True once the machine moved long enough for its response to be fitted."""
+        """True once the machine has moved long enough for its response to be fitted."""
         return self._follower is not None
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples; yield the result of each block they complete before the next block is processed."""
+        """Process the next samples, and yield the result of each block that they complete.
+
+        The next block is processed only when its result is asked for.
+        """
         if not run.follows:
             self._held[:], self._samples = math.nan, self._samples[:, :0]
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
@@ -108,9 +121,10 @@ class PressureEstimator:
         self._samples = samples.copy()
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
-        """Set stuck pressure readings in the first `n_block` samples to nan.
+        """Set stuck pressure readings in the first `n_block` columns of `samples` to nan.
 
-        Returns False, and changes nothing, if only later samples can tell whether a reading is stuck.
+        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns False, and changes
+        nothing, if only later samples can tell whether a reading is stuck.
         """
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         if min(hold.pending for hold in holds) < n_block:
@@ -121,7 +135,7 @@ class PressureEstimator:
         return True
 
     def _estimate_block(self, block: Recording) -> BlockResult:
-        """Estimate the conductance of a block, or return the reason why it is not judged."""
+        """Estimate the conductance in a block, or return the reason why the block is not judged."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _MIN_RATE:
             return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")
@@ -145,7 +159,11 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
-        """Report a block that does not fit the model; after `lost` such blocks in succession restart the fit."""
+        """Report a block that does not fit the model.
+
+        After `lost` such blocks in succession (`priors.toml`) restart the fit. `restarts` tells whether later blocks
+        cannot be compared with those before this one.
+        """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
             follower.interrupt(math.inf)
@@ -155,9 +173,10 @@ class PressureEstimator:
         return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
-        """Prepare the fit for a block after a `gap` [s]; return it, with True if earlier blocks are not comparable.
+        """Prepare the fit for a block that follows the last one after a `gap` [s].
 
-        After a change of the sampling rate the present parameters are the start of a new fit.
+        After a change of the sampling rate a new fit starts from the present parameters. Returns the fit to use, and
+        True if this and later blocks cannot be compared with earlier ones.
         """
         has_other_rate = follower.machine.rate != rate
         if has_other_rate:
@@ -170,7 +189,11 @@ class PressureEstimator:
         return follower, has_other_rate or not is_short
 
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
-        """Fit a block, store its sums, and update the usual variance; return whether the model describes the block."""
+        """Fit a block and store its sums; return whether the model describes the block.
+
+        The block also updates the usual variance of the residuals. The update is faster while the model is settling
+        or does not describe the block.
+        """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
         row = np.concatenate([[self._end, sums.samples], sums.theta, sums.gram.ravel(), sums.scores.ravel()])
@@ -186,9 +209,10 @@ class PressureEstimator:
         return is_described
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
-        """Test parameters and signals for changes in the blocks from `since` to the one that ends at `end` [s].
+        """Test the parameters of the model and the signals of the last blocks for changes.
 
-        None if these blocks are not stored back to `onset`; empty if they are too few.
+        The blocks are those from the time `since` to the block that ends at `end` [s]. The result is None if the
+        stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.
         """
         rows, seconds = self._rows, self.block_seconds
         if not rows.size or rows[-1, _END] != end or rows[0, _END] - seconds > onset:
@@ -209,12 +233,15 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Widen the parameters' covariance to the prior, after a repair or an exchange; `since` changes nothing."""
+        """Forget what was learned of the machine's parameters, after a repair or an exchange.
+
+        `since` has no effect; it is there for the same call as that of `LiveBalance`.
+        """
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return the state without the rig as plain values."""
+        """Return the state, without the rig, as plain values for JSON, which `load_state` restores."""
         state = save_attributes(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}
@@ -222,7 +249,10 @@ class PressureEstimator:
         return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        """Restore a state saved by `state`, so that later results are identical to the last bit.
+
+        Raises InputError if the state does not fit.
+        """
         restore_attributes(self, _SAVED, state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
             return
@@ -240,6 +270,6 @@ _FOLLOWER_ATTRIBUTES = ("theta", "covariance", "states", "variance", "last")
 
 
 def _recording(rows: Array, rate: float) -> Recording:
-    """Make a recording of stored rows of samples: time [s], then the channels `_READ`."""
+    """Make a recording of stored samples (4, n), whose rows are time [s], p_A, p_B and u."""
     t, *channels = rows
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)

@@ -1,4 +1,4 @@
-"""A rise of the conductance in a stream, with its test, and its verdict by the one decision (`decision.decide`)."""
+"""An increase of a running machine's leakage conductance, its test, and the verdict on it (`decision.decide`)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,20 @@ _UNDATED = Interval(math.nan, math.nan, math.nan)
 
 
 class LiveRise(NamedTuple):
-    """A rise of the conductance in a stream, with its test (`observable.DatedTest`).
+    """An increase of the leakage conductance of a running machine, with the test that detected it.
 
-    `test`: "step" or "level"; `score`: for a step twice the logarithm of an e-value, for a level a normal quantile;
-    `interval`: onset with its 95 % interval [s]; `size`, `deviation`: the rise and its standard deviation [m^3/(s Pa)].
+    It satisfies the protocol `observable.DatedTest`.
+
+    Attributes
+    ----------
+    test : str
+        "step" for a step within the stream, "level" for a conductance above that of the healthy machine.
+    score : float
+        For a step twice the logarithm of an e-value, for a level a normal quantile.
+    interval : Interval
+        Onset with its 95 % interval [s].
+    size, deviation : float
+        The increase and its standard deviation [m^3/(s Pa)].
     """
 
     test: str
@@ -32,7 +42,10 @@ class LiveRise(NamedTuple):
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of the largest probability that a healthy machine scores this high (for a step, Ville's bound)."""
+        """Logarithm of the largest probability that a healthy machine scores this high.
+
+        For a step it is Ville's bound.
+        """
         from scipy.special import log_ndtr
 
         return -0.5 * max(self.score, 0.0) if self.test == STEP else float(log_ndtr(-self.score))
@@ -43,25 +56,29 @@ class LiveRise(NamedTuple):
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with at most the probability `chance`."""
+        """Return the score that a healthy machine exceeds with a probability of at most `chance`."""
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))
 
     def onset(self) -> Interval:
-        """Return the onset [s] with its 95 % interval."""
+        """Return the onset of the increase [s] with its 95 % interval."""
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity, as the smallest detectable step depends on the stream's random walk and is not known."""
+        """Return infinity, as the smallest detectable step is not known.
+
+        It depends on the random walk of the conductance.
+        """
         return math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class LiveLeak:
-    """The leakage of a watched machine (`observable.LeakMeasure`).
+    """The leakage of a watched machine.
 
-    `test`: rise that a test has shown, or a step that is no alarm; `flow_per_conductance`: mean of abs(p_A - p_B) [Pa].
+    It satisfies the protocol `observable.LeakMeasure`, which explains the fields. `test` is the increase that a test
+    has detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
     """
 
     test: LiveRise
@@ -80,17 +97,20 @@ class LiveLeak:
 
     @property
     def step(self) -> LiveRise | None:
-        """Test of a step within the stream."""
+        """Test for a step within the stream; None if the increase was found by the test of the level."""
         return self.test if self.test.test == STEP else None
 
     @property
     def rise(self) -> LiveRise | None:
-        """Test of the level over that of the healthy machine."""
+        """Test of the conductance against that of the healthy machine.
+
+        It is None if the increase was found by the test for a step.
+        """
         return self.test if self.test.test == LEVEL else None
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of the rise [m^3/s], with its standard deviation."""
+        """Mean flow of the increase, and its standard deviation [m^3/s]."""
         pressure = self.flow_per_conductance
         return Flow(self.test.size * pressure, self.test.deviation * pressure)
 
@@ -98,23 +118,24 @@ class LiveLeak:
 
     @property
     def rise_onset(self) -> Interval:
-        """Onset of the rise over the healthy level."""
+        """Onset of the increase, with its 95 % interval [s]."""
         return self.test.interval
 
     def relative(self, flow: Flow) -> None:
-        """Return None: a stream states no flow relative to the pump's."""
+        """Return None, as no flow relative to the pump's is stated for a running machine."""
 
     def total(self, detectable_flow: float | None) -> None:
-        """Return None: each block's estimate states the total leakage."""
+        """Return None, as the estimate of each block states the total leakage."""
 
     def history(self, onset_s: float | None) -> None:
-        """Return None: the blocks' estimates are the history."""
+        """Return None, as the estimates of the blocks are the history of the leak."""
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide whether a watched machine leaks; `lack`: why there is no estimate of its `leak`, in one line.
+    """Decide whether a watched machine leaks.
 
-    Rivals of the leak are not weighed here, but once, when its test raises an alarm (`explanation`).
+    If there is no estimate of its `leak` yet, `lack` is the reason in one line. Other explanations of an increase are
+    not weighed here, but once, when its test raises an alarm (`explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

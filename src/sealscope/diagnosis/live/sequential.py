@@ -1,24 +1,25 @@
 """Detect a step of a coefficient in a stream: an e-detector over all onsets, with a random walk of any size.
 
-Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine g has a level that walks:
-the innovations e_k of its Kalman filter, of variance kappa S_k with kappa unknown, are Student t given those before. A
-step of size delta at block j adds f_k delta to e_k, with f the filter's response to a step, which may begin within
-block j (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S and n innovations the ratio of the
-likelihoods, delta ~ N(0, v kappa) and kappa integrated, is
+Each block gives an estimate g_k of the coefficient with a variance V_k. In a healthy machine the level of g follows a
+random walk. Given the earlier blocks, the innovations e_k of its Kalman filter have the variance kappa S_k with kappa
+unknown, and so follow Student's t. A step of size delta at block j adds f_k delta to e_k, where f is the filter's
+response to a step, which may begin within block j (`PARTS`). With a = sum f e / S, b = sum f^2 / S, T = sum e^2 / S
+and n innovations, and with delta ~ N(0, v kappa) and kappa integrated, the likelihood ratio is
 
-    R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2),
+    R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2).
 
-counted where a > 0 only, which makes it smaller. The walk's size q is one of `WALKS`; what was known of it before j is
-its prior pi_j, in which each keeps a share, for the walk may change. Both sides average over it,
+It is counted only where a > 0, which makes it smaller. The walk's size q is one of `WALKS`. What was known of q
+before block j is its prior pi_j, in which each size keeps some probability, as the walk may change. Numerator and
+denominator are both averaged over it:
 
-    M_k = sum_j  sum_q pi_j(q) p_q(e_j..e_k) mean_v R_j  /  sum_q pi_j(q) p_q(e_j..e_k),
+    M_k = sum_j  sum_q pi_j(q) p_q(e_j..e_k) mean_v R_j  /  sum_q pi_j(q) p_q(e_j..e_k).
 
-an e-detector, whatever level and noise are: E[M at a stopping time] <= E[blocks until then]. An alarm where M > 1/alpha
-comes once in 1/alpha blocks of a healthy machine, at most. Fewer onsets only make M smaller: they are thinned with
-their age, so that memory is bounded.
+This is an e-detector for any level and noise: E[M at a stopping time] <= E[blocks until then]. An alarm where M >
+1/alpha therefore occurs at most once in 1/alpha blocks of a healthy machine. Fewer onsets only make M smaller, and so
+old onsets are thinned out, which bounds the memory.
 
-Sources: J. Shin, A. Ramdas, A. Rinaldo, arXiv 2203.03532 (e-detectors); A. S. Willsky and H. L. Jones, IEEE
-Trans. Automat. Contr. 21 (1976) 108 (step in a filter).
+Sources: J. Shin, A. Ramdas, A. Rinaldo, arXiv 2203.03532 (e-detectors); A. S. Willsky and H. L. Jones, IEEE Trans.
+Automat. Contr. 21 (1976) 108 (step in a filter).
 """
 
 from __future__ import annotations
@@ -61,13 +62,14 @@ _SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "lo
 
 
 class StepDetector:
-    """An e-detector for a rise of one coefficient, block by block, in bounded memory.
+    """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
-    For each walk q a Kalman filter gives `_level` and `_level_variance`; `_squares`, `_count`: T and n of the
-    innovations with a fading memory; `_log_weights`: log probability of the walk; `_log_variances`: sum of log S.
-    `_sums` (5, q, j): rows `_REST` to `_LOG_PRIOR` of each walk and onset j. `_onsets` (j, 4): number of innovations
-    since, number of the block in which the onset lies, onset and begin of that block [s]. `_unit`: standard deviation
-    of the first block, in which estimates are stored.
+    The statistic is the e-detector of the module's docstring, whose symbols are used here. For each size q of the
+    random walk a Kalman filter gives `_level` and `_level_variance`. `_squares` and `_count` are T and n of the
+    innovations, with fading memory, `_log_weights` the log probability of q, and `_log_variances` the sum of log S.
+    `_sums` (5, q, j) has the rows `_REST` to `_LOG_PRIOR` for each walk q and onset j. `_onsets` (j, 4) holds for
+    each onset the number of innovations since, the number of its block, its time and the begin of its block [s].
+    `_unit` is the standard deviation of the first block, the unit in which estimates are stored.
     """
 
     def __init__(self) -> None:
@@ -77,20 +79,20 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all onsets and blocks so far; keep the learned noise and walk."""
+        """Drop all blocks so far and rises that may have begun in them; keep the learned noise and random walk."""
         self._end = -np.inf
         self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
 
     def is_representable(self, g: float, deviation: float) -> bool:
-        """Test whether the squares of `g` and its `deviation`, in units of the first deviation, fit into floats."""
+        """Test whether the squares of an estimate `g` and of its standard `deviation` can be stored as floats."""
         unit = self._unit or deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Update filters and sums by a block from `begin` to `end` [s]: `g` with its standard `deviation`.
+        """Process the estimate `g` of the block from `begin` to `end` [s], with its standard `deviation`.
 
-        With the innovation e = g - level of each walk's filter, its variance S, and the effect f of a unit step on it,
-        a += f e / S, b += f^2 / S and T += e^2 / S for each onset.
+        Let e = g - level be the innovation of a walk's filter, S its variance, and f the effect of a unit step on it.
+        Then for each onset a += f e / S, b += f^2 / S and T += e^2 / S.
         """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
@@ -118,9 +120,9 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the noise and the probabilities of the q walks by one innovation e.
+        """Update the noise and the probabilities of the q random walks by one innovation e.
 
-        `variance`: S, by each walk's filter; `square`: e^2 / S; both (q, 1).
+        `variance` (q, 1) is S from each walk's filter, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -135,7 +137,7 @@ class StepDetector:
         self._log_variances = self._log_variances + np.log(variance)
 
     def _add_onsets(self, begin: float, end: float) -> None:
-        """Add the onsets within a block, one for each of `PARTS`, and thin the old ones."""
+        """Add possible onsets in the block from `begin` to `end` [s], one for each of `PARTS`; thin out old ones."""
         sums = np.zeros((5, len(WALKS), len(PARTS)))
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
         # pi_j(q) p_q(e_j..e_k) = exp(sums[_LOG_PRIOR]) T_k^(-n/2) prod S^(-1/2), up to a factor equal for all q
@@ -149,7 +151,11 @@ class StepDetector:
             self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
-        """Compute the log e-value of a step, log M, or minus infinity if a quick bound of it is at most `min_log_e`."""
+        """Compute the logarithm of the evidence (e-value M of the module's docstring) that the coefficient has risen.
+
+        The result is minus infinity if no rise can have begun yet, or if a quick upper bound of log M is at most
+        `min_log_e`.
+        """
         if not len(self._onsets):
             return -np.inf
         a, b, T = self._sums[_A : _T + 1]
@@ -160,25 +166,25 @@ class StepDetector:
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
 
     def _log_likelihoods(self) -> Array:
-        """Compute the log likelihood (q, j) of each walk since each onset without a step, up to a constant."""
+        """Compute the log likelihood of each walk q since each onset j without a step, (q, j), up to a constant."""
         n, log_T = self._onsets[:, 0], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratios log R (v, q, j) for each step size v, walk q and onset j."""
+        """Compute the log likelihood ratio log R of a step of size v under walk q with onset j, (v, q, j)."""
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
         explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
         return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, 0] * np.log1p(-explained)))
 
     def _log_terms(self) -> Array:
-        """Compute the logarithms of the terms of M, (v, q, j), for each step size v, walk q and onset j."""
+        """Compute the logarithms of the terms whose sum is M, for each step size v, walk q and onset j, (v, q, j)."""
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate the step in the blocks: onset and size, averaged over all walks, onsets and sizes."""
+        """Estimate time and size of the coefficient's rise, averaged over random walks, onsets and prior sizes."""
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)
@@ -199,7 +205,11 @@ class StepDetector:
         return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
     def bound(self, probability: float = 0.95) -> float:
-        """Compute the quantile of a positive rise at `probability`, an upper bound [unit of g]; inf without onsets."""
+        """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
+
+        The bound is the quantile, at `probability`, of the rise under the condition that it is positive. It is
+        infinite until there have been enough blocks for a rise to begin in one of them.
+        """
         if not len(self._onsets):
             return np.inf
         a, b, T = self._sums[_A : _T + 1]
@@ -212,16 +222,22 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of the innovations over the stated one, for the walk with a tenth of a block's variance."""
+        """Variance of the innovations over the variance that the blocks state for their estimates.
+
+        It applies to the random walk whose variance per block is a tenth of a block's variance.
+        """
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values."""
+        """Return the state as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        """Restore a state saved by `state`, so that later results are identical to the last bit.
+
+        Raises InputError if the state does not fit.
+        """
         restore_attributes(self, _SAVED, state)
         if self._sums.shape[2] != len(self._onsets):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
@@ -230,8 +246,9 @@ class StepDetector:
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
     """Select the onsets to keep: all of the last `RECENT` blocks, and fewer of older blocks.
 
-    Older onsets are kept on a grid that coarsens with age, up to `HORIZON` blocks, and only if at the start of a block.
-    `block`: number of the present block; `onsets` (j, 4).
+    Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the
+    age `HORIZON`. `block` is the number of the present block and `onsets` (j, 4) are those of `StepDetector`. Returns
+    flags (j,).
     """
     _, onset_block, onset, block_start = onsets.T
     age = block - onset_block

@@ -1,6 +1,7 @@
-"""Features of a running machine that no balance contains, block by block: duty, noise, hum, sense, mean pressures.
+"""Features of a running machine that no volume balance contains, block by block.
 
-Features and tests of their steps are those of a recording's blocks (`inference.changes`).
+They are duty, noise, mains hum, the sense of p_A - p_B, and mean pressures. Features and tests are those of the
+blocks of a recording (`inference.changes`).
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ _GROUP_SIZES = (1, 2, 4)
 
 
 class SignalWindow:
-    """The features of the last `WINDOW` blocks of a running machine, and tests of their steps."""
+    """Duty, noise, hum and mean pressures of the last `WINDOW` blocks of a machine, and tests for their changes."""
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 0))
@@ -68,7 +69,10 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
-        """Add the block that begins at the clock `begin` [s], unless samples are missing in it."""
+        """Compute and store the features of the block that begins at `begin` [s]; skip a block with missing samples.
+
+        `channels` are the samples of the block by channel, and `rate` is the sampling rate [Hz].
+        """
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
@@ -88,7 +92,10 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test the features for a step in the blocks that begin at the clock `since` [s] or later."""
+        """Test each feature for a step in the blocks that begin at `since` [s] or later.
+
+        The result is empty if there are fewer than `MIN_BLOCKS` blocks.
+        """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()
@@ -104,7 +111,11 @@ class SignalWindow:
         )
 
     def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
-        """Test the pressure levels for steps, in the shortest groups of blocks with both directions of motion."""
+        """Test the mean pressures in either direction of motion for steps.
+
+        Blocks are averaged in the smallest groups in which the machine moves both ways. `rows` are stored blocks,
+        `time` (n,) their centres [s]. The result is empty if there are too few groups.
+        """
         # a row ends with a Gram matrix, flattened
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)
         for size in _GROUP_SIZES:
@@ -119,9 +130,12 @@ class SignalWindow:
         return ()
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values."""
+        """Return the state as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, ("_rows", "_means"))
 
     def load_state(self, state: Any) -> None:
-        """Restore a saved `state`; later results are bit-identical. Raises InputError if the state does not fit."""
+        """Restore a state saved by `state`, so that later results are identical to the last bit.
+
+        Raises InputError if the state does not fit.
+        """
         restore_attributes(self, ("_rows", "_means"), state)

@@ -1,4 +1,4 @@
-"""One running actuator, block by block: L/min with an interval, and alarms at a stated rate per operating hour."""
+"""Watch a running actuator block by block: leakage in L/min with an interval, and alarms at a stated rate."""
 
 from __future__ import annotations
 
@@ -50,39 +50,41 @@ if TYPE_CHECKING:
 #: Format of the saved state.
 STATE_VERSION = 16
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
-#: Blocks per mean that is stated as the leak after an alarm.
+#: Number of blocks in the mean that is stated as the leak after an alarm.
 _N_RECENT = _PRIORS.recent
 #: Numbers of a block that are saved.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
-#: Numbers of a block beyond this are refused: their products would overflow.
+#: Blocks with larger numbers are refused, as their products would overflow.
 _MAX_NUMBER = 1e100
-#: A way of watching estimates a conductance for each block.
+#: Each way of watching estimates a conductance for each block.
 Estimator = LiveBalance | PressureEstimator
 _ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBalance, PressureEstimator)}
 
 
 class Watch:
-    """One running actuator, whose state can be saved; `watch` makes one.
+    """Watch one running actuator for leaks; made by the function `watch`, with a state that can be saved.
 
-    Where the position is recorded it is watched by the balance of volumes, else by the pressures and the command.
+    If the position is recorded, the leakage is estimated from the balance of volumes, otherwise from the response of
+    the pressures to the command.
 
     Parameters
     ----------
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
-        As for `watch`.
+        Arguments of `watch`.
     litres : mapping of str to bool, optional
-        For each way of watching, whether the rig states the sizes that L/min need; by default found from the rig.
+        For each way of watching, "volumes" and "pressures", whether the rig states the sizes that are needed for
+        L/min; by default this is found from the rig.
     healthy : HealthyLevel, optional
-        As for `watch`.
+        Argument of `watch`.
 
     Attributes
     ----------
     leak : WatchedLeak or None
-        The leak that a test has shown.
+        The leak that a test has detected, None if there is none.
     baseline : WatchBaseline or None
-        Healthy state that the machine is compared with, None while it is learned.
+        Healthy state that the machine is compared with, None while it is being learned.
     blocks, baseline_version : int
-        Whole blocks so far, and version of the baseline that is in use or being learned.
+        Number of complete blocks so far, and version of the baseline that is in use or being learned.
 
     Examples
     --------
@@ -124,9 +126,10 @@ class Watch:
         self._since = math.nan  # begin of the first block that others are compared with [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
-        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, applied once in `seconds`.
+        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
 
-        Raises InputError if the stated rate of false alarms, of which each test has a fraction, allows no threshold.
+        Each test has a fixed fraction of the stated rate of false alarms. Raises InputError if no threshold can be
+        set for this rate.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
@@ -138,39 +141,42 @@ class Watch:
 
     @cached_property
     def _rig_text(self) -> str:
-        """The rig as JSON, for the saved state."""
+        """The rig as JSON text, for the saved state."""
         return json.dumps(self._rig.model_dump())
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig of the baseline, whether it states L/min for each way of watching, and its learning time [h]."""
+        """Rig and learning time [h] of the baseline, and for each way of watching if the rig states L/min.
+
+        The order is rig, mapping from way of watching to bool, learning time.
+        """
         return self._rig, self._litres, self.learn_hours
 
     @property
     def method(self) -> str:
-        """Way of watching, "volumes" where the position is recorded, else "pressures"."""
+        """Way of watching: "pressures" if channels without a position are in use, else "volumes"."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
     def counters(self) -> dict[str, int]:
-        """Counts of dropped samples, skipped blocks and interruptions, by reason."""
+        """Numbers of dropped samples, skipped blocks and interruptions, by reason."""
         return dict(self._samples.counters)
 
     @property
     def block_seconds(self) -> float:
-        """Approximate duration of a block [s]."""
+        """Approximate length of a block [s]; until samples have arrived, that of the volume balance."""
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
     def why_no_litres(self) -> str:
-        """Reason why L/min are not stated, "" if they are."""
+        """Reason why no L/min are stated; "" if they are."""
         if self._estimator is None or self._estimator.litres:
             return ""
         return "L/min is not stated: areas and displacement of the machine are not, which its file states"
 
     @property
     def evidence(self) -> Evidence:
-        """Present verdict, with the detected leak or the 95 % upper bound of an undetected one."""
+        """Present verdict, with the detected leak or with a 95 % upper bound of an undetected one."""
         leak = self.leak
         if leak is not None:
             return decide_on_stream(self._measure(self._estimator or self._make_estimator(), leak), leak.allowed)
@@ -182,7 +188,7 @@ class Watch:
         return decide_on_stream(measure, probability)
 
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Describe the detected `leak`, or if it is None the upper bound of an undetected one."""
+        """Describe the detected `leak` or, if `leak` is None, the upper bound of an undetected one."""
         make_measure = partial(
             LiveLeak,
             flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
@@ -204,23 +210,24 @@ class Watch:
         Parameters
         ----------
         samples : Recording
-            The next samples, in SI units: ``p_A``, ``p_B``, ``x`` and ``theta`` or ``omega``; or, of a cylinder with
-            two like areas, ``p_A``, ``p_B`` and ``u``; behind a servo valve ``x``, ``u`` and all four pressures.
-            Samples that do not fit are dropped and counted (`counters`).
+            The next samples, in SI units. A pump-controlled cylinder needs ``p_A``, ``p_B``, ``x`` and ``theta`` or
+            ``omega``; with two equal areas ``p_A``, ``p_B`` and ``u`` suffice. A valve-controlled cylinder needs
+            ``x``, ``u`` and all four pressures. Samples that cannot be used are dropped and counted (`counters`).
         follows : bool, default True
-            False if the clock starts anew, as at the start of a separate file.
+            False if the clock starts anew, as at the beginning of a separate file.
 
         Returns
         -------
         list of BlockEstimate
-            One for every block that the samples complete.
+            One estimate for every block that the samples complete.
         """
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Yield the estimate of each block (`update`) with the leak known by then.
+        """Process samples like `update`; yield the estimate of each block and the leak detected by then.
 
-        Iterate to the end, as samples are processed only as the iterator advances.
+        If no leak has been detected, the second item is None. Samples are processed only as the iterator advances,
+        and so it must be iterated to the end.
         """
         if not follows:
             self._samples.restart("pauses between samples")
@@ -240,14 +247,17 @@ class Watch:
             self._samples.is_final = self._estimator.has_begun
 
     def _make_estimator(self) -> Estimator:
-        """Make the estimator of the conductance for the way of watching."""
+        """Make the object that estimates the conductance from the channels in use."""
         litres = self._litres.get(self.method, False)
         if self.method == PressureEstimator.method:
             return PressureEstimator(self._rig, litres)
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the numbering of blocks and baselines of an earlier watch with other settings or state."""
+        """Continue the numbering of an earlier watch, which had other settings.
+
+        `blocks` is the number of its blocks, and `baseline_version` the version of its baseline.
+        """
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -261,20 +271,21 @@ class Watch:
     def dismiss(self) -> None:
         """Withdraw the leak alarm and restart the tests with the next block; keep the learned baseline.
 
-        The reference level from healthy recordings (`healthy`), which may have caused the alarm, is dropped.
+        The level from healthy recordings (`healthy`), which may have caused the alarm, is not used any more.
         """
         self.leak = self.healthy = None
         self._forget()
 
     def _forget(self) -> None:
-        """Restart the tests: drop all blocks that later ones would be compared with."""
+        """Restart the tests, and drop all blocks that later ones would be compared with."""
         self._detector.forget()
         self._compared, self._grouped = self._compared[:0], 0
 
     def judge(self, result: BlockResult) -> BlockEstimate:
-        """Process a result of the estimator; return the estimate of its last block, or the reason why there is none.
+        """Test a result of the estimator for a leak, and return the estimate of its last block.
 
-        `blocks` counts results: the blocks of the first fit arrive in one.
+        If there is no conductance, the returned estimate states the reason. `blocks` counts results: the blocks of
+        the first fit arrive together as one.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -300,7 +311,7 @@ class Watch:
         awaits_explanation = self._test_step(estimator, block)
         if not has_known_duty:
             return BlockEstimate(self.blocks, block.end, "another duty" if self.leak is None else "alarm")
-        # a step that may turn out to be no leak must not count in a test of the mean: begin a new group
+        # a step that may not be a leak must not count in the test of the mean: begin a new group
         self._grouped = 0 if awaits_explanation else self._grouped + 1
         if self._grouped == GROUP:
             self._grouped = 0
@@ -319,7 +330,10 @@ class Watch:
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
-        """Add a block to the tests, which restart after a pause or between known and other duties."""
+        """Add a block to the tests; restart them after a pause and at a change between known and other duties.
+
+        `row` is the block as an array with one row of `_BLOCK`.
+        """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
         if has_known_duty != self._is_known:  # blocks under different duties are not compared
@@ -333,7 +347,7 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, and freeze the baseline after the stated hours."""
+        """Add a block to the baseline; freeze the baseline once the stated hours are over."""
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
@@ -342,10 +356,10 @@ class Watch:
             self._learning = BaselineLearning()
 
     def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
-        """Test for a step of the conductance after a block, and raise the leak alarm if a leak explains the step.
+        """Test for a step of the conductance after a block, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Returns True if a step was
-        found whose explanation needs further blocks.
+        found but is not, or not yet, explained by a leak.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -365,9 +379,10 @@ class Watch:
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
-        """Explain a rise by the blocks around it, or as a leak if these are no longer stored.
+        """Explain an increase of the conductance by the blocks around it, or as a leak if these are no longer stored.
 
-        After a start, or a change that is surely no leak, the tests restart, and the event is counted.
+        If the explanation is the start of the machine, or surely another event, the tests restart and the event is
+        counted.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))
         if n_since < _EXPLANATION.shows:
@@ -389,7 +404,11 @@ class Watch:
         return explanation
 
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Test the mean of the last `GROUP` blocks against the baseline or, until it exists, the healthy recordings."""
+        """Test the mean of the last `GROUP` blocks against the healthy machine, and raise the alarm if it is higher.
+
+        The healthy machine is that of the baseline or, until there is one, of the healthy recordings. Without either
+        there is no test.
+        """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
         if healthy is None:
@@ -425,10 +444,11 @@ class Watch:
         before: float | None = None,
         cause: Cause | None = None,
     ) -> None:
-        """Set the leak alarm, `self.leak`, from a significant rise at the end of a block.
+        """Set the leak alarm, `self.leak`, from a significant increase of the conductance at the end of a block.
 
-        `before`: conductance before the onset, by default the mean of the blocks before it; `cause`: by default that of
-        the estimator. If there is an alarm already, its time and its conductance before the onset are kept.
+        `threshold` is that of the test, and `reason` the text of the alarm. `before` is the conductance before the
+        onset, by default the mean of the blocks before it. `cause` is by default that of the estimator. If there is
+        an alarm already, its time and its conductance before the onset are kept.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -457,12 +477,12 @@ class Watch:
         self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
 
     def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
-        """Return the stored blocks since the latest onset of a leak, at least the last one."""
+        """Return the stored blocks after the latest possible onset of a leak, at least the last block."""
         is_after = self._compared["end"] - self.block_seconds >= leak.onset_interval_s[1]
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Average the flows of the last block's estimate over more blocks, to cover whole cycles of the duty.
+        """Replace the flows of the last block's estimate by means over more blocks, to cover whole duty cycles.
 
         The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
         """
@@ -473,7 +493,10 @@ class Watch:
         return self._add_flows(estimate, estimator, blocks)
 
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
-        """Add mean total flow and leak of blocks [L/min], with 95 % intervals, to an estimate, if L/min are stated."""
+        """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
+
+        The estimate is returned unchanged if no L/min are stated.
+        """
         if not estimator.litres:
             return estimate
         lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
@@ -491,7 +514,7 @@ class Watch:
             min_fraction, reference_sd = estimator.min_internal_fraction, self.leak.rise_sd
         leak = mean_flow((blocks["g"] - reference.level) * lpm, errors)
         half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
-        # the interval of the reference level, and what part of the flow may be outside or by an orifice, widen it
+        # an uncertain reference level, and flow that may be to the outside or through an orifice, widen the interval
         low = min_fraction * (leak.value + (reference.level - reference.high) * mean_lpm - half_width)
         high = estimator.orifice_factor * (leak.value + (reference.level - reference.low) * mean_lpm + half_width)
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
@@ -508,9 +531,9 @@ class Watch:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Watch:
-        """Restore a watch from its `state`, which may have passed through JSON; later results are bit-identical.
+        """Restore a watch from its `state`, which may have passed through JSON.
 
-        Raises InputError if the state is of another version or damaged.
+        Later results are identical to the last bit. Raises InputError if the state is of another version or damaged.
         """
         version = require_part(state, "version", int)
         if version != STATE_VERSION:
@@ -557,19 +580,20 @@ def watch(
     Parameters
     ----------
     rig : Rig, str or path, default "thesis"
-        States piston area and pump displacement; without a recorded position the whole model is used.
+        Sizes of the machine. If the position is recorded, only piston area and pump displacement are used, otherwise
+        the whole model.
     false_alarms_per_1000_h : float, default 1
-        False alarms of a healthy machine per 1000 operating hours, at most.
+        Largest number of false alarms of a healthy machine per 1000 operating hours.
     learn_hours : float, default 8
-        Operating hours from which the baseline is learned; then it is frozen.
+        Operating hours over which the baseline is learned; after them it is frozen.
     healthy : HealthyLevel, optional
-        Level of the machine's healthy recordings. Until there is a baseline, the total leakage is compared with it, so
-        that a leak present from the first sample is found.
+        Leakage level of the machine's healthy recordings. Until there is a baseline, the total leakage is compared
+        with this level. A leak that is present from the first sample can then be detected.
 
     Returns
     -------
     Watch
-        Its `update` takes samples, its `state` can be saved.
+        The watch. Its method `update` processes samples, and its method `state` returns a state that can be saved.
 
     Raises
     ------

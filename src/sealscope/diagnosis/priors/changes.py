@@ -1,11 +1,21 @@
-"""Typed tables of `inference/changes/priors.toml`: priors on signals that a leak does not change."""
+"""Typed tables of `inference/changes/priors.toml`: assumptions on signals that a leak does not change."""
 
 from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class SignalPriors(PriorTable):
-    """Features of the signals: `mains` [Hz]; `neighbours` [bins]; `shortest` [s]; the others are numbers."""
+    """Features of the signals, such as noise and hum, and how much they change in a healthy machine.
+
+    - `blocks`: most blocks that a recording is divided into.
+    - `order`: number of differences by which noise is told from motion and ringing.
+    - `mains` [Hz]: frequencies of the electric grids.
+    - `highest`: highest frequency over the sampling rate at which a hum is looked for.
+    - `neighbours` [bins]: distances of the spectral lines that a line of hum is compared with.
+    - `shortest` [s]: shortest block.
+    - `busy`: smallest time in motion, over that of the busiest block, with which a block counts as in motion.
+    - `wander`: change of the logarithm of a feature within a recording.
+    """
 
     blocks: int
     order: int
@@ -18,7 +28,12 @@ class SignalPriors(PriorTable):
 
 
 class PressureLevelPriors(PriorTable):
-    """Mean pressures in either direction of motion."""
+    """Mean pressures in either direction of motion.
+
+    - `blocks`: numbers of blocks that are tried, the largest first.
+    - `least`: smallest fraction of a block's time for which it moves in either direction.
+    - `slowest`: lowest speed that counts as motion, over the highest one.
+    """
 
     blocks: tuple[int, ...]
     least: float
@@ -26,7 +41,14 @@ class PressureLevelPriors(PriorTable):
 
 
 class HealthyLevelPriors(PriorTable):
-    """Friction and drifts compared with healthy recordings; `drift` [Pa], the others are numbers."""
+    """Friction and drift of a pressure, compared with healthy recordings.
+
+    - `slowest`: lowest speed that counts as motion, over the highest one.
+    - `friction`: standard error of the logarithm of a recording's friction.
+    - `scatter`: standard deviation of this logarithm between days.
+    - `recordings`: number of recordings that the prior on the scatter counts for.
+    - `drift` [Pa]: standard deviation of a transducer's zero within a recording.
+    """
 
     slowest: float
     friction: float
@@ -36,7 +58,15 @@ class HealthyLevelPriors(PriorTable):
 
 
 class OctavePriors(PriorTable):
-    """Spectra of both pressures in octaves: `lowest`, `highest` [Hz], `seconds` [s]; the others are numbers."""
+    """Spectra of both pressures in octaves, compared with healthy recordings.
+
+    - `lowest`, `highest` [Hz]: limits of the frequencies that are compared.
+    - `share`: highest frequency over the sampling rate.
+    - `seconds` [s]: length of a window.
+    - `error`: standard error of the ratio of a recording.
+    - `scatter`: standard deviation of the ratio between days.
+    - `recordings`: number of recordings that the prior on the scatter counts for.
+    """
 
     lowest: float
     highest: float
@@ -48,7 +78,11 @@ class OctavePriors(PriorTable):
 
 
 class FilteredPriors(PriorTable):
-    """Size of the spectral tilt that a filter causes: median and spread of its logarithm."""
+    """Change of the spectrum's tilt that a filter or a clogged line of a transducer causes.
+
+    - `size`: median size.
+    - `spread`: standard deviation of the logarithm of the size.
+    """
 
     size: float
     spread: float

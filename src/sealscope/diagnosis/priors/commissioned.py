@@ -1,10 +1,14 @@
-"""Typed tables of `commissioned/priors.toml`: requirements on the smallest leak that a machine's file states."""
+"""Typed tables of `commissioned/priors.toml`: how the smallest detectable leak of a machine is defined."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class SmallestLeakPriors(PriorTable):
-    """Requirements on the smallest detectable leak: detection probability, and multiples of healthy days tried."""
+    """Definition of the smallest detectable leak of a machine.
+
+    - `power`: probability with which the next recording shows it.
+    - `repeats`: factors on the number of healthy recordings that are tried to halve it.
+    """
 
     power: float
     repeats: tuple[int, ...]

@@ -1,10 +1,16 @@
-"""Typed tables of `decision/priors.toml`: priors of decisions."""
+"""Typed tables of `decision/priors.toml`: probabilities that a decision rests on."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class NullPriors(PriorTable):
-    """Prior on the error of a detector's null distribution for healthy recordings."""
+    """Prior on the error of the false-alarm probabilities that a detector's own law gives.
+
+    - `fails`: fraction of machines on which the law does not hold for a statistic.
+    - `inflation`: exponential scale of the logarithm of the factor by which such a law underestimates a surprisal's
+      mean.
+    - `largest`: largest such factor.
+    """
 
     fails: float
     inflation: float
@@ -12,13 +18,25 @@ class NullPriors(PriorTable):
 
 
 class QuestionPriors(PriorTable):
-    """Fraction of the false-alarm probability for each test of a diagnosis."""
+    """Division of the false-alarm probability of a diagnosis among its tests.
+
+    - `within`: fraction for a change within the recording if there are healthy recordings; without them, fraction for
+      the
+      leakage against the limit in the rig's file.
+    """
 
     within: float
 
 
 class ExplanationPriors(PriorTable):
-    """Probabilities above which an explanation is named or a leak stated."""
+    """Probabilities from which an explanation is named or a leak stated.
+
+    - `heading`: factor by which another event that is named for a healthy recording may be rarer than a false leak.
+    - `leak`: probability from which a change is called a leak.
+    - `named`: probability from which a cause other than a leak is named.
+    - `sure`: a leak is excluded if its probability is below 1 - `sure`.
+    - `misfit`: smallest relative error with which a term describes the data.
+    """
 
     heading: float
     leak: float
@@ -28,7 +46,11 @@ class ExplanationPriors(PriorTable):
 
 
 class WorthPriors(PriorTable):
-    """Limits beyond which an upper bound of a leak, or an unjudged rest of a recording, is too large to state."""
+    """Limits beyond which "no leak" is not stated.
+
+    - `share`: largest upper bound of a leak, over the pump's flow.
+    - `unjudged`: largest fraction of a recording after its last judged sample.
+    """
 
     share: float
     unjudged: float

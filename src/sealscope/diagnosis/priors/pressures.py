@@ -1,4 +1,4 @@
-"""Typed tables of `inference/pressures/priors.toml`: priors on machines judged by pressures and command."""
+"""Typed tables of `inference/pressures/priors.toml`: assumptions on machines judged by pressures and command."""
 
 from collections.abc import Mapping
 from typing import Literal
@@ -12,7 +12,13 @@ Parameter = Literal[
 
 
 class ResponseBlocks(PriorTable):
-    """Blocks of a recording: `shortest`, `wander` [s]; `slowest` [Hz]; the others are numbers."""
+    """Division of a recording into blocks.
+
+    - `most`: largest number of blocks.
+    - `shortest` [s]: shortest block.
+    - `wander` [s]: time for which the change of a parameter is stated.
+    - `slowest` [Hz]: lowest sampling rate.
+    """
 
     most: int
     shortest: float
@@ -21,14 +27,23 @@ class ResponseBlocks(PriorTable):
 
 
 class MachineScale(PriorTable):
-    """Relative standard deviations of the rig's sizes."""
+    """Uncertainty of the rig's sizes, as relative standard deviations.
+
+    - `mass`: moving mass.
+    - `area`: piston area.
+    """
 
     mass: float
     area: float
 
 
 class MainsPriors(PriorTable):
-    """Lines of the mains: `lines` [Hz]; the others are numbers."""
+    """Hum of the electric mains in the pressures.
+
+    - `lines` [Hz]: frequencies of the grids.
+    - `within`: relative error of these frequencies.
+    - `harmonics`: highest harmonic.
+    """
 
     lines: tuple[float, ...]
     within: float
@@ -36,7 +51,12 @@ class MainsPriors(PriorTable):
 
 
 class ConductancePriors(PriorTable):
-    """Conductance past the piston: `wander`, `level` [m^3/(s Pa)]; the others are numbers."""
+    """Leakage conductance past the piston.
+
+    - `wander` [m^3/(s Pa)]: its change in 90 s, a standard deviation.
+    - `level` [m^3/(s Pa)]: its standard deviation between recordings of one machine.
+    - `orifice`: mean flow of an orifice over that of the laminar leak that fits the response best.
+    """
 
     wander: float
     level: float
@@ -44,9 +64,10 @@ class ConductancePriors(PriorTable):
 
 
 class FrictionLaw(PriorTable):
-    """A law of friction: compliance `give` [m/N] before sliding, and largest creep speed [m/s].
+    """A law of friction; the unit of lengths per force is [m/N].
 
-    `creep` is None to use the value of the rig.
+    - `give` [m/N]: compliance of the contact before it slides: centre, standard deviation and change in 90 s.
+    - `creep` [m/s]: largest speed of creep; None to use the value of the rig.
     """
 
     give: tuple[float, float, float]
@@ -54,7 +75,17 @@ class FrictionLaw(PriorTable):
 
 
 class FollowPriors(PriorTable):
-    """Fits along a recording: `window`, `beginning`, `block`, `settling`, `centring` [s]; `slow` [periods]."""
+    """Fits along a recording.
+
+    - `window` [s]: length of the first fit.
+    - `beginning` [s]: length of the beginning, which is run once before the fit.
+    - `block` [s]: length of a block of the beginning.
+    - `settling` [s]: time in which the drive starts.
+    - `centring` [s]: time constant of the mean position, from which the load's spring force is counted.
+    - `slow` [periods]: width of the Gaussian filter that removes the ringing.
+    - `unexplained`: standard deviations of a block's chi square above which jumps of parameters are tried.
+    - `explained`: largest fraction of the variance of p_A - p_B that valid parameters leave unexplained.
+    """
 
     window: float
     beginning: float
@@ -69,8 +100,9 @@ class FollowPriors(PriorTable):
 class PressureResponsePriors(PriorTable):
     """The tables of `inference/pressures/priors.toml`.
 
-    By the parameter's name, `response`: centre, standard deviation and wander in 90 s; `start`, `jump`: middle of the
-    values that fits start from, and the factor to the largest.
+    Three of them are mappings by the name of a parameter. `response` gives centre, standard deviation and change in
+    90 s. `start` gives the middle of the values from which fits start, and the factor from it to the largest one.
+    `jump` gives the same for values after a jump.
     """
 
     blocks: ResponseBlocks

@@ -1,13 +1,17 @@
-"""Typed tables of `rms_change/priors.toml`: priors on the RMS of the details of healthy machines."""
+"""Typed tables of `rms_change/priors.toml`: assumptions on the RMS of wavelet details of healthy machines."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class WalkPriors(PriorTable):
-    """Random walk of the log RMS levels over time.
+    """Random walk of the logarithm of the RMS over time.
 
-    `machine`, `noise`, `duty`: half-Cauchy scales of the deviation gained in `time` [s], [1 in 90 s]; `tried`: number
-    of rates tried; `least`: smallest fraction of a level that is due to the machine.
+    - `machine`, `noise`, `duty` [1 in 90 s]: half-Cauchy scales of the standard deviation that it gains in `time`,
+      due to
+      the machine, to noise and to a duty that does not repeat.
+    - `tried`: number of rates of the walk between recordings that are tried.
+    - `time` [s]: time for which the scales are stated.
+    - `least`: smallest fraction of a detail's energy that is due to the machine.
     """
 
     machine: float
@@ -19,7 +23,13 @@ class WalkPriors(PriorTable):
 
 
 class DutyExponents(PriorTable):
-    """Prior standard deviations of the exponents in the power law of a detail's RMS over the duty."""
+    """Exponents of a power law for a detail's RMS over the duty, as prior standard deviations.
+
+    - `command`: of the command's RMS.
+    - `rate`: of the RMS of the command's rate of change.
+    - `load`: of the RMS of the pressure difference.
+    - `direction`: of the mean pressure difference over its RMS.
+    """
 
     command: float
     rate: float
@@ -28,7 +38,15 @@ class DutyExponents(PriorTable):
 
 
 class LevelScatter(PriorTable):
-    """Scatter of the log RMS from recording to recording; `pause` [s], the other fields have no unit."""
+    """Scatter of the logarithm of the RMS between recordings.
+
+    - `scatter`: standard deviation between recordings of one session.
+    - `session`: standard deviation between sessions.
+    - `pause` [s]: time without a recording that separates sessions.
+    - `error`: standard error of a recording.
+    - `freedom`: degrees of freedom of the prior on the scatter.
+    - `worth`: size of a change that is worth finding.
+    """
 
     scatter: float
     session: float
@@ -39,7 +57,16 @@ class LevelScatter(PriorTable):
 
 
 class RmsBlockPriors(PriorTable):
-    """Blocks of a recording; `seconds`, `settling` [s], the other fields have no unit."""
+    """Division of a recording into blocks.
+
+    - `seconds` [s]: shortest block.
+    - `samples`: fewest samples of a block.
+    - `most`: largest number of blocks.
+    - `fewest`: smallest number of blocks in which a change is looked for.
+    - `settling` [s]: time in which pressures and speed settle after a start.
+    - `settling_cycles`: the same in cycles of the duty.
+    - `standstill`: RMS of a command at standstill over that of the whole recording.
+    """
 
     seconds: float
     samples: int
@@ -51,7 +78,11 @@ class RmsBlockPriors(PriorTable):
 
 
 class RingingRates(PriorTable):
-    """Lowest sampling rates [Hz] at which the machine's and a hydraulic line's ringing are recorded."""
+    """Lowest sampling rates at which the ringing of the pressures is recorded.
+
+    - `ringing` [Hz]: ringing of the machine.
+    - `slowest` [Hz]: ringing of a hydraulic line.
+    """
 
     ringing: float
     slowest: float

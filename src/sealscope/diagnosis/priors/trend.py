@@ -1,10 +1,18 @@
-"""Typed tables of `trend/priors.toml`: priors on the levels of a machine from recording to recording."""
+"""Typed tables of `trend/priors.toml`: assumptions on a machine's leakage from recording to recording."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class LevelDeviation(PriorTable):
-    """Scatter of a level from recording to recording: its size, and the times [d] for which a part of it lasts."""
+    """Scatter of the level between recordings of one machine.
+
+    - `volume_balance`: standard deviation over the usual level, for the volume balance.
+    - `ringing`: standard deviation of the ringing's logarithm.
+    - `nodes`: number of standard deviations that are tried.
+    - `freedom`: degrees of freedom of the prior.
+    - `lasts`: fractions of the variance that are correlated over time, each equally likely.
+    - `times` [d]: correlation times.
+    """
 
     volume_balance: float
     ringing: float
@@ -15,16 +23,22 @@ class LevelDeviation(PriorTable):
 
 
 class LevelError(PriorTable):
-    """Errors stated for a single recording, of its ringing level (logarithm) and of its scale (relative)."""
+    """Errors of the level of a single recording.
+
+    - `ringing`: standard error of the ringing's logarithm.
+    - `scale`: relative difference of the scale above which recordings cannot be compared.
+    """
 
     ringing: float
     scale: float
 
 
 class ChangeScales(PriorTable):
-    """Scales of a change's half-normal priors; `wait` [d].
+    """Scales of the half-normal priors on a change.
 
-    `steps` in deviations between recordings, `intervals` in intervals between recordings.
+    - `steps` [deviations between recordings]: sizes of a step.
+    - `intervals` [intervals between recordings]: time in which a growth reaches one deviation.
+    - `wait` [d]: longest wait between recordings that counts as running time.
     """
 
     steps: tuple[float, ...]
@@ -33,7 +47,11 @@ class ChangeScales(PriorTable):
 
 
 class HistoryPriors(PriorTable):
-    """Limits of a fitted history: `outlier` [deviations between recordings]; `furthest` [d]."""
+    """Limits of a fitted history.
+
+    - `outlier` [deviations between recordings]: distance beyond which a single recording is an outlier.
+    - `furthest` [d]: longest time that is predicted.
+    """
 
     outlier: float
     furthest: float

@@ -1,16 +1,23 @@
-"""Typed tables of `verdict/priors.toml`: the leak that a machine bears, and how often a verdict may be wrong."""
+"""Typed tables of `verdict/priors.toml`: the default repair limit, and false-alarm probabilities."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class RepairPriors(PriorTable):
-    """Default repair limit, as the creep speed of the piston with its lines shut [mm/min]."""
+    """Default repair limit.
+
+    - `creep` [mm/min]: creep speed of the piston with its lines shut.
+    """
 
     creep: float
 
 
 class FalseAlarmPriors(PriorTable):
-    """Default, smallest and largest probability of the verdict `leak` on a leak-free recording."""
+    """Probability of the verdict "leak" on a leak-free recording.
+
+    - `probability`: default.
+    - `rarest`, `largest`: limits of what a caller may ask for.
+    """
 
     probability: float
     rarest: float

@@ -1,1 +1,1 @@
-"""The thesis's method: a change of the RMS of the db8 details."""
+"""The thesis's method: detect a leak by a change of the RMS of the pressures' db8 wavelet details."""

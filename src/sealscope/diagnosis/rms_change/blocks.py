@@ -1,7 +1,7 @@
-"""Cut a recording into blocks that compare with each other, and give each the RMS of its details and of its duty.
+"""Cut a recording into comparable blocks, and compute for each the RMS of the wavelet details and of the duty.
 
-A block is a whole fraction of the command's cycle, so that blocks of the same phase differ by noise and by changes of
-the machine alone; without a cycle it is a window of fixed length.
+A block is a whole fraction of the command's cycle, so that blocks of the same phase differ only by noise and by
+changes of the machine. Without a cycle, a block is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -31,13 +31,29 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 
 @dataclass(frozen=True)
 class RmsBlocks:
-    """Log RMS of every quantity (`QUANTITIES`) in the n blocks without missing samples.
+    """Logarithm of the RMS of every wavelet quantity (`QUANTITIES`) in n blocks of a recording.
 
-    `edges` (n + 1,): start of each block and end of the last one [s]; `log_rms` (n, 5 per chamber); `duty` (n, 4): log
-    RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp) / RMS(dp). In both, the
-    mean differences between the phases of a duty cycle are removed. `phases`: number of blocks per cycle; `cycle`:
-    period of the command [s], or None; `frozen`: description of the first block in which a pressure reading is stuck,
-    which makes its log RMS meaningless, or None; `n_left_out`: number of blocks with missing samples.
+    From `log_rms` and `duty` the mean differences between the phases of a duty cycle are removed.
+
+    Attributes
+    ----------
+    edges : array, (n + 1,)
+        Start of each block and end of the last one [s].
+    log_rms : array, (n, 5 per chamber)
+        Logarithm of the RMS of each quantity.
+    duty : array, (n, 4)
+        Logarithm of the RMS of the command, of its rate of change and of the pressure difference dp, and
+        mean(dp)/RMS(dp).
+    chambers : tuple of str
+        Names of the chamber pressures.
+    phases : int
+        Number of blocks per cycle of the command.
+    cycle : float or None
+        Period of the command [s], None if nothing repeats.
+    frozen : str or None
+        Description of the first block in which a pressure reading is stuck, which makes its log RMS meaningless.
+    n_left_out : int
+        Number of blocks that were left out because samples are missing.
     """
 
     edges: Array
@@ -51,21 +67,24 @@ class RmsBlocks:
 
     @property
     def share(self) -> float:
-        """Fraction of all blocks that are not left out."""
+        """Fraction of all blocks that have no missing samples."""
         return len(self.log_rms) / max(len(self.log_rms) + self.n_left_out, 1)
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns, such as "d3 of p_A"."""
+        """Names of the columns of `log_rms`, such as "d3 of p_A"."""
         return column_names(self.chambers)
 
     @property
     def seconds(self) -> float:
-        """Length of a block [s]."""
+        """Length of a block [s]; 0 without blocks."""
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return the blocks after the machine's start, which lasts 10 s or three cycles, at most an eighth of them."""
+        """Return the blocks after the machine's start, in which pressures and speed settle.
+
+        The start is taken to last 10 s or three cycles, whichever is longer, but at most an eighth of the blocks.
+        """
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
         first = min(n_blocks // 8, int(np.ceil(start_s / self.seconds))) if n_blocks else 0
@@ -73,20 +92,20 @@ class RmsBlocks:
 
 
 def column_names(chambers: Sequence[str]) -> list[str]:
-    """Return the names of the columns of `RmsBlocks.log_rms`."""
+    """Return the names of the columns of `RmsBlocks.log_rms`, such as "d3 of p_A"."""
     return [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chambers whose readings are not mostly clipped; if all are clipped, return all chambers."""
+    """Return the chamber pressures that are not mostly clipped, or all of them if every one is clipped."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
 
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
-    """Compute the log RMS (5 per judged chamber,) and the duty (4,) of a whole recording.
+    """Compute log RMS (5 per judged chamber,) and duty (4,) of a whole recording, as described for `RmsBlocks`.
 
-    Samples affected by padding of the wavelet transform are left out.
+    Samples at the ends, where the wavelet transform depends on padding, are left out.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -95,7 +114,10 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 
 
 def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
-    """Compute log RMS (n, 5 per chamber) and duty (n, 4) between consecutive sample `bounds` (n + 1,)."""
+    """Compute log RMS (n, 5 per chamber) and duty (n, 4) of the blocks between consecutive sample `bounds` (n + 1,).
+
+    `transformed` holds the wavelet details of each chamber.
+    """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
         load = recording["p_A"] - recording["p_B"]
@@ -112,9 +134,10 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
-    """Cut a recording into blocks, without the samples affected by padding of the wavelet transform.
+    """Cut a recording into blocks and compute their log RMS and duty.
 
-    The recording must be uniformly sampled and without missing samples.
+    The recording must be uniformly sampled and without missing samples. Samples at the ends, where the wavelet
+    transform depends on padding, are left out.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -138,11 +161,11 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
 
 
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
-    """Choose the sample bounds of the blocks, and the number of blocks per cycle.
+    """Choose the sample numbers at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
-    `inside`: samples unaffected by padding; `rate` [Hz]; `cycle`: period of the command [s], or None. A block is an
-    integer fraction or an integer multiple of the cycle. If this gives too many blocks, each block spans several whole
-    cycles.
+    `inside` are the samples that do not depend on padding, `rate` is the sampling rate [Hz], and `cycle` the period
+    of the command [s], or None. A block is an integer fraction or an integer multiple of the cycle. If this gives too
+    many blocks, each block spans several whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)
@@ -161,10 +184,10 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
 def _find_frozen(
     recording: Recording, chambers: Sequence[str], log_rms: Array, is_complete: NDArray[np.bool_], times: Array
 ) -> str | None:
-    """Describe the first block in which a pressure is stuck; None if there is none.
+    """Describe the first block in which a pressure reading is stuck; None if there is none.
 
-    A pressure is stuck if a detail d1 to d4 is only rounding error or not finite. `is_complete` (n,): blocks without
-    missing samples; `times` (n + 1,): bounds of the blocks [s].
+    A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. `is_complete` (n,) marks
+    the blocks without missing samples, and `times` (n + 1,) are the bounds of the blocks [s].
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

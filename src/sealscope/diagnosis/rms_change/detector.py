@@ -1,4 +1,4 @@
-"""The thesis's method as observables: changes of the RMS of the db8 details.
+"""The thesis's method as a detector: changes of the RMS of the pressures' db8 wavelet details.
 
 The thesis compares the RMS of d1..d4 and of d3*d4 before and after (its ch. 5 and Appendix C) and calls a leak where
 it went down (p_A) or up (p_B). Here d2..d4 of all chambers are tested for a step of either sign within the recording
@@ -38,13 +38,13 @@ DETAILS = "details"
 
 
 class RmsChange:
-    """Change of the details' RMS, within a recording or against leak-free ones."""
+    """Detector of changes of the wavelet details' RMS, within a recording or against leak-free recordings."""
 
     name = RMS_CHANGE
     reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
-        """Create the detector; `rig` is ignored, as nothing is assumed of the machine."""
+        """Create the detector; `rig` is ignored, as the method assumes nothing of the machine."""
 
     def usable(self, recording: Recording) -> str | None:
         """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
@@ -56,7 +56,7 @@ class RmsChange:
         return None if frozen is None else f"{frozen} is constant"
 
     def learn(self, recording: Recording) -> Summary:
-        """Summarise a healthy recording for later comparisons: log RMS, duty, chambers, rate and start."""
+        """Summarise a healthy recording for later comparisons: log RMS, duty, chambers, sampling rate and start."""
         levels, duty = measure_levels(recording)
         return {
             "chambers": list(judged_chambers(recording)),
@@ -68,7 +68,11 @@ class RmsChange:
         }
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the details' RMS for changes, within the recording or against the healthy ones."""
+        """Test the RMS of the details for changes.
+
+        The recording is compared with those of `baseline` or, without one, tested for a change within it. If the
+        sampling rate is too low or the recording too short, the report is empty and states the reason.
+        """
         min_rate: float = RMS_PRIORS.rate.slowest
         if recording.rate < min_rate:
             rule = f"needs {min_rate:g} Hz or more to see the ringing that a leak damps"
@@ -85,10 +89,10 @@ class RmsChange:
 
 
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
-    """Test every quantity of every chamber for a step within the blocks of one recording.
+    """Test every detail of every chamber for a step of its RMS within one recording.
 
-    All changed quantities share one onset, found from the sum of their log likelihoods. `rate`: sampling rate [Hz];
-    `unused`: recorded columns that belong to no channel.
+    All quantities are assumed to change at one onset, which is found from the sum of their log likelihoods. `rate` is
+    the sampling rate [Hz], and `unused` are recorded columns that belong to no channel.
     """
     changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -121,7 +125,10 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 
 
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
-    """Test a recording's RMS for changes against leak-free recordings of the same chambers and rate."""
+    """Test the RMS of a recording's details for changes against leak-free recordings of the same chambers and rate.
+
+    If there is none, the report is empty and states the reason.
+    """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, and must be of the same ones
     summaries = [
@@ -144,9 +151,10 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
 def compare_summaries(
     judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]
 ) -> tuple[tuple[Observable, ...], float]:
-    """Test every quantity of every chamber for a rise or fall against leak-free recordings.
+    """Test every detail of every chamber for a rise or fall of its RMS against leak-free recordings.
 
-    Returns the observables and the smallest 95 % upper bound of an undetected change over all judged quantities.
+    `judged` and `summaries` are results of `RmsChange.learn`. Returns one observable for each detail, and the
+    smallest 95 % upper bound of an undetected change over all judged quantities (change of log RMS).
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
@@ -164,17 +172,17 @@ def compare_summaries(
 
 
 def _is_judged(column: str) -> bool:
-    """Test whether the quantity in a column name, such as "d3 of p_A", is among the judged ones."""
+    """Test whether the detail in a column name, such as "d3 of p_A", is one of those that are judged (`JUDGED`)."""
     return column.split(maxsplit=1)[0] in JUDGED
 
 
 def _make_observable(
     column: str, size: float, score: float, chance: float, chambers: Sequence[str], onset: Interval | None = None
 ) -> Observable:
-    """Make the observable of a column's change.
+    """Make the observable for the change of one column, such as "d3 of p_A".
 
-    `chance`: p-value of a single test. It is corrected for the number of tests: a rise and a fall of each judged
-    quantity in each chamber.
+    `size` is the change of the log RMS, and `chance` the p-value of a single test. It is multiplied by the number of
+    tests: a rise and a fall of each judged quantity in each chamber.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",
@@ -187,6 +195,6 @@ def _make_observable(
 
 
 def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
-    """Select the log RMS (5 per chamber,) of these chambers from a recording's summary."""
+    """Select the log RMS (5 per chamber,) of the given chambers from a recording's summary."""
     levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
     return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

@@ -1,13 +1,15 @@
-"""The machine's part in the RMS of a detail, without the noise, within a recording and between recordings.
+"""Estimate how the ringing of a machine changes, from the RMS of wavelet details, with the noise removed.
 
-The energy of a detail d_j is that of white noise, equal in every detail (d1 is almost only noise), plus the machine's:
-E_j = (1 + g)^2 S_j + E_1. So the change g of the machine's amplitude is, to first order,
+The energy E_j of a detail d_j is the sum of two energies: that of white noise, which is equal in every detail (d1 is
+almost only noise), and that of the machine, E_j = (1 + g)^2 S_j + E_1. To first order the change g of the machine's
+amplitude follows from
 
     y = log RMS d_j - log sqrt(S_j + E_1) = w g + error,    w = S_j / (S_j + E_1),
 
-with E_1 of the same block or recording: a change of the noise cancels, and where noise dominates the weight w is small.
-For d1 y is the log RMS itself. The effect of the duty is eliminated: g follows powers of `blocks.DUTY` with priors on
-the exponents (`priors.toml`); a duty that does not repeat has a wider random walk of g.
+with E_1 of the same block or recording. A change of the noise therefore cancels, and where noise dominates the weight
+w is small. For d1, y is the log RMS itself. The effect of the duty is eliminated: g follows powers of the duty's
+features (`blocks.DUTY`) with priors on the exponents (`priors.toml`). For a duty that does not repeat, g has a wider
+random walk.
 """
 
 from __future__ import annotations
@@ -23,11 +25,11 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute the noise-free change of the log RMS, and the fraction of energy that is not noise.
+    """Compute the change of the log RMS without noise, and the fraction of the energy that is not noise.
 
-    `log_rms` (n, 5 per chamber): levels of n blocks or recordings; `healthy` (k, 5 per chamber): levels from which the
-    mean signal energy S_j of each detail is estimated, as the energy beyond that of d1. The energy E_1 of d1 is the
-    noise of the same row. Returns y and w of the module's equations, both in the shape of `log_rms`.
+    `log_rms` (n, 5 per chamber) are the values of n blocks or recordings. `healthy` (k, 5 per chamber) are those from
+    which the machine's mean energy S_j in each detail is estimated, as the energy that exceeds that of d1. The energy
+    E_1 of d1 in the same row is the noise. Returns y and w of the module's equations, both in the shape of `log_rms`.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -45,9 +47,10 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 
 
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Compute the information on the change g of each quantity over the blocks, with the duty eliminated.
+    """Compute the likelihood of the machine's change of amplitude, g of the module, in each block of a recording.
 
-    Returns one `Information` for each column of `blocks.log_rms`, and the mean weight w of each column.
+    The effect of the duty is eliminated. Returns one `Information` (a normal likelihood over the blocks) for each
+    column of `blocks.log_rms`, and the mean weight w of each column.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance
@@ -72,14 +75,14 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def estimate_rises(
     log_rms: Array, duty: Array, healthy: Array, healthy_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Estimate the rise g of each quantity over n leak-free recordings, corrected for the duty.
+    """Estimate the change g of each quantity relative to n leak-free recordings, corrected for the duty.
 
-    `log_rms` (5 per chamber,), `duty` (4,): judged recording; `healthy` (n, 5 per chamber), `healthy_duty` (n, 4):
-    leak-free recordings; `times` (n + 1,): start of the leak-free recordings, then of the judged one [s], None if
-    unknown. Returns the rises and the weights w, (5 per chamber,).
+    `log_rms` (5 per chamber,) and `duty` (4,) are those of the judged recording, `healthy` (n, 5 per chamber) and
+    `healthy_duty` (n, 4) those of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free
+    recordings and of the judged one [s], None if unknown. Returns the changes and their weights w, (5 per chamber,).
 
-    Model of the healthy values: a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over time. The
-    rate of this process is unknown; its variance is that between sessions, which are separated by a pause.
+    The healthy values are modelled by a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over
+    time. The rate of this process is unknown. Its variance is that between sessions, which are separated by a pause.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponents = np.array([vars(RMS_PRIORS.duty)[name] for name in DUTY])

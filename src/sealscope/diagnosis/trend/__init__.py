@@ -1,1 +1,1 @@
-"""Trend: the leakage of a single machine over its recordings, in the order of their times."""
+"""The trend of a single machine: its leakage over many recordings, in the order of time."""

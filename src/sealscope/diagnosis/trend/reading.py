@@ -1,4 +1,4 @@
-"""Readings: the leakage of a single recording, and the order to compare a machine's readings in."""
+"""Estimate the leakage of single recordings ("readings"), and sort a machine's readings for comparison."""
 
 from __future__ import annotations
 
@@ -47,16 +47,48 @@ BASES: tuple[Basis, ...] = get_args(Basis)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """Leakage level of one recording.
+    """Leakage of a machine in one recording.
 
-    `start`: time of its first sample [s since 1970], None if unknown; `duration` [s]; `basis`: method of the level,
-    None if no level can be stated, with the reason in `problem`; `level`: conductance of pump and piston together
-    [m^3/(s Pa)], or a relative index, with its standard error `error`; `states_flow`: True if the level can be stated
-    in L/min; `area`: piston area [m^2] that converts a creep speed to the level's unit, or None; `pressure`: mean |p_A
-    - p_B| [Pa]; `pump`: mean flow of the pump; `size_error`: relative standard error of the machine's size; `sums` of
-    the balance's `terms`, and `ringing`: data to compare with other recordings, None if the channels do not allow them;
-    `temperature` of the oil [deg C], None if the file does not state it; `scale`: measured ratio of displacement to
-    area over the assumed one; `machine`: assumptions about the machine; `digest`: hash, equal for copies.
+    Attributes
+    ----------
+    file : str
+        Name of the recording.
+    start : float or None
+        Time of its first sample [s since 1970], None if unknown.
+    duration : float
+        Duration [s].
+    basis : Basis or None
+        Method by which the level was estimated. None if no level can be stated; `problem` then tells why.
+    level, error : float
+        Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)]. For the basis "ringing"
+        minus the mean log RMS of the details. Unless `states_flow`, it is relative to the assumed machine. nan
+        without a basis.
+    states_flow : bool
+        True if the level can be stated in L/min.
+    area : float or None
+        Piston area [m^2] that converts a creep speed to the level's unit, None if it cannot be converted.
+    pressure : float
+        Mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing.
+    temperature : float or None
+        Temperature of the oil [deg C], None if neither measured nor stated.
+    scale : float or None
+        Measured ratio of displacement to area, relative to the assumed ratio.
+    machine : AssumedMachine or None
+        What was assumed of the machine.
+    digest : str
+        Hash of the chamber pressures, equal for copies.
+    problem : str
+        Reason why there is no level, else "".
+    pump : float
+        Mean flow of the pump [m^3/s].
+    size_error : float
+        Relative standard error of the machine's size.
+    sums : RecordingSums or None
+        Sums of the volume balance, for comparison with other recordings; None without a balance.
+    terms : tuple of ColumnRoles
+        Terms of the volume balance that `sums` belongs to.
+    ringing : Summary or None
+        Summary of the pressures' ringing, for comparison with other recordings; None if the channels do not allow it.
     """
 
     file: str
@@ -83,9 +115,10 @@ class LeakReading:
 def estimate_reading(
     recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = ""
 ) -> LeakReading:
-    """Estimate the leakage level of a recording.
+    """Estimate the leakage of a recording.
 
-    `rig`: assumed sizes of the machine; if None, as for `diagnose`, L/min are stated only for a known machine.
+    `rig` states the sizes of the machine. If it is None, L/min are stated only for a known machine, as in `diagnose`.
+    `file` is the name of the recording, by default that of the file it was read from.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -108,9 +141,10 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the most specific level that a defect-free recording allows.
+    """Estimate the leakage by the best method that a recording without defects allows.
 
-    Returns the fields of `LeakReading` that the level determines, or only its `problem` if no level can be estimated.
+    The methods are the volume balance, the pressure response and the ringing, in this order. Returns the fields of
+    `LeakReading` that depend on the method, or only its `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     no_balance, no_response = unusable_reason(balance, part), unusable_reason(response, part)
@@ -139,7 +173,7 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
 
 
 def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Return the fields of a level by the balance of volumes: the conductance of pump and piston."""
+    """Return the fields of `LeakReading` for a conductance from the volume balance."""
     size, total = solution.size, solution.conductance
     return {
         "basis": "volume balance",
@@ -156,7 +190,10 @@ def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[s
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the scatter between recordings of levels about the `usual` one."""
+    """Make the prior on the standard deviation of the level between recordings of one machine.
+
+    `usual` is the typical level. The volume balance has a prior in proportion to it.
+    """
     between = TREND.between
     if basis == "pressure response":
         return ScatterPrior(PRESSURE.conductance.level, between.freedom)
@@ -166,10 +203,22 @@ def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class TrendPoint(LeakReading):
-    """The reading of a recording in a trend.
+    """The leakage of one recording in a trend, with its place in the order of time.
 
-    `day`: time since the first recording; `group` of comparable readings, -1 if it is left out for the reason `note`;
-    `value` in the trend's unit and 95 % interval of its error, None if it is left out.
+    In addition to the fields of `LeakReading`:
+
+    Attributes
+    ----------
+    start : float
+        Time of its first sample [s since 1970].
+    day : float
+        Time since the first recording [days].
+    group : int
+        Number of the group of recordings that can be compared with each other; -1 if the recording is left out.
+    note : str
+        Reason why it is left out, or a remark; "" if there is none.
+    value, low, high : float or None
+        Leakage and the 95 % interval of its error, in the trend's unit; None if the recording is left out.
     """
 
     start: float
@@ -181,17 +230,19 @@ class TrendPoint(LeakReading):
     high: float | None = None
 
     def time_of_day(self, day: float) -> float:
-        """Convert a day of the trend to a time [s since 1970]."""
+        """Convert a time of the trend, in days since the first recording, to seconds since 1970."""
         return self.start + (day - self.day) * DAY
 
 
 def build_timeline(
     readings: Sequence[LeakReading], every: float | None = None
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
-    """Sort readings by time and group the comparable ones; return them and how each group differs from the first.
+    """Sort readings by time and group those that can be compared with each other.
 
-    Comparable readings have the most frequent basis and nearly equal scales of position or angle. `every`: time between
-    readings in the order of their names [s]. Raises InputError if the time of one is unknown.
+    Only readings of the most frequent basis are used; the readings of a group have nearly equal scales of position or
+    angle. `every` is the time between readings [s] if they are to be dated in the order of their names. Returns the
+    readings with their groups, and for each group a text on its difference from the first one. Raises InputError if
+    the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -213,7 +264,10 @@ def build_timeline(
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time, or set times in steps of `every` [s] by name; raise InputError if a time is unknown."""
+    """Sort readings by time; if `every` [s] is given, date them at equal intervals in the order of their names.
+
+    Raises InputError if the time of a reading is unknown.
+    """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
@@ -227,9 +281,9 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
-    """List the reason why each reading is left out, "" for those that are used.
+    """Return for each reading the reason why it is left out, "" for those that are used.
 
-    Reasons are a missing level, a copy of another recording, and a basis rarer than the most frequent one.
+    A reading is left out if it has no level, is a copy of another recording, or has another basis than most readings.
     """
     file_of_digest: dict[str, str] = {}
     notes = []
@@ -247,9 +301,9 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 
 
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """List the findings on the clock, on groups of recordings, and on readings left out.
+    """List the findings on a trend: errors of the clock, readings left out, and groups that cannot be compared.
 
-    Readings whose reasons differ only in numbers share one finding.
+    Readings that are left out for reasons that differ only in numbers share one finding.
     """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
@@ -268,20 +322,20 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
 
 
 def _join_files(readings: Iterable[LeakReading]) -> str:
-    """Join the names of the readings' files, at most three."""
+    """Join the file names of readings in a text, at most three of them."""
     return join_names((reading.file for reading in readings), 3)
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative change of a scale from another, 0 if one is unknown."""
+    """Compute the relative change from the scale `other` to `scale`; 0 if one of them is unknown."""
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
-    """Find signs that the clock was set back.
+    """Find signs that a clock was set back; at most one finding.
 
-    These are recordings that overlap, and times that fall while the numbers in the file names rise. Recordings dated
-    without a time of day share one start and do not count as overlapping.
+    The signs are recordings that overlap, and times that fall while the numbers in the file names rise. Recordings
+    dated without a time of day have the same start and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

@@ -1,4 +1,4 @@
-"""The trend of a machine over its recordings: level, healthy band, change, growth, and when it reaches a limit."""
+"""The trend of a machine over its recordings: leakage, healthy range, change, growth and time to the repair limit."""
 
 from __future__ import annotations
 
@@ -49,35 +49,36 @@ class Trend:
     Parameters
     ----------
     decision : Evidence
-        Verdict, reason, leak, bound and onset, as of a diagnosis: `leak` where the level rose beyond what a healthy
-        machine does, a leak explains it, and it was not repaired since.
+        Verdict, reason, leak, bound and onset, as in a diagnosis. The verdict is `leak` if the level rose more than
+        that of a healthy machine may, a leak explains the rise, and no repair followed.
     basis : str or None
-        What the levels rest on: volume balance, pressure response, or the damping of the pressures' ringing.
+        Method by which the levels were estimated: volume balance, pressure response, or the damping of the pressures'
+        ringing.
     unit : str
-        Unit of the levels: ``L/min``, or ``%`` of the first recordings where the machine's size is not known.
+        Unit of the levels: ``L/min``, or ``%`` of the first recordings if the machine's size is not known.
     pressure : float or None
-        Pressure difference for which L/min are stated [Pa].
+        Pressure difference at which L/min are stated [Pa].
     points : tuple of TrendPoint
         The recordings in the order of their times.
     groups : tuple of str
-        How each group of comparable recordings differs from the first group.
+        A text for each group of comparable recordings on its difference from the first group.
     episodes : tuple of Episode
-        Recordings between repairs; the last episode is the present one. Days of its `wear` count from the first
+        The periods between repairs; the last one is the present one. Days in their `wear` count from the first
         recording.
     rows : tuple of int
-        Indices of the points that the episodes compare; rows of an `Episode` are indices into these.
+        Indices of the points that are compared; the rows of an `Episode` are indices into `rows`.
     repair : RepairLimit
-        Leak beyond the healthy level at which a repair is due; `limit` is that level.
+        Leak above the healthy level at which a repair is due.
     machine : AssumedMachine or None
         What was assumed of the machine, and who stated it.
     findings : tuple of Finding
-        What is left out, not comparable or missing, and why.
+        Recordings that are left out or not comparable, and other findings on the data.
     years : float
-        Machine-years to a false alarm.
+        Mean time to a false alarm [machine-years].
     healthy : int
         Number of first recordings that were known to be healthy.
     dated : bool
-        Whether the times are those of the recordings, as opposed to equal intervals.
+        True if the times are those of the recordings, False if equal intervals are assumed.
 
     Examples
     --------
@@ -109,24 +110,27 @@ class Trend:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict, "leak", "no leak" or "cannot tell"."""
+        """The verdict: "leak", "no leak" or "cannot tell"."""
         return self.decision.verdict
 
     @property
     def reason(self) -> str:
-        """Reason of the verdict in one line, with the false-alarm rate."""
+        """Reason for the verdict in one line, with the false-alarm rate."""
         fell = bool(self.episodes) and self.episodes[-1].fell
         rate = f"1 false alarm in {self.years:g} machine-years"
         return f"{self.decision.reason}{' since the repair' if fell else ''} ({rate})"
 
     @property
     def wear(self) -> Wear | None:
-        """Wear since the last repair, None if no recording states a level."""
+        """Level, change and growth since the last repair; None if no recording states a level."""
         return self.episodes[-1].wear if self.episodes else None
 
     @property
     def total(self) -> Interval | None:
-        """Present flow past pump and piston in the trend's unit, as in a diagnosis; None without a level."""
+        """Present flow past pump and piston with its 95 % interval, in the trend's unit.
+
+        It is None if no recording states a level.
+        """
         total = self.decision.total_leakage
         if total is None or total.lpm is None or total.interval_lpm is None:
             return self.wear and self.wear.total
@@ -134,7 +138,10 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Rise of the flow past pump and piston since the machine was healthy, in the trend's unit; None if none."""
+        """Increase of the flow past pump and piston since the machine was healthy, in the trend's unit.
+
+        It is given with its 95 % interval, and is None if there is no increase.
+        """
         value, ends = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and ends is not None:
             return Interval(value, *ends)
@@ -147,25 +154,25 @@ class Trend:
 
     @property
     def alarm(self) -> TrendPoint | None:
-        """First recording at which the test raised an alarm since the last repair; None without an alarm."""
+        """First recording since the last repair at which the test raised an alarm; None if it did not."""
         number = self.episodes[-1].alarm if self.episodes else None
         return None if number is None else self.points[self.rows[number]]
 
     @property
     def repairs(self) -> tuple[TrendPoint, ...]:
-        """The first recording after each repair."""
+        """The first recording after each repair, in the order of time."""
         return tuple(self.points[self.rows[episode.begin]] for episode in self.episodes if episode.fell)
 
     @property
     def next_check(self) -> str:
-        """Next check on the machine, in one or two sentences."""
+        """Next check to make on the machine, in one or two sentences."""
         if self.verdict == NO_LEAK and self.decision.cause is None:
             return "Nothing needs a check; go on recording under the same duty."
         return state_of(self.verdict, self.decision.cause).action
 
     @property
     def state(self) -> MachineState:
-        """State of the machine by NAMUR NE 107, as in a diagnosis."""
+        """State of the machine by NAMUR NE 107, as in a diagnosis of one recording."""
         condition: str = self.verdict
         if self.verdict == LEAK and self.wear is not None and self.limit is not None:
             condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
@@ -174,7 +181,7 @@ class Trend:
         return state_of(condition, self.decision.cause, action=self.next_check)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the trend as plain JSON values; a number that is not finite becomes null."""
+        """Return the trend as plain values for JSON; a number that is not finite becomes None."""
         wear, total = self.wear, self.decision.total_leakage
         alarm, days = self.alarm, [point.day for point in self.points] or [math.nan]
         limit_day = wear and wear.reach and Interval(*(days[-1] + wait for wait in wear.reach))
@@ -237,14 +244,14 @@ class Trend:
         )
 
     def _format_day(self, day: float) -> str | float | None:
-        """Format a time as an ISO stamp, or in days if the times are not known."""
+        """Format a time, in days since the first recording, in ISO format; return the days if no dates are known."""
         if not math.isfinite(day) or not self.dated:
             return day
         time_ms = np.datetime64(round(self.points[0].time_of_day(day) * 1e3), "ms")
         return str(time_ms)[:19]  # without the fraction of a second
 
     def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:
-        """Format value and ends of an interval of days as `_format_day` does."""
+        """Format value and ends of an interval of days like `_format_day`; None for None."""
         return days and {name: self._format_day(day) for name, day in days._asdict().items()}
 
 
@@ -263,24 +270,25 @@ def trend(
     Parameters
     ----------
     recordings : iterable of Recording
-        Recordings of the machine, in any order, or readings of them; copies count once.
+        Recordings of the machine in any order, or readings of them (`estimate_reading`); copies count once.
     rig : Rig, str or path-like, optional
-        What may be assumed of the machine, as for `diagnose`; without it levels are
-        relative, unless the recordings state the machine.
+        Sizes of the machine, as for `diagnose`; without it levels are relative, unless the recordings state the
+        machine.
     healthy : int, optional
-        How many of the first recordings are known to be of a healthy machine.
+        Number of first recordings that are known to be of a healthy machine.
     limit : str, optional
-        Leak beyond the healthy level at which a repair is due, as a flow (``"5 mL/min"``) or as a speed of creep
-        (``"8 mm/min"``, the default).
+        Leak above the healthy level at which a repair is due, as a flow (``"5 mL/min"``) or as a creep speed of the
+        piston (``"8 mm/min"``, the default).
     years : float, optional
-        Machine-years in which a healthy machine has one false alarm, 0.1 to 1000.
+        Mean time to a false alarm of a healthy machine [machine-years], 0.1 to 1000.
     every : float, optional
-        Time between two recordings [s], of recordings without times, in the order of their files' names.
+        Time between two recordings [s]. With it, the recordings are dated at equal intervals in the order of their
+        files' names.
 
     Returns
     -------
     Trend
-        Verdict, levels with intervals, healthy band, change, growth and time to the limit.
+        Verdict, levels with intervals, healthy range, change, growth and time to the limit.
 
     Raises
     ------
@@ -332,7 +340,7 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Add levels, episodes and the decision to a trend of at least one comparable recording."""
+    """Add levels, periods between repairs and the decision to a trend of at least one comparable recording."""
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
     averages, rows = levels.average_neighbours(), trend.rows
@@ -353,7 +361,7 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Add the values in the trend's unit to the points, and a finding on outliers to the findings."""
+    """Return the points with values in the trend's unit, and the findings with one on outliers if there are any."""
     points, findings, outliers = [*trend.points], [*trend.findings], np.flatnonzero(outlier_excess(levels)[1])
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
@@ -368,14 +376,14 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings among the first `trend.healthy` ones, which are known to be healthy; at least 1."""
+    """Count how many of the first recordings, known to be healthy, are among the compared ones; at least 1."""
     digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
 class _ConvertedLevels(NamedTuple):
-    """Levels in the trend's unit, with the factor that converts a level of a reading to that unit."""
+    """Levels in the trend's unit, and the factor that converts the level of a reading to that unit."""
 
     levels: Levels
     trend_units_per_level: float
@@ -384,8 +392,9 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the compared levels to the trend's unit and to the oil temperature of the first recording.
 
-    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are conductances
-    [m^3/(s Pa)], or for the ringing logarithms; a difference of logarithms from the healthy mean is converted to %.
+    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are
+    conductances [m^3/(s Pa)] or, for the ringing, logarithms, whose difference from the healthy mean is converted to
+    %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
@@ -410,7 +419,7 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Convert the limit of a repair to a rise in the trend's unit; None if there is none, or it cannot be converted."""
+    """Convert the repair limit to an increase of the level in the trend's unit; None if it cannot be converted."""
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:
         return trend.repair.value / LITRE_PER_MINUTE

@@ -1,8 +1,8 @@
-"""The rise of a machine's leakage over its recordings, as a measure of a leak for `decision.decide`.
+"""Describe the increase of a machine's leakage over its recordings in the form that `decision.decide` judges.
 
-The sequential test of `wear` gives the chance of the rise in a healthy machine: the time between two recordings over
-the mean time to a false alarm. Rival explanations are observed as in a diagnosis: terms of the balance in all
-recordings since the onset, and the ringing of the last one.
+The sequential test of `wear` gives the chance that a healthy machine shows such an increase: the time between two
+recordings over the mean time to a false alarm. Other explanations are observed as in a diagnosis: terms of the
+balance in all recordings since the onset, and the ringing of the last recording.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ MIN_RECORDINGS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrendLeak:
-    """The rise of the leakage from recording to recording, as a `LeakMeasure` with flows in the levels' unit.
+    """Increase of the leakage from recording to recording, in the form of the protocol `LeakMeasure`.
 
-    There is no test for a step within a recording, and no history other than the trend itself.
+    That protocol explains the fields; flows are in the unit of the levels. There is no test for a step within a
+    recording, and no history other than the trend itself.
     """
 
     provider: str
@@ -55,23 +56,26 @@ class TrendLeak:
 
     @property
     def step_flow(self) -> Flow:
-        """Unknown flow, as no step within a recording is tested."""
+        """A flow of 0 with infinite error, as no step within a recording is tested."""
         return Flow(0.0, np.inf)
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The whole rise, as no step within a recording accounts for a part of it; None without a rise."""
+        """The whole increase of the leakage, as no step within a recording explains a part of it.
+
+        The result is None if nothing increased.
+        """
         return None if self.rise is None else LeakRise(self.rise)
 
     def relative(self, flow: Flow) -> None:
-        """Return None: a trend states no leak relative to the pump."""
+        """Return None, as a trend states no leak relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston [L/min], None if the levels are relative."""
+        """Return the present flow past pump and piston [L/min]; None if the levels are relative."""
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
-        """Return None: the history of the leak is the trend itself."""
+        """Return None, as the trend itself is the history of the leak."""
 
 
 def decide_trend(
@@ -83,11 +87,24 @@ def decide_trend(
     interval: float,
     years: float,
 ) -> Evidence:
-    """Decide from the recordings since the last repair whether the leakage has risen.
+    """Decide from the recordings since the last repair whether the leakage of a machine has increased.
 
-    `points`: comparable recordings in time order; `trend_units_per_level`: factor from levels of readings to the
-    trend's unit; `pressure`: pressure difference at which L/min are stated [Pa], None if the levels are relative;
-    `interval`: typical time between two recordings [days]; `years`: mean time between false alarms [machine-years].
+    Parameters
+    ----------
+    points : sequence of TrendPoint
+        Comparable recordings in the order of time.
+    episode : Episode
+        The period since the last repair, with its test.
+    trend_units_per_level : float
+        Factor from the level of a reading to the trend's unit.
+    pressure : float or None
+        Pressure difference at which L/min are stated [Pa], None if the levels are relative.
+    interval : float
+        Typical time between two recordings [days].
+    years : float
+        Mean time between false alarms [machine-years].
+
+    Returns ------- Evidence The verdict; "cannot tell" for fewer than three recordings.
     """
     wear = episode.wear
     # interval over the mean time to a false alarm of this score
@@ -107,10 +124,11 @@ def decide_trend(
 def _measure_leak(
     points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
 ) -> TrendLeak:
-    """Measure the rise since the last repair.
+    """Describe the increase of the leakage since the last repair as a TrendLeak.
 
-    `chance`: probability of such a rise in a healthy machine; other arguments as for `decide_trend`. As the leak may be
-    laminar or an orifice, the flow is taken as proportional to the pressure to one of the powers `EXPONENTS`.
+    `chance` is the probability of such an increase in a healthy machine; the other arguments are those of
+    `decide_trend`. As the leak may be laminar or an orifice, its flow is taken as proportional to the pressure to one
+    of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -136,9 +154,9 @@ def _measure_leak(
 
 
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
-    """Convert the rise to a normal distribution whose probability of a value below zero is `chance`.
+    """Describe the increase by a normal distribution that is negative with the probability `chance`.
 
-    None if the chance is 0.5 or more, or the upper bound of the rise is not positive.
+    The result is None if the chance is 0.5 or more, or if the upper bound of the increase is not positive.
     """
     from scipy.special import ndtri
 
@@ -150,13 +168,20 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Make the total leakage [L/min], with the size's relative error `size_deviation` added to its interval."""
+    """Make the total leakage [L/min] from the present level `total` with its interval.
+
+    The interval is widened by the relative error `size_deviation` of the machine's size. `pressure` is the pressure
+    difference at which the flow is stated [Pa].
+    """
     below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
     return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
 
 
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
-    """Report the fall of the ringing as a detector's observation, which gives no upper bound of a leak."""
+    """Report the decrease of the ringing as an observation of a detector; it gives no upper bound of a leak.
+
+    `chance` is the probability of such a decrease in a healthy machine.
+    """
     size = -wear.leak.value / 100.0  # change of the logarithm, from %
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
     ringing = None
@@ -166,9 +191,9 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split the recordings comparable with the last one into those before the onset and those since.
+    """Split the recordings of the last one's group into those before the onset of the change and those since.
 
-    Without an onset the split is at the last recording.
+    Without an onset, the last recording alone is the second part.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -177,9 +202,10 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 
 
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
-    """Compare the other balance terms since the onset with those before, as rival explanations of the rise.
+    """Test the other terms of the volume balance for a change at the onset, which could explain the increase.
 
-    Recordings are compared only where the same single balance describes both.
+    The recordings since the onset are compared with those before, if the same single balance describes both;
+    otherwise the result is empty.
     """
     names = [roles.names for roles in points[-1].terms]
     sums_before, sums_since = (

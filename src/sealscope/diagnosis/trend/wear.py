@@ -1,29 +1,31 @@
-"""Wear over recordings: one Gaussian model of the level that each states, and a sequential test for its rise.
+"""Wear over recordings: a Gaussian model of the leakage level in each recording, and a sequential test for its rise.
 
 The level that recording i states at the time t_i is
 
-    y_i = mu_l(i) + beta c_i + delta g(t_i) + d(t_i) + e_i,
+    y_i = mu_l(i) + beta c_i + delta g(t_i) + d(t_i) + e_i.
 
-mu of the group l of recordings that can be compared, a covariate c with a normal prior on beta, what changes from
-recording to recording d, the recording's own error e_i of stated deviation s_i, and the change g: a step,
-``g = [t >= t_j]``, or a growth, ``g = max(t - t_(j-1), 0)``. d is normal with variance tau^2, of which a share r lasts,
-half of it for an hour and half for a week: its covariance is ``tau^2 ((1 - r) [i = k] + r/2 sum_T exp(-|t_i -
-t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is uniform on a few values, and both are
-summed on a grid. mu has a wide prior, delta a half-normal one of some scales in units of tau. With L L' = cov(y), the
-rows of z = L^-1 y up to n are those of the first n recordings alone, so that one factorisation serves all n: with
-G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the likelihood ratio exp(b delta - a delta^2/2).
+Here mu_l is the mean of the group l of comparable recordings, c a covariate with a normal prior on beta, and e_i the
+recording's own error of stated deviation s_i. The change g is a step, ``g = [t >= t_j]``, or a growth, ``g = max(t -
+t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this
+variance is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2
+((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is
+uniform on a few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several
+scales in units of tau. With L L' = cov(y), the rows of z = L^-1 y up to n are those of the first n recordings alone,
+so that one factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the
+likelihood ratio exp(b delta - a delta^2/2).
 
-The test is Shiryaev's and Roberts's: with the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
+The test is that of Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against
+none,
 
     R_n = sum_(j <= n) w_j LR_j(n),   w_j = min(t_j - t_(j-1), longest wait),   alarm where R_n > A.
 
-Without a change R_n - sum_(j <= n) w_j is a martingale, whatever the number of recordings, so that the mean time to a
-false alarm is at least A: the threshold is that time itself. This holds for machines whose tau the prior describes.
+Without a change R_n - sum_(j <= n) w_j is a martingale for any number of recordings. The mean time to a false alarm
+is therefore at least A: the threshold is that time itself. This holds for machines whose tau the prior describes.
 
 Sources: M. Pollak, Annals of Statistics 13 (1985) 206-227, doi 10.1214/aos/1176346587 (Shiryaev-Roberts and its mean
 time); J. Shin, A. Ramdas, A. Rinaldo, New England Journal of Statistics in Data Science 2 (2024) 229-260, doi
-10.51387/23-NEJSDS51 (mixtures and unknown parameters); Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections
-5.4 and 14.8 (grid of tau, regression with known covariance).
+10.51387/23-NEJSDS51 (mixtures and unknown parameters); Gelman et al., Bayesian Data Analysis, 3rd ed. (2013),
+sections 5.4 and 14.8 (grid of tau, regression with known covariance).
 """
 
 from __future__ import annotations
@@ -54,7 +56,10 @@ _MAX_FREEDOM = 20
 
 
 class ScatterPrior(NamedTuple):
-    """Prior on the standard deviation of the level between recordings: a `scale` with degrees of `freedom`."""
+    """Prior on the standard deviation of the level between recordings: scaled inverse chi-square.
+
+    `scale` is the typical standard deviation, and `freedom` the degrees of freedom.
+    """
 
     scale: float
     freedom: float
@@ -62,11 +67,24 @@ class ScatterPrior(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels (n,) of n recordings in time order, and the `prior` on their scatter.
+    """Leakage levels of n recordings in the order of time, and the prior on their scatter.
 
-    `t`: time [days]; `value`: the levels; `error`: standard error that each recording states for its level; `group`
-    (n,): number of the group, whose recordings share a mean; `covariate` (n,): an explanatory variable, whose
-    coefficient has the prior standard deviation `slope_sd`, 0 for none.
+    Attributes
+    ----------
+    t : array, (n,)
+        Times [days].
+    value : array, (n,)
+        The levels.
+    error : array, (n,)
+        Standard error that each recording states for its level.
+    group : array, (n,)
+        Number of the group of comparable recordings, which have a common mean.
+    covariate : array, (n,)
+        An explanatory variable, the warming of the oil [K].
+    prior : ScatterPrior
+        Prior on the standard deviation between recordings.
+    slope_sd : float
+        Prior standard deviation of the covariate's coefficient, 0 if it has no effect.
     """
 
     t: Array
@@ -81,19 +99,22 @@ class Levels:
         return self.t.size
 
     def select(self, rows: slice) -> Levels:
-        """Return the levels of the recordings `rows`."""
+        """Return the levels of a slice of the recordings."""
         t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
         return replace(self, t=t, value=value, error=error, group=self.group[rows], covariate=covariate)
 
     @property
     def interval(self) -> float:
-        """Typical time between two recordings [days]."""
+        """Typical time between two recordings [days]; 1 if unknown."""
         steps = np.diff(self.t)
         return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 
     @property
     def scatter(self) -> float:
-        """Standard deviation between recordings, from the median step between neighbours shrunk towards the prior."""
+        """Standard deviation between recordings, from the prior and from the median step between neighbours.
+
+        Their variances are averaged with the prior's degrees of freedom and the number of steps as weights.
+        """
         prior = self.prior
         # the step of two neighbours has twice the variance of one
         steps = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
@@ -103,7 +124,7 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average neighbours within a group to reduce the levels to about `max_count`, which limits computing time."""
+        """Average neighbours of the same group, so that about `max_count` levels remain, to limit computing time."""
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
@@ -118,11 +139,12 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute the part of each value that is ignored as an outlier, (n,), in two variants.
+    """Compute how far each level lies outside the scatter of the levels before it, which is ignored as an outlier.
 
-    The first variant treats the value as the latest one. The second also uses the next value, and is 0 for the last
-    value. The excess is the signed distance from the median of the three values before, less `outlier` standard
-    deviations. It is 0 if the value before, or in the second variant the value after, lies as far out on the same side.
+    This excess is the signed distance of a level from the median of the up to three levels before it, less `outlier`
+    standard deviations (`priors.toml`). It is 0 if the level before lies as far out on the same side. Returns two
+    variants, each (n,). The first treats each level as the latest one. The second also uses the level after it: the
+    excess is 0 if that lies as far out on the same side, and for the last level.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -141,12 +163,22 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
 
 
 class _Changes(NamedTuple):
-    """Hypotheses of a change: c changes over n recordings, of m profiles.
+    """Hypotheses of a change of the level: c changes over n recordings, with m different profiles over time.
 
-    `profiles` (n, m): g of the module, the effect of a unit change on each recording. Of each change (c,):
-    `profile_index`, the column of its profile; `scale` of its amplitude in tau; `begin`, the first recording after it;
-    `grows`, True for a growth, False for a step; `log_weight`, the logarithm of w_j, divided among the kinds and scales
-    of one begin.
+    Attributes
+    ----------
+    profiles : array, (n, m)
+        Effect of a unit change on each recording, g of the module.
+    profile_index : array, (c,)
+        Column of `profiles` that each change has.
+    scale : array, (c,)
+        Prior scale of the size of each change, in units of tau.
+    begin : array, (c,)
+        Index of the first recording after each change.
+    grows : array, (c,)
+        True for a growth, False for a step.
+    log_weight : array, (c,)
+        Logarithm of w_j of the module, which is divided among the kinds and scales of change with the same begin.
     """
 
     profiles: Array
@@ -160,7 +192,8 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Make all changes that may begin after the first `n_healthy` recordings: steps, and growths per month.
 
-        The scale of a step is a multiple of the scatter tau, that of a growth tau in n usual intervals.
+        The scale of a step is a multiple of the scatter tau. That of a growth is tau over a number of usual intervals
+        between recordings. With `steps_only` there are no growths.
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))
@@ -180,7 +213,7 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Make one growth with a profile (n,) from the first recording on, whose amplitude has the `scale` in tau."""
+        """Make a single growth with the given profile (n,) and `scale`, which begins with the first recording."""
         first = np.zeros(1, dtype=np.int64)
         return cls(
             profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
@@ -188,11 +221,20 @@ class _Changes(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """Likelihoods at one pair (tau, r) of the grid.
+    """Likelihoods at one point (tau, r) of the grid, for n recordings and m profiles of a change.
 
-    `log_null` (n,): logarithm of prior times likelihood without a change, after each recording; `a`, `b` (n, m): terms
-    of the likelihood ratio of m profiles; `mean`, `variance`: level of the last group without a change; `mean_slope`
-    (m,): decrease of that mean per unit of a change.
+    Attributes
+    ----------
+    tau : float
+        Standard deviation between recordings.
+    log_null : array, (n,)
+        Logarithm of prior times likelihood without a change, after each recording.
+    a, b : array, (n, m)
+        Terms of the likelihood ratio, as in the module.
+    mean, variance : float
+        Mean level of the last group without a change, and its variance.
+    mean_slope : array, (m,)
+        Decrease of this mean per unit of a change.
     """
 
     tau: float
@@ -205,12 +247,13 @@ class _Node(NamedTuple):
 
 
 def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
-    """Compute the likelihoods at all nodes (tau, r) of the grid for changes of the `profiles` (n, m).
+    """Compute the likelihoods at all points (tau, r) of the grid for changes with the given `profiles` (n, m).
 
-    `may_grow`: the level may have grown evenly from the first recording on. The values have the covariance
-    shared + tau^2 (r C + (1 - r) I) + error^2, C the correlation over the time between recordings and r the fraction of
-    the scatter that lasts. Vectors are whitened by its Cholesky factor L: z the values, u the unit level of the last
-    group, G the profiles. Up to each recording a = sum G^2 and b = sum G z.
+    With `may_grow`, the level may have grown evenly since the first recording even without a change. The levels have
+    the covariance shared + tau^2 (r C + (1 - r) I) + error^2, where C is the correlation over the time between
+    recordings and r the fraction of the scatter that is correlated. Vectors are whitened by its Cholesky factor L: z
+    is the levels, u the unit level of the last group, and G the profiles. Up to each recording a = sum G^2 and b =
+    sum G z.
     """
     from scipy.linalg import solve_triangular
 
@@ -249,9 +292,10 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
 
 def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
-    """Compute the log mean likelihood ratio, log E[exp(b delta - a delta^2/2)], for a half-normal delta of scale k.
+    """Compute the log of the mean likelihood ratio of a change whose size has a half-normal prior.
 
-    The expectation is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
+    The mean of exp(b delta - a delta^2/2) over a half-normal delta of scale k is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2)
+    Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
     """
     from scipy.special import log_ndtr
 
@@ -261,22 +305,29 @@ def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
 
 
 class ChangeScores(NamedTuple):
-    """Logarithm of R after each recording (n,), with the most probable `begin` (n,) of a change."""
+    """Result of the sequential test after each of n recordings.
+
+    `log_R` (n,) is the logarithm of the statistic R, and `begin` (n,) the index of the first recording after the most
+    probable change.
+    """
 
     log_R: Array
     begin: IntArray
 
     def find_alarm(self, days: float) -> int | None:
-        """Find the first recording whose R exceeds the mean time to a false alarm [days]."""
+        """Find the first recording with R above `days`, the mean time to a false alarm [days].
+
+        The result is None if there is none.
+        """
         alarms = np.flatnonzero(self.log_R > math.log(days))
         return int(alarms[0]) if alarms.size else None
 
 
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
-    """Compute the sequential test's R for a rise (a step or a growth), or with `falls` for a fall (a step).
+    """Compute the statistic R of the sequential test for a rise of the level, either a step or a growth.
 
-    The first `n_healthy` recordings are assumed unchanged; `may_grow`: allow an even growth from the first recording on
-    as part of the null hypothesis.
+    With `falls` the test is for a downward step instead. The first `n_healthy` recordings are assumed unchanged. With
+    `may_grow`, an even growth since the first recording does not count as a change.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
@@ -295,7 +346,10 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
 
 
 def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
-    """Draw from normal distributions (d,), with `positive` cut off below 0, by the inverse distribution function."""
+    """Draw one number from each of d normal distributions, which are cut off below 0 if `positive`.
+
+    Uses the inverse distribution function.
+    """
     from scipy.special import ndtr, ndtri
 
     p_negative = ndtr(-mean / sd) if positive else np.zeros(len(mean))
@@ -304,7 +358,11 @@ def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positiv
 
 
 class _Draws(NamedTuple):
-    """Draws (d,) from the posterior: `tau`, index and amplitude of the change, and mean level before it."""
+    """Draws (d,) from the posterior distribution of a change.
+
+    `tau` is the standard deviation between recordings, `change` the index of the change among the hypotheses,
+    `amplitude` its size, and `mean_before` the mean level before it.
+    """
 
     tau: Array
     change: IntArray
@@ -313,9 +371,9 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw from the posterior.
+        """Draw from the posterior distribution of the hypotheses `changes` given the levels; the seed is fixed.
 
-        `signed`: give the amplitude a flat prior and either sign, instead of a half-normal prior.
+        With `signed`, the size of a change has a flat prior and either sign, instead of a half-normal prior.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
@@ -335,19 +393,37 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rise (d,) of the last recording's level due to each draw from the hypotheses `changes`."""
+        """Compute the rise (d,) of the last recording's level for each draw from the hypotheses `changes`."""
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
 class Wear(NamedTuple):
-    """Level, change and time to the limit after the last of a series of recordings.
+    """State of a machine after the last of a series of recordings: level, change, growth and time to the limit.
 
-    Quantities are in the unit of the levels. `total`: present level without the last recording's own scatter; `leak`:
-    its rise since the change; `bound`: 95 % upper bound of that rise; `growth`: rise per month; `step`: size of a step,
-    None if a growth is more probable or nothing changed; `onset`: time of the change [days], None if nothing changed;
-    `healthy`: mean before the change, with the range of 95 % of the recordings then; `scatter`: standard deviation
-    between recordings; `limit`: mean before the change plus the allowed rise, None if no rise is stated; `reach`: days
-    from the last recording to the limit, infinite if never reached.
+    Quantities are in the unit of the levels, with 95 % intervals.
+
+    Attributes
+    ----------
+    total : Interval
+        Present level, without the scatter of the last recording.
+    leak : Interval
+        Rise of the level since the change; if nothing changed, the rise that the levels allow.
+    bound : float
+        95 % upper bound of this rise.
+    growth : Interval
+        Rise per month.
+    step : Interval or None
+        Size of the step; None if a growth is more probable or nothing changed.
+    onset : Interval or None
+        Time of the change [days], None if nothing changed.
+    healthy : Interval
+        Mean level before the change, with the range of 95 % of the recordings then.
+    scatter : float
+        Standard deviation between recordings.
+    limit : float or None
+        Level at which a repair is due, None if there is no limit.
+    reach : Interval or None
+        Days from the last recording until the limit is reached, infinite if never; None if there is no limit.
     """
 
     total: Interval
@@ -363,18 +439,18 @@ class Wear(NamedTuple):
 
 
 def _interval_of_draws(draws: Array) -> Interval:
-    """Compute the median and 95 % interval of draws, some of which may be infinite."""
+    """Compute the median and the 95 % interval of draws (d,), some of which may be infinite."""
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
     return Interval(float(median), float(low), float(high))
 
 
 def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int | None) -> Wear:
-    """Estimate level, growth and time to the limit after the last recording.
+    """Estimate level, growth and time to the repair limit after the last recording.
 
-    `allowed_rise`: rise of the level above the healthy one at which a repair is due, None if there is no limit;
-    `change_begin`: index of the first recording after the change, found by the test. If it is None, an even growth of
-    either sign over all recordings is estimated, with a wide prior. No growth per month is estimated from recordings
-    that span less than a day.
+    `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
+    `change_begin` is the index of the first recording after the change that the test has found. If it is None, an
+    even growth or decrease over all recordings is estimated, with a wide prior. No growth per month is estimated from
+    recordings that span less than a day.
     """
     is_changed, is_long = change_begin is not None, levels.t[-1] - levels.t[0] >= 1.0
     # without a change the growth may begin with the first recording
@@ -413,14 +489,17 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 
 
 def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
-    """Compute the days (d,) in which levels (d,) reach a limit by their `growth` (d,) per month; infinite if never."""
+    """Compute the days (d,) until each `level` (d,) reaches the limit if it grows by its `growth` (d,) per month.
+
+    The result is 0 for a level that has reached the limit, and infinite for one that never will.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         days = np.where(growth > 0.0, (limit - level) / growth, math.inf) * DAYS_PER_MONTH
     return np.where(level >= limit, 0.0, days)
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean of unchanged recordings, the range of 95 % of them, and their standard deviation."""
+    """Estimate the mean of recordings without a change, the range of 95 % of them, and their standard deviation."""
     draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
     error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(draws.tau.size)
@@ -429,11 +508,11 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 
 
 class Episode(NamedTuple):
-    """Recordings between two repairs, rows `begin` to `end` (exclusive) of the judged ones.
+    """A period between two repairs, rows `begin` to `end` (exclusive) of the compared recordings.
 
-    `alarm`: row at which the test raised an alarm, or None; `log_days`: logarithm of the largest mean time to a false
-    alarm [days] for which the test would still raise one; `wear`: estimate at the last row; `fell`: True if the episode
-    began with a fall of the level.
+    `alarm` is the row at which the test raised an alarm, or None. `log_days` is the logarithm of the largest mean
+    time to a false alarm [days] for which the test would raise one. `wear` is the state after the last row. `fell` is
+    True if the period began with a repair, i.e. a fall of the level.
     """
 
     begin: int
@@ -447,11 +526,11 @@ class Episode(NamedTuple):
 def find_episodes(
     levels: Levels, *, years: float, n_healthy: int = 1, allowed_rise: float | None = None
 ) -> list[Episode]:
-    """Divide the recordings at repairs, and test and estimate the wear of each part.
+    """Divide a series of recordings at repairs, and test and estimate the wear in each period between them.
 
-    `years`: minimum mean time between false alarms; `n_healthy`: number of first recordings that are known to be
-    healthy; `allowed_rise`: rise of the level at which a repair is due, or None. A repair is a fall of the level
-    detected by the same test. After it the level is estimated anew; the scatter before it becomes the prior.
+    `years` is the mean time between false alarms, at least. The first `n_healthy` recordings are known to be healthy.
+    `allowed_rise` is the rise of the level at which a repair is due, or None. A repair is a fall of the level that
+    the same test detects. After it the level is estimated anew, and the scatter before it becomes the prior.
     """
     days, begin, episodes = years * DAYS_PER_YEAR, 0, list[Episode]()
     while begin < len(levels):
@@ -471,9 +550,10 @@ def find_episodes(
 
 
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
-    """Find the index of the first recording after the first repair; the number of recordings if there is none.
+    """Find the index of the first recording after the first repair; the number of recordings if there was none.
 
-    `days`: mean time to a false alarm. If the `rise` has raised an alarm, the fall is tested from the worn level on.
+    `rise` is the result of the test for a rise, and `days` the mean time to a false alarm [days]. If that test has
+    raised an alarm, a fall is looked for only after the rise.
     """
     fall, worn_from = score_changes(levels, n_healthy, falls=True), 0
     alarm, repair = rise.find_alarm(days), fall.find_alarm(days)

@@ -1,1 +1,1 @@
-"""What a diagnosis states, and how the evidence of several detectors becomes one verdict."""
+"""What a diagnosis states: verdict and evidence, the severity of a leak, the assumed machine and its state."""

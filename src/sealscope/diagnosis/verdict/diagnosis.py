@@ -1,4 +1,4 @@
-"""Diagnosis: the fused evidence on one recording, and its context for the reader, as in the output contract."""
+"""The diagnosis of one recording: combined evidence of all detectors and its context, as in the output contract."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "ri
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(Evidence):
-    """Verdict on one recording: the fused evidence of all detectors.
+    """Verdict on one recording: the combined evidence of all detectors.
 
-    In addition to the fields of `Evidence`, whose `parts` are every detector's, that of the judge first:
+    It has the fields of `Evidence`, where `parts` is the evidence of every detector, that of the deciding one first.
+    Its other fields are:
 
     Parameters
     ----------
@@ -52,19 +53,19 @@ class Diagnosis(Evidence):
     quality : tuple of Finding
         Findings on the data.
     baselines : int
-        Leak-free recordings that it was compared with.
+        Number of leak-free recordings that it was compared with.
     machine : AssumedMachine, optional
-        What was assumed of the machine, and what of it was stated.
+        Assumed sizes of the machine, and whether they were stated.
     limit : RepairLimit
-        Leak from which the machine is to be repaired.
+        Leak from which the machine must be repaired.
     about : mapping of str to str
-        Statements in the recording's file: operator, machine, oil temperature.
+        Statements in the recording's file, such as operator, machine and oil temperature.
     start : str, optional
-        When the recording began, as ISO 8601, if the file states it.
+        Time at which the recording began, in ISO 8601 format, if the file states it.
     unused : tuple of str
-        Recorded pressures, positions, speeds and flows that are read into no channel.
+        Recorded pressures, positions, speeds and flows that were not read as channels.
     pressure_unit : str
-        Unit in which its texts state pressures: that of the log, else bar.
+        Unit of pressures in texts: that of the log if it is known, else bar.
 
     Examples
     --------
@@ -95,9 +96,10 @@ class Diagnosis(Evidence):
     def from_evidence(
         cls, evidence: Evidence, recording: Recording, machine: AssumedMachine, *, file: str | None, **fields: Any
     ) -> Diagnosis:
-        """Make the diagnosis of a recording from its evidence and the file's own statements.
+        """Make the diagnosis of a recording from the combined evidence and from statements in the recording's file.
 
-        `file`: name of the recording, by default that of its file; `fields`: remaining fields of `Diagnosis`.
+        `file` is the name of the recording, by default that of the file it was read from. `fields` are the remaining
+        fields of `Diagnosis`.
         """
         if evidence.relative is None:
             evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
@@ -115,21 +117,25 @@ class Diagnosis(Evidence):
 
     @property
     def severity(self) -> Severity | None:
-        """Severity of the leak; None if there is none, or its size is unknown."""
+        """Severity of the leak; None if there is no leak or its size is unknown."""
         return severity(self, self.limit)
 
     @property
     def limit_lpm(self) -> float | None:
-        """Repair limit as a flow past the piston [L/min]; None for a speed of a piston whose area is not stated."""
+        """Repair limit as a flow past the piston [L/min].
+
+        The result is None if the limit is a creep speed of the piston and the piston's area is not stated.
+        """
         is_stated = self.machine is not None and self.machine.area_stated
         return self.limit.flow_lpm(self.machine.area if is_stated else None)  # type: ignore[union-attr]
 
     @property
     def repair_lpm(self) -> float | None:
-        """Repair limit to draw in the plot of `course` [L/min]; None if it cannot be stated as a flow.
+        """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        If the course is the total leakage, the limit is raised by the median of the course before the onset, less any
-        leak that was open from the start.
+        The result is None if there is no such plot, or if the limit cannot be stated as a flow. If the plot shows the
+        total leakage, the limit is raised by the leakage of the healthy machine. This is the median of the plotted
+        flow before the onset, minus the leak if there is one that was open from the start.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None or not course.whole:
@@ -145,7 +151,10 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured ratio of displacement to area, relative to the assumed one, and its interval; None if unknown."""
+        """Measured ratio of displacement to piston area, over the assumed ratio, with its 95 % interval.
+
+        It is None if no detector has measured the ratio.
+        """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
                 return decision.ratio, decision.ratio_interval
@@ -153,17 +162,17 @@ class Diagnosis(Evidence):
 
     @property
     def machine_name(self) -> str | None:
-        """The machine's name in the file; None if there is none."""
+        """Name of the machine as stated in the recording's file; None if it is not stated."""
         return find_machine_name(self.about)
 
     @property
     def methods(self) -> tuple[Evidence, ...]:
-        """Evidence of every detector, each followed by its parts."""
+        """Evidence of every detector, each followed by the evidence of its parts."""
         return tuple(evidence for detector in self.parts for evidence in (detector, *detector.parts))
 
     @property
     def _condition(self) -> str:
-        """The condition of `states.toml` that corresponds to the verdict."""
+        """Name of the condition in `states.toml` that corresponds to the verdict."""
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -172,20 +181,21 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause that the verdict names, of the leak or of another event; None if it names none."""
+        """Cause that the verdict names, either of the leak or of another event; None if it names none."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
     def next_check(self) -> str:
-        """Next check on the machine, in one or two sentences."""
+        """Next check to make on the machine, in one or two sentences."""
         with_bypass = self.machine is not None and self.machine.bypass
         return action_of(self._condition, self.named_cause, ("bypass",) if with_bypass else ())
 
     @property
     def state(self) -> MachineState:
-        """State of the machine as NAMUR NE 107 names it, a failure if the leak is surely over the repair limit.
+        """State of the machine by NAMUR NE 107, such as "good".
 
-        Page, terminal, JSON and metrics state its name, letter, colour and severity.
+        It is a failure if the leak surely exceeds the repair limit. Page, terminal, JSON and metrics show its name,
+        letter, colour and severity.
         """
         is_over_limit = self.severity is not None and self.severity.level == "repair"
         condition = "leak over the limit" if is_over_limit else self._condition
@@ -193,7 +203,10 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """True if the level is that of a healthy machine, by leak-free recordings or by the rig."""
+        """True if there is no leak and the leakage is known to be that of a healthy machine.
+
+        This is known from leak-free recordings, or from the healthy leakage that the rig states.
+        """
         is_healthy_by_rig = self.total_leakage is not None and self.total_leakage.healthy
         return self.verdict == NO_LEAK and (self.baselines > 0 or is_healthy_by_rig)
 
@@ -201,8 +214,8 @@ class Diagnosis(Evidence):
     def is_baseline(self) -> bool:
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
-        Usual means that at least 1 in 20 healthy recordings scores as high. False also if an undetected leak could make
-        up the whole total leakage.
+        The leakage is usual if at least 1 in 20 healthy recordings scores as high. The result is False also if an
+        undetected leak could make up the whole total leakage.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
@@ -214,17 +227,20 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """True if the leakage probably rose within the recording, though no onset is stated."""
+        """True if the leakage probably rose within the recording, although no onset is stated."""
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of one of the judging detector's tests; None if it was not made."""
+        """Find the evidence of the test called `name` of the detector that decided; None if it made no such test."""
         judge = self.parts[0].parts if self.parts else ()
         return next((part for part in judge if part.detector == name), None)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as plain JSON values in the output contract's order; numbers not finite become null."""
+        """Return the diagnosis as plain values for JSON, in the order of the output contract.
+
+        Numbers that are not finite become None.
+        """
         ratio, ratio_interval = self.measured_ratio or (None, None)
         total = None if self.total_leakage is None else dict(vars(self.total_leakage))
         if total is not None:
@@ -265,9 +281,9 @@ class Diagnosis(Evidence):
         )
 
     def to_frame(self) -> pandas.DataFrame:
-        """Return the figures as one row of a table, intervals as two columns; `pandas.concat` joins several.
+        """Return the diagnosis as a table with one row; an interval has two columns.
 
-        Raises MissingExtra if pandas is not installed.
+        `pandas.concat` joins the tables of several diagnoses. Raises MissingExtra if pandas is not installed.
         """
         try:
             import pandas
@@ -285,7 +301,7 @@ class Diagnosis(Evidence):
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Where to draw; by default the axes of a new figure.
+            Axes to draw into; by default those of a new figure.
 
         Returns
         -------
@@ -295,7 +311,7 @@ class Diagnosis(Evidence):
         Raises
         ------
         InputError
-            No method states the leak over time.
+            No detector states the leak over time.
         MissingExtra
             matplotlib is not installed.
         """
@@ -327,10 +343,10 @@ class Diagnosis(Evidence):
         return f"Diagnosis({self.verdict!r}, file={self.file!r}{figures_text})"
 
     def _repr_html_(self) -> str:
-        """Return the diagnosis as a table for notebooks."""
+        """Return the diagnosis as an HTML table for notebooks."""
 
         def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
-            """Format a number, with its interval if there is one; "" for None."""
+            """Format a number, followed by its interval if there is one; "" for None."""
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 
@@ -352,11 +368,11 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(test: Evidence) -> bool:
-    """Test whether at least 1 in 20 healthy recordings scores as high, or the chance is not stated."""
+    """Test whether at least 1 in 20 healthy recordings scores as high; True if this chance is not stated."""
     return test.chance is None or test.chance >= 0.05
 
 
 def find_machine_name(preamble: Mapping[str, str]) -> str | None:
-    """Return the machine's name in the preamble of a file; None if there is none."""
+    """Find the machine's name among the statements at the beginning of a file; None if it is not stated."""
     names = {name.lower(): text for name, text in preamble.items()}
     return next((names[name] for name in _MACHINE_NAMES if name in names), None)

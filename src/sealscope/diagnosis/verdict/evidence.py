@@ -1,4 +1,4 @@
-"""Evidence: the verdict of one detector, of one of its parts, or of all detectors together, with the figures for it."""
+"""Evidence: the verdict of one detector, one of its tests, or all detectors together, with the figures behind it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sealscope.recordings.recording import Array
 Verdict = Literal["leak", "no leak", "cannot tell"]
 #: The three verdicts; `decision.decide` alone gives one.
 LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
-#: What a change can come from.
+#: Possible causes of a change.
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
@@ -25,15 +25,15 @@ Cause = Literal[
 ]
 #: Figures that a detector may refuse to state.
 Figure = Literal["onset_s", "leak_lpm"]
-#: The causes for which the verdict is `leak`: piston and pump lie in parallel, often no channel separates them, and
-#: without a position a loss to the outside looks the same.
+#: The causes for which the verdict is `leak`. Piston and pump lie in parallel and often no channel separates them;
+#: without a position, a loss to the outside looks the same, too.
 LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "leak inside or outside")
 #: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest chance that is stated.
 RAREST: float = VERDICT.false_alarm.rarest
-#: The built-in detectors: by the balance of volumes, by a model of the pressures, and by changes of the pressures'
-#: details, which judges where no other can and states no size.
+#: The built-in detectors. They use the balance of volumes, a model of the pressures, and changes of the pressures'
+#: wavelet details; the last one decides only where no other can, and states no size.
 VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure response", "rms change"
 
 
@@ -41,9 +41,15 @@ VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure resp
 class LeakCourse:
     """Leak flow over the time of a recording.
 
-    Estimates `lpm` (k,) [L/min] at the times `t` (k,) [s], each with its 95 % interval `low`, `high` (k,). `whole`:
-    True for the total flow past pump and piston, stated if no leak began; False for the rise of that flow since the
-    onset of a leak.
+    Attributes
+    ----------
+    t : array, (k,)
+        Times of the estimates [s].
+    lpm, low, high : array, (k,)
+        Flow at these times, and its 95 % interval [L/min].
+    whole : bool
+        True for the total flow past pump and piston, which is stated if no leak began. False for the increase of that
+        flow since the onset of a leak.
     """
 
     t: Array
@@ -57,11 +63,18 @@ class LeakCourse:
 class TotalLeakage:
     """Mean flow past pump and piston together in a recording, including any leak from before its start.
 
-    `lpm`: the flow with its 95 % interval [L/min], None if the machine's size is not known; `pressure`: mean absolute
-    pressure difference that drives it [Pa]; `findable_lpm`: smallest step of the flow that would have been detected
-    [L/min], None if a step was detected; `healthy_lpm`: largest flow of a healthy machine at that pressure [L/min],
-    None if the rig does not state it; `pump_share`, `findable_share`: `lpm` and `findable_lpm` as fractions of the
-    pump's mean flow.
+    Attributes
+    ----------
+    lpm, interval_lpm : float and pair of floats, or None
+        The flow and its 95 % interval [L/min], None if the machine's size is not known.
+    pressure : float
+        Mean absolute pressure difference that drives the flow [Pa].
+    findable_lpm : float or None
+        Smallest step of the flow that would have been detected [L/min], None if a step was detected.
+    healthy_lpm : float or None
+        Largest flow of a healthy machine at this pressure [L/min], None if the rig does not state it.
+    pump_share, findable_share : float or None
+        `lpm` and `findable_lpm` as fractions of the pump's mean flow.
     """
 
     lpm: float | None
@@ -74,18 +87,25 @@ class TotalLeakage:
 
     @property
     def healthy(self) -> bool:
-        """True if the upper end of the flow's interval is at most the largest flow of a healthy machine."""
+        """True if the upper end of the flow's 95 % interval is at most the largest flow of a healthy machine.
+
+        The result is False if either of them is not known.
+        """
         is_known = self.healthy_lpm is not None and self.interval_lpm is not None
         return is_known and self.interval_lpm[1] <= self.healthy_lpm  # type: ignore[index,operator]
 
 
 @dataclass(frozen=True)
 class RelativeLeak:
-    """Leak relative to other measured quantities, available even if area and displacement are unknown.
+    """Size of a leak relative to other measured quantities, which needs no stated area or displacement.
 
-    `pump_share`: leak as a fraction of the pump's mean flow, None if the pump's motion is not recorded; `creep`: leak
-    divided by the piston's area, the speed at which the piston would creep with its lines shut [m/s], None if the
-    position has no unit; each with its 95 % interval.
+    Attributes
+    ----------
+    pump_share, pump_share_interval : float and pair of floats, or None
+        Leak as a fraction of the pump's mean flow, and its 95 % interval. None if the pump's motion is not recorded.
+    creep, creep_interval : float and pair of floats, or None
+        Leak divided by the piston's area, and its 95 % interval [m/s]. This is the speed at which the piston would
+        creep with its lines shut. None if the position has no unit.
     """
 
     pump_share: float | None = None
@@ -101,8 +121,9 @@ class Evidence:
     Parameters
     ----------
     verdict : {"leak", "no leak", "cannot tell"}
+        The verdict.
     reason : str
-        Why, in one line.
+        Reason for the verdict, in one line.
     score, threshold : float, optional
         A leak is reported if the score exceeds the threshold.
     onset_s, onset_interval_s : float and pair of floats, optional
@@ -110,30 +131,31 @@ class Evidence:
     leak_lpm, leak_interval_lpm : float and pair of floats, optional
         Mean flow past the piston while the leak is open, and its 95 % interval [L/min].
     parts : tuple of Evidence
-        The detector's own parts, each with a score and a threshold; of a fused verdict, the evidence of every detector.
+        The detector's single tests, each with a score and a threshold; for a combined verdict, the evidence of every
+        detector.
     cause : str, optional
-        Cause of the change. With a cause other than a leak past piston or pump, the verdict is `no leak` or `cannot
-        tell`.
+        Cause of the change. If it is something else than a leak past piston or pump, the verdict is `no leak` or
+        `cannot tell`.
     course : LeakCourse, optional
-        The leak over the recording, where the detector follows it.
+        The leak over the time of the recording, if the detector estimates it.
     refuses : frozenset of {"onset_s", "leak_lpm"}
         Figures that the detector has a reason not to state, as opposed to those it cannot compute.
     total_leakage : TotalLeakage, optional
-        Total flow past pump and piston, where the detector measures it.
+        Total flow past pump and piston, if the detector measures it.
     share : float
-        Share of the recording, 0 to 1, that the verdict rests on.
+        Fraction of the recording, 0 to 1, that was used for the verdict.
     judged_until : float
-        When the last judged sample was taken, as a share of the recording's time. A leak stays once it began, so that
-        only the rest after it may hide one.
+        Time of the last judged sample, as a fraction of the recording's duration. As a leak stays once it began, only
+        the rest of the recording may hide one.
     detector : str
-        Name of the detector, or of the part; of a fused verdict, the detector that judged, "" if none did.
+        Name of the detector or of its test; for a combined verdict, that of the deciding detector, "" if none did.
     usable : bool
-        Whether the recording had what the detector needs.
+        Whether the recording had the channels and the length that the detector needs.
     chance : float, optional
-        Probability that a leak-free recording scores as high, by the detector's own null distribution; at most the
-        false-alarm probability where the score is over the threshold.
+        Probability that a leak-free recording scores as high, by the detector's own null distribution. It is at most
+        the false-alarm probability if the score exceeds the threshold.
     relative : RelativeLeak, optional
-        The leak relative to the recording's own measurements; stated even if L/min is refused.
+        The leak relative to other quantities of the recording; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
         Measured ratio of displacement to area, relative to the assumed one, and its 95 % interval.
     bound_lpm : float, optional
@@ -165,17 +187,17 @@ class Evidence:
 
     @property
     def alarmed(self) -> bool:
-        """True if the score exceeds the threshold."""
+        """True if there is a score and it exceeds the threshold."""
         return self.score is not None and self.threshold is not None and self.score > self.threshold
 
     @property
     def abstains(self) -> bool:
-        """True if the verdict is `cannot tell` without a detected change, which leaves it to the next detector."""
+        """True if the verdict is "cannot tell" and no change was detected, so that the next detector is asked."""
         return self.verdict == CANNOT_TELL and self.cause is None and not self.alarmed
 
     @property
     def summary(self) -> str:
-        """The verdict in words, with its cause if the change is no leak past piston or pump."""
+        """The verdict in words; if the change is something else than a leak past piston or pump, with its cause."""
         if self.cause is None or self.cause in LEAKS or self.verdict == LEAK:
             return self.verdict
         if self.verdict == CANNOT_TELL:
@@ -184,12 +206,15 @@ class Evidence:
 
     @property
     def stated_chance(self) -> float | None:
-        """The `chance` for display, not below `RAREST`, as smaller probabilities cannot be trusted."""
+        """The `chance` to display, raised to at least `RAREST`, as smaller probabilities cannot be trusted.
+
+        It is None if the chance is unknown.
+        """
         return None if self.chance is None else max(RAREST, self.chance)
 
     @property
     def odds(self) -> str | None:
-        """Fraction of healthy recordings that look like this one, in words; None if it is not stated."""
+        """Fraction of healthy recordings that look like this one, as a sentence; None if it is not known."""
         if self.stated_chance is None:
             return None
         if self.stated_chance >= 0.2:

@@ -1,4 +1,4 @@
-"""The machine assumed by a diagnosis: the sizes behind every L/min, stated or merely assumed."""
+"""The machine that a diagnosis assumes: the sizes behind every flow in L/min, and whether somebody stated them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,26 @@ _DEFAULT, _REASON = "thesis", "no rig was stated"
 
 @dataclass(frozen=True)
 class AssumedMachine:
-    """Assumptions of a diagnosis about the machine.
+    """Sizes of the machine that a diagnosis assumes.
 
-    `rig`: name of the rig; `stated_by`: source of the rig: "call" (`--rig` or a Rig), "recording" (its provenance) or
-    "nobody"; `area`: mean piston area of both sides [m^2]; `displacement` of the pump [m^3/rev]; `area_stated`,
-    `displacement_stated`: True if known from the rig or stated separately; `flow_meter`: True if a meter, `q_pump`,
-    measures the flow, in which case neither size is needed; `areas`: areas of sides A and B [m^2]; `bypass`: True if a
-    flow meter in a bypass of the cylinder was recorded.
+    Attributes
+    ----------
+    rig : str
+        Name of the rig.
+    stated_by : {"call", "recording", "nobody"}
+        Source of the rig: the caller (`--rig` or a Rig), the recording's provenance, or a mere assumption.
+    area : float
+        Mean piston area of both sides [m^2].
+    displacement : float
+        Displacement of the pump [m^3/rev].
+    area_stated, displacement_stated : bool
+        Whether the size is known from the rig, or was stated separately.
+    flow_meter : bool
+        Whether a flow meter, channel `q_pump`, measures the flow, so that neither size is needed.
+    areas : tuple of float, optional
+        Piston areas of sides A and B [m^2].
+    bypass : bool
+        Whether a flow meter in a bypass of the cylinder was recorded.
     """
 
     rig: str
@@ -42,11 +55,11 @@ class AssumedMachine:
 
     @property
     def stated(self) -> bool:
-        """True if area and displacement are both stated, not assumed."""
+        """True if area and displacement are both stated, and not merely assumed."""
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the machine as plain JSON values."""
+        """Return the machine as plain values for JSON."""
         return {
             "name": self.rig,
             "stated_by": self.stated_by,
@@ -60,10 +73,11 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Return the rig that detectors assume, with a summary of which of its sizes are stated.
+    """Choose the rig that detectors assume for a recording, and summarise which of its sizes are stated.
 
-    Without `rig` the thesis's rig is used. It counts as stated if the recording's provenance names a rig of the same
-    areas and displacement; otherwise all its values are assumptions (`Rig.states`).
+    If `rig` is None, the thesis's rig is used. It counts as stated if the recording's provenance names a rig of the
+    same areas and displacement; otherwise all its values are marked as assumptions (`Rig.states`). Raises InputError
+    if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy = "call"
@@ -92,18 +106,18 @@ def states_rig(rig: Rig) -> bool:
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Test whether a flow meter in m^3/s measures the pump flow.
+    """Test whether the pump flow is measured by a flow meter in m^3/s, given the units of the channels.
 
-    False if the flow is computed from the pump's angle or speed.
+    The result is False if the flow is computed from the pump's angle or speed.
     """
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the largest leakage of a healthy pump, `pump.G_healthy` [m^3/(s Pa)], or 0 if unknown.
+    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] that the rig gives; 0 if it is not known.
 
-    A value that a rig file assumes for its own pump is used. The value of the default rig is not used for a pump of
-    which only the displacement is stated.
+    The parameter is `pump.G_healthy`. A value that a rig file assumes for its own pump is used. The value of the
+    default rig is not used for another pump of which only the displacement is stated.
     """
     is_same_place = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_same_place
@@ -111,12 +125,12 @@ def healthy_leakage(rig: Rig) -> float:
 
 
 def unstated_rig() -> Rig:
-    """Return the default rig, with each value marked as an assumption."""
+    """Return the default rig, with every value marked as an assumption."""
     return load_rig(_DEFAULT).as_assumed(_REASON)
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Test whether a recording's provenance names a packaged rig with the area and displacement of this one."""
+    """Test whether a recording's provenance names a packaged rig of the same areas and displacement as `rig`."""
     experiment = provenance.get("experiment")
     if not isinstance(experiment, Mapping):
         return False

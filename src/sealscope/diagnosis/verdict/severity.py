@@ -1,4 +1,4 @@
-"""Severity of a leak: as a flow, relative to the pump's flow, as a piston speed, and against a repair limit."""
+"""Severity of a leak: as a flow, as a fraction of the pump's flow, as a piston speed, and over a repair limit."""
 
 from __future__ import annotations
 
@@ -25,8 +25,15 @@ _Figure = tuple[float, float, float] | None
 class RepairLimit:
     """Leak at which a machine must be repaired.
 
-    `value`: by `kind` a flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s]; `stated`: True
-    if the caller gave the limit, False for the default creep of `priors.toml`, which applies to any piston area.
+    Attributes
+    ----------
+    value : float
+        A flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s].
+    kind : {"flow", "creep"}
+        Which of the two `value` is.
+    stated : bool
+        True if the caller gave the limit, False for the default creep speed of `priors.toml`, which applies to any
+        piston area.
     """
 
     value: float
@@ -35,7 +42,10 @@ class RepairLimit:
 
     @classmethod
     def parse(cls, text: str | None) -> RepairLimit:
-        """Parse a repair limit, a flow or a speed with its unit; return the default one for None."""
+        """Parse a repair limit such as "5 mL/min" or "8 mm/min"; None gives the default limit.
+
+        Raises InputError unless the text is a positive flow or speed with its unit.
+        """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
@@ -55,13 +65,13 @@ class RepairLimit:
         return f"{self.value / MM_PER_MINUTE:.3g} mm/min of creep"
 
     def flow_lpm(self, area: float | None) -> float | None:
-        """Convert the limit to L/min; None for a speed limit if the piston's `area` [m^2] is None."""
+        """Convert the limit to a flow [L/min]; None if it is a speed and the piston's `area` [m^2] is None."""
         if self.kind == "flow":
             return self.value / LITRE_PER_MINUTE
         return None if area is None else self.value * area / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain JSON values; the kind not stated is null."""
+        """Return the limit as plain values for JSON; of flow and creep speed, the one that is not stated is None."""
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
@@ -73,9 +83,18 @@ class RepairLimit:
 class Severity:
     """Severity of a leak, as far as it is known.
 
-    Each figure is given with its 95 % interval, or None if it is not known: `mL_per_min`, mean flow while the leak is
-    open; `pump_share`, that flow over the pump's mean flow; `creep_mm_per_min`, the speed at which the piston would
-    creep with its lines shut under the same pressure difference; `of_limit`, the leak over the repair limit.
+    Attributes
+    ----------
+    mL_per_min : tuple of float, or None
+        Mean flow while the leak is open [mL/min].
+    pump_share : tuple of float, or None
+        This flow as a fraction of the pump's mean flow.
+    creep_mm_per_min : tuple of float, or None
+        Speed at which the piston would creep with its lines shut under the same pressure difference [mm/min].
+    of_limit : tuple of float, or None
+        The leak divided by the repair limit.
+
+    Each figure is a tuple of value and 95 % interval (value, low, high), or None if it is not known.
     """
 
     mL_per_min: _Figure
@@ -85,10 +104,10 @@ class Severity:
 
     @property
     def level(self) -> Level | None:
-        """Urgency of the repair, by the 95 % interval of the leak relative to the limit.
+        """Urgency of the repair, from the 95 % interval of the leak divided by the repair limit.
 
-        `repair` if the whole interval is above the limit, `monitor` if all of it is below half the limit, else `plan`.
-        None if the leak is not known in the limit's unit.
+        It is "repair" if the whole interval is above the limit, "monitor" if all of it is below half the limit, else
+        "plan". It is None if the leak is not known in the limit's unit.
         """
         if self.of_limit is None:
             return None
@@ -96,7 +115,7 @@ class Severity:
         return "repair" if low > 1.0 else "monitor" if high < 0.5 else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain JSON values: each figure, its `_interval`, and the level."""
+        """Return the severity as plain values for JSON: the level, and each figure with its `_interval`."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
@@ -106,7 +125,10 @@ class Severity:
 
 
 def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
-    """Compute the severity of the leak in the evidence; None if there is no leak, or its size is unknown."""
+    """Compute the severity of a detected leak relative to a repair limit.
+
+    The result is None if there is no leak or its size is unknown.
+    """
     if evidence.verdict != LEAK or (evidence.leak_lpm is None and evidence.relative is None):
         return None
     relative = evidence.relative or RelativeLeak()
@@ -124,9 +146,10 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 
 
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
-    """Express a leak in L/min as a fraction of the assumed pump's flow, and as a speed of the assumed piston.
+    """Convert a leak in L/min to a fraction of the pump's flow and to a creep speed of the piston.
 
-    None if no L/min is stated; the fraction is None if neither speed nor angle of the pump is recorded.
+    Displacement and piston area are those of `machine`. The result is None if no L/min are stated. The fraction is
+    None if neither speed nor angle of the pump is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None
@@ -147,7 +170,10 @@ def _mean_speed(recording: Recording) -> float:
 
 
 def _convert_figure(value: float | None, interval: tuple[float, float] | None, factor: float = 1.0) -> _Figure:
-    """Multiply a value and its interval by a factor; return None if a number is missing or infinite."""
+    """Multiply a value and its interval by a factor; None if a number is missing or not finite.
+
+    Returns (value, low, high).
+    """
     if value is None or interval is None or not all(math.isfinite(number) for number in (value, *interval)):
         return None
     return factor * value, factor * interval[0], factor * interval[1]

@@ -22,12 +22,26 @@ LEAKING = (LEAK, "leak over the limit")
 
 @dataclass(frozen=True, kw_only=True)
 class MachineState:
-    """State of a machine, from `states.toml`.
+    """State of a machine by NAMUR NE 107, from `states.toml`.
 
-    `name`: good, check function, out of specification, maintenance required or failure; `symbol`: its letter; `health`:
-    its number in DeviceHealthEnumeration; `severity`: 1 to 1000, as of an event of OPC UA, 0 for good; `condition` that
-    it follows from, such as "leak" or "no data"; `since_s`: clock of the samples when it began [s], None if
-    unknown; `cause` of the change; `action`: what is to be done.
+    Attributes
+    ----------
+    name : str
+        "good", "check function", "out of specification", "maintenance required" or "failure".
+    symbol : str
+        Letter of the state.
+    health : int
+        Number of the state in OPC UA's DeviceHealthEnumeration.
+    severity : int
+        Severity of an OPC UA event for the state, 1 to 1000; 0 for good.
+    condition : str
+        Condition that led to the state, such as "leak" or "no data".
+    since_s : float or None
+        Time at which the state began, on the clock of the samples [s]; None if unknown.
+    cause : str or None
+        Cause of the change.
+    action : str
+        What is to be done.
     """
 
     name: str
@@ -40,13 +54,13 @@ class MachineState:
     action: str
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the state as plain JSON values."""
+        """Return the state as plain values for JSON."""
         return {**vars(self)}
 
 
 @cache
 def _tables() -> Mapping[str, Mapping[str, Any]]:
-    """Read `states.toml`."""
+    """Read the tables of `states.toml`; they are cached."""
     return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
 
 
@@ -54,10 +68,11 @@ def _tables() -> Mapping[str, Mapping[str, Any]]:
 def state_of(
     condition: str, cause: str | None = None, *, since_s: float | None = None, action: str | None = None
 ) -> MachineState:
-    """Return the machine state for a condition of `states.toml`; raise KeyError for an unknown condition.
+    """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    `cause`: cause of the change; it determines the action, and also the state unless it is a leak past piston or pump.
-    `since_s`: time at which the state began [s]; `action`: replaces the action of the table.
+    `cause` is the cause of the change. It determines the action and, unless the condition is a leak past piston or
+    pump, also the state. `since_s` is the time at which the state began [s]. `action` replaces the action of the
+    table.
     """
     tables = _tables()
     condition_row, cause_row = tables["conditions"][condition], tables["causes"].get(cause or "", {})
@@ -69,9 +84,10 @@ def state_of(
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
-    """Return the action for a condition, or for the cause of a change; KeyError as for `state_of`.
+    """Return the action for a condition of `states.toml`, or for the cause of a change if the table has one.
 
-    `parts`: components that leak like a worn seal, such as a bypass valve; their checks come first.
+    `parts` are components that leak like a worn seal, such as a bypass valve. If the machine leaks, their checks come
+    first. Raises KeyError for an unknown condition or part.
     """
     tables = _tables()
     action: str = tables["causes"].get(cause or "", tables["conditions"][condition])["action"]

@@ -1,4 +1,4 @@
-"""Export of alarms and estimates as labelled data; the labels are the marks of persons."""
+"""Export alarms and estimates as labelled data; the labels follow from the marks that persons gave the alarms."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ ALARM_COLUMNS = (
     "by_chance_per_1000_h",
 )
 ESTIMATE_COLUMNS = ("actuator", "t", "status", *FIGURES, "label", "alarm")
-#: Mark of an alarm -> label of its estimates.
+#: Label of the estimates during an alarm, by the mark of the alarm.
 _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write `alarms.csv` and `estimates.csv` into a folder, and return their numbers of rows.
+    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return their numbers of rows.
 
-    The estimates from the start of an alarm's onset interval until its last mark are labelled `leak` if the mark is
-    `repaired` or `valid`, and `healthy` if it is `invalid`. Other estimates have no label.
+    The estimates from the start of an alarm's onset interval until its last mark are labelled: `leak` if the mark is
+    `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
@@ -51,7 +51,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     n_estimates = 0
 
     def estimates() -> Iterator[dict[str, Any]]:
-        """Yield the rows of the estimates, and count them."""
+        """Yield the rows of `estimates.csv` with their labels, and count them."""
         nonlocal n_estimates
         for n_estimates, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
             labels = [labels for start, stop, labels in intervals[row["actuator"]] if start <= row["t"] <= stop]
@@ -63,7 +63,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
 
 
 def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any]]]:
-    """Read all events in their order, by the id of their alarm."""
+    """Read all events of alarms, and group them by the id of the alarm, in their order."""
     events, number = defaultdict[str, list[dict[str, Any]]](list), 0
     while batch := store.events_since(number):
         number = batch[-1][0]
@@ -73,5 +73,5 @@ def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any
 
 
 def _select_columns(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
-    """Return the values of these columns, None for missing ones."""
+    """Select the values of `columns` from a row, with None for a missing value."""
     return {name: row.get(name) for name in columns}

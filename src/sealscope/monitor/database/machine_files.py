@@ -1,4 +1,4 @@
-"""Marks of alarms, written to the file of the commissioned machine that an actuator's `rig` names."""
+"""Write the marks that persons give alarms into the file of the commissioned machine."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from sealscope.storage.toml_file import read_toml
 
 
 def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
-    """Write a person's mark of an alarm into the machine's file `rig`, and return a line that states the result.
+    """Write the mark that a person gave an alarm into the machine's file, and return one line that states the result.
 
-    The `samples` before an `invalid` mark are added as a healthy recording, unless the machine judges them leaking.
-    After a `valid` mark no recording from the onset on becomes healthy until a repair. Returns "" for any other mark,
-    and if `rig` is not a machine's file.
+    `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` these are added as a
+    healthy recording, unless the machine judges that they leak. After a `valid` mark no recording from the onset on
+    becomes healthy until a repair. Returns "" for a mark that such a file does not store, and if `rig` is no
+    machine's file.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
@@ -39,7 +40,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         outcome = "written down"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the alarm to a machine, and after an invalid one its samples as healthy."""
+            """Add the marked alarm to a machine, and if it is invalid, its samples as a healthy recording."""
             nonlocal outcome
             machine = replace(machine, alarms=(*machine.alarms, judgement))
             if mark == "invalid":
@@ -57,7 +58,11 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
 
 
 def _combine_samples(samples: Sequence[Recording], shift: float) -> Recording:
-    """Join samples to one recording that starts at 0 s; its date is the first time plus `shift` [s since 1970]."""
+    """Join samples to one recording whose times start at 0 s.
+
+    `shift` [s]: added to the first time to give the date of the recording, in seconds since 1970. Raises
+    SealscopeError if there are no samples.
+    """
     if not samples:
         raise SealscopeError("no samples of the alarm are kept: add its recording by sealscope commission --add")
     joined = join(samples) if len(samples) > 1 else samples[0]

@@ -1,8 +1,8 @@
 """Connections to PostgreSQL with time limits, for a server that is gone, hangs, or waits for a lock.
 
-TCP detects a server that is gone. A server that hangs still confirms every packet: after a deadline for its answer the
-connection is closed and the transaction tried again. The server itself aborts a statement before that deadline, as
-otherwise each attempt would leave one more waiting process in it.
+TCP detects a server that is gone. A server that hangs still confirms every packet: after a deadline for its answer
+the connection is closed and the transaction is tried again. The server itself aborts a statement before that
+deadline; otherwise each attempt would leave one more waiting process in it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
 
 
 def engine_options(url: URL) -> dict[str, Any]:
-    """Return the engine options of a PostgreSQL URL, {} for another database; options in the URL take precedence."""
+    """Build the options of SQLAlchemy's `create_engine` that limit the waiting times of a PostgreSQL database.
+
+    Returns {} for another database. Options in the URL take precedence.
+    """
     if url.drivername not in _DRIVERS:
         return {}
     keepalive = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
@@ -37,22 +40,25 @@ def engine_options(url: URL) -> dict[str, Any]:
 
 
 def limit_answers(engine: Engine) -> None:
-    """Limit the time of each answer on an engine's connections, if the driver is psycopg 3."""
+    """Make an engine's connections raise an error if the server does not answer within `ANSWER_S`.
+
+    Only the driver psycopg 3 is supported; with others nothing is done.
+    """
     if engine.dialect.driver != "psycopg":
         return
     from psycopg import Connection, OperationalError
 
     class LimitedConnection(Connection[Any]):
-        """A connection, closed if the server does not answer in time."""
+        """A connection that is closed if the server does not answer within `ANSWER_S`."""
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
-            """Run a generator of the driver, with which psycopg waits for an answer, under the time limit."""
+            """Run `gen`, the generator by which psycopg waits for an answer, under the time limit."""
             return super().wait(self._limited(gen), *arguments, **options)
 
         def _limited(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Close the connection and raise OperationalError if `gen` gets no answer for `ANSWER_S`.
+            """Pass on the generator `gen`; close the connection and raise OperationalError without an answer.
 
-            Psycopg resumes the generator several times a second, also without an answer.
+            Psycopg resumes the generator several times a second, even if there is no answer.
             """
             last_answer, ready = time.monotonic(), None
             while True:

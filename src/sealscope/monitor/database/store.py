@@ -30,9 +30,9 @@ from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import restore
 
-#: Identities of blocks that are kept for each actuator: more than a day of messages of 1 s each.
+#: Number of block identities that are stored for each actuator: more than a day of messages of 1 s each.
 MAX_IDENTITIES = 100_000
-#: Refused messages that are kept: the last ones.
+#: Number of refused messages that are stored, the newest ones.
 MAX_REFUSED = 1000
 #: Attempts to create the tables, as several monitors may start at once.
 _ATTEMPTS = 10
@@ -40,10 +40,11 @@ _ATTEMPTS = 10
 
 @dataclass
 class StoredRows:
-    """Rows that one transaction adds to the tables in addition to the blocks.
+    """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
 
-    `estimates`, `pending`, `events`: new rows; `alarms` by id, `actuators` (checkpoints) and `summaries` by actuator:
-    changed rows; `old_blocks`, `old_estimates`: the number up to which they are deleted, by actuator.
+    `estimates`, `pending`, `events`: new rows; `alarms` (by id), `actuators` and `summaries` (by actuator): rows that
+    are new or replace others, where `actuators` has the checkpoints; `old_blocks`, `old_estimates`: by actuator, the
+    running number up to which old rows are deleted.
     """
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
@@ -56,7 +57,7 @@ class StoredRows:
     old_estimates: dict[str, int] = field(default_factory=dict)
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
-        """Add the estimates of a block, each with the oil temperature [deg C]."""
+        """Add the estimates of an actuator's blocks, each with the oil temperature [deg C], None if unknown."""
         for estimate in estimates:
             total, leak = estimate.total_interval_lpm or (None, None), estimate.leak_interval_lpm or (None, None)
             figures = (estimate.total_lpm, *total, estimate.leak_lpm, *leak, oil_celsius)
@@ -66,17 +67,18 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add the samples and verdict of a block, which a restart judges again.
+        """Add a block's samples and the verdict on them, which a restart judges again until the next checkpoint.
 
-        `number`: number of the block since the checkpoint, from 1; `follows`: False if the samples do not continue
-        those before.
+        `number`: number of the block since the checkpoint, from 1; `follows`: False if there is a gap between these
+        samples and those before.
         """
         self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
-        """Add an alarm in its present state, and an event of `kind` at `t` [s]; no event if `kind` is empty.
+        """Add an alarm in its present state, and an event of this kind at the time `t` [s].
 
-        `by_whom`, `text`: the person who caused the event and their comment, "" if there is none.
+        `kind`: name of the event, "" to add none; `by_whom`, `text`: the person who caused it and their comment, ""
+        for none.
         """
         actuator, plain = {"actuator": alarm.actuator}, json.dumps(alarm.as_dict())
         self.alarms[alarm.id] = {**actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
@@ -85,13 +87,13 @@ class StoredRows:
             self.events.append({**actuator, **entry, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
-        """Add the state of an actuator, which replaces its pending samples."""
+        """Add a checkpoint: the settings (JSON) and state of an actuator, which replace its pending samples."""
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
         plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
 
     def add_summary(self, actuator: str, summary: dict[str, Any]) -> None:
-        """Add the summary of an actuator."""
+        """Add the summary of an actuator, which the page and other outputs show."""
         import orjson
 
         plain = orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode()
@@ -99,7 +101,11 @@ class StoredRows:
 
 
 class StoredSamples(NamedTuple):
-    """Samples of a block; `follows`: True if they continue those before; `verdict`: None if they are no recording."""
+    """The stored samples of a block.
+
+    `follows`: False if there is a gap between these samples and those before; `verdict`: verdict on the samples as a
+    whole recording, None if they are no recording.
+    """
 
     samples: Recording
     follows: bool
@@ -107,7 +113,10 @@ class StoredSamples(NamedTuple):
 
 
 class StoredCheckpoint(NamedTuple):
-    """The checkpoint of an actuator: its settings as JSON, its state as plain values, and the samples since."""
+    """The stored checkpoint of an actuator.
+
+    `settings`: its settings as JSON; `state`: its state as plain values; `pending`: samples that arrived after it.
+    """
 
     settings: str
     state: dict[str, Any]
@@ -139,7 +148,10 @@ class MonitorStore:
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {version} ({database})")
 
     def _prepare_tables(self, attempts: int) -> str:
-        """Create missing tables, in up to `attempts` tries, and return the schema version of the database."""
+        """Create missing tables, and return the version of the database's schema.
+
+        Tries up to `attempts` times, because another monitor may be creating the tables.
+        """
         facts = tables.facts
         try:
             with self.engine.begin() as connection:
@@ -156,13 +168,13 @@ class MonitorStore:
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Open a transaction, committed if the block ends without an error."""
+        """Open a transaction, which is committed if the context ends without an error, else rolled back."""
         with self._writing_lock, self.engine.begin() as connection:
             yield connection
 
     @contextmanager
     def _begin_relaxed_transaction(self) -> Iterator[sa.Connection]:
-        """Open a faster transaction, which survives the end of this process but perhaps not a loss of power."""
+        """Open a faster transaction, whose changes survive the end of this process but perhaps no loss of power."""
         is_file = self.engine.dialect.name == "sqlite"
         with self._writing_lock, self.engine.connect() as connection:
             if is_file:
@@ -179,17 +191,17 @@ class MonitorStore:
                     connection.commit()
 
     def _rows(self, query: Any) -> Sequence[sa.Row[Any]]:
-        """Execute a query and return its rows."""
+        """Execute a query, and return all its rows."""
         with self.engine.connect() as connection:
             return connection.execute(query).all()
 
     def _value(self, query: Any) -> int:
-        """Return the single number of a query, 0 if there is none."""
+        """Execute a query for a single number, and return it; return 0 if there is none."""
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
     def select_stored(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Select the stored blocks among `blocks`, each an actuator and an identity."""
+        """Select the blocks that are stored already among `blocks`, given as pairs (actuator, identity)."""
         # one query per block: SQLite scans the whole table for a list of pairs
         columns = tables.blocks.c
         is_block = (columns.actuator == bindparam("name")) & (columns.identity == bindparam("identity"))
@@ -202,11 +214,11 @@ class MonitorStore:
             }
 
     def is_known(self, actuator: str, identity: str) -> bool:
-        """Return True if a block is stored."""
+        """Return True if the block of an actuator with this identity is stored already."""
         return bool(self.select_stored([(actuator, identity)]))
 
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
-        """Store blocks, each an actuator, an identity, and a running number of the actuator.
+        """Store the identities of blocks, each given as (actuator, identity, running number of the actuator).
 
         Raises IntegrityError, which ends the transaction, if one of them is stored already.
         """
@@ -214,7 +226,7 @@ class MonitorStore:
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
-        """Store rows and delete old ones within a transaction, with one statement per table."""
+        """Write rows to all tables within a transaction, and delete the old rows that `rows` states."""
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
             delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
@@ -234,12 +246,12 @@ class MonitorStore:
                 connection.execute(table.delete().where(is_old), last_old_rows)
 
     def commit_rows(self, rows: StoredRows) -> None:
-        """Store rows in a transaction of their own."""
+        """Write rows to all tables in a separate transaction (`write_rows`)."""
         with self.writing() as connection:
             self.write_rows(connection, rows)
 
     def upsert(self, connection: sa.Connection, table: sa.Table, rows: list[dict[str, Any]]) -> None:
-        """Update rows of a table by primary key, or insert the missing ones."""
+        """Write rows to a table: update the stored rows with the same primary keys, and insert the missing ones."""
         if not rows:
             return
         key = table.primary_key.columns.keys()
@@ -254,7 +266,7 @@ class MonitorStore:
                     self.upsert(connection, table, [row])
 
     def write_refused(self, rows: Sequence[dict[str, Any]]) -> None:
-        """Store refused messages in a transaction of their own, and keep only the last `MAX_REFUSED`."""
+        """Store refused messages in a separate transaction, and delete all but the newest `MAX_REFUSED`."""
         table, columns = tables.refused, tables.refused.c
         with self.writing() as connection:
             connection.execute(table.insert(), rows[-MAX_REFUSED:])
@@ -262,14 +274,15 @@ class MonitorStore:
             connection.execute(table.delete().where(columns.number <= last - MAX_REFUSED))
 
     def refused(self, max_rows: int = MAX_REFUSED) -> list[dict[str, Any]]:
-        """Return the last refused messages and files, newest first."""
+        """Read the last refused messages and files, newest first."""
         rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(max_rows))
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
-        """Record that a reader starts to decode a message; return how many earlier attempts never finished.
+        """Store that a reader starts to decode a message; return the number of earlier attempts that never finished.
 
-        A message whose decoding crashes the process can thus be refused after the restart.
+        After a restart, a message whose decoding crashed the process can thus be refused. `digest`: hash of the
+        message.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -279,17 +292,17 @@ class MonitorStore:
         return n_before
 
     def end_decoding(self, reader: str, digest: str) -> None:
-        """Delete the note that a reader began to decode a message."""
+        """Delete the record of `begin_decoding`: the reader has finished with the message of this digest."""
         columns = tables.decodings.c
         with self._begin_relaxed_transaction() as connection:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
-        """Return the highest number of an actuator's rows of `table` (blocks or estimates), 0 if there are none."""
+        """Read the highest running number of an actuator's blocks or estimates, whichever `table` has; 0 for none."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
-        """Read the checkpoint of an actuator and the samples since, None if there is no checkpoint."""
+        """Read the checkpoint of an actuator with the samples since then; return None if there is no checkpoint."""
         states, pending = tables.actuators, tables.pending
         samples = select(pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
         with self.engine.connect() as connection:
@@ -298,16 +311,19 @@ class MonitorStore:
         return None if row is None else StoredCheckpoint(row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
-        """Return the samples of an actuator since its last checkpoint."""
+        """Read the samples of an actuator since its last checkpoint, one recording for each block."""
         checkpoint = self.checkpoint(actuator)
         return [] if checkpoint is None else [block.samples for block in checkpoint.pending]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the last summary of each actuator."""
+        """Read the last summary of each actuator, by name."""
         return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
-        """Return alarms as plain values, sorted by actuator, then by running number, latest first."""
+        """Read alarms as plain values, sorted by actuator, and for each actuator with the latest alarm first.
+
+        `open_only`: leave out closed and invalid alarms; `actuator`: read only the alarms of this actuator.
+        """
         columns = tables.alarms.c
         query = select(columns.alarm)
         if open_only:
@@ -318,22 +334,23 @@ class MonitorStore:
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, max_events: int = 1000) -> list[tuple[int, dict[str, Any]]]:
-        """Return (number, event) of the events after `number`, in ascending order."""
+        """Read the events with a running number above `number`, as pairs (number, event) in ascending order."""
         columns = tables.events.c
         query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(max_events)
         return [(row.number, _event_from_row(row)) for row in self._rows(query)]
 
     def last_events(self, actuator: str, max_events: int = 200) -> list[dict[str, Any]]:
-        """Return the latest events of an actuator, newest first."""
+        """Read the latest events of an actuator, newest first."""
         columns = tables.events.c
         query = select(tables.events).where(columns.actuator == actuator)
         query = query.order_by(columns.number.desc()).limit(max_events)
         return [_event_from_row(row) for row in self._rows(query)]
 
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
-        """Average successive estimates of an actuator, to return at most about `max_rows` rows in order of time.
+        """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        `seconds`: length of the history before the newest estimate [s], None for all of it.
+        Each row is the mean of equally many successive estimates. `seconds` [s]: length of the history before the
+        newest estimate, None for all of it.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -346,14 +363,14 @@ class MonitorStore:
         return [dict(row._mapping) for row in self._rows(query.where(is_chosen).group_by(group).order_by(group))]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
-        """Yield all stored estimates, by actuator and number."""
+        """Yield all stored estimates, sorted by actuator and running number."""
         query = select(tables.estimates).order_by(tables.estimates.c.actuator, tables.estimates.c.number)
         with self.engine.connect() as connection:
             for row in connection.execution_options(yield_per=10_000).execute(query):
                 yield dict(row._mapping)
 
     def position(self, name: str) -> int:
-        """Return the number of the last event that the output `name` has delivered, 0 if there is none."""
+        """Read the number of the last event that the output `name` has delivered, 0 if there is none."""
         return self._value(select(tables.facts.c.value).where(tables.facts.c.name == name))
 
     def write_position(self, name: str, number: int) -> None:
@@ -362,7 +379,10 @@ class MonitorStore:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Call `send` with the output's new events in order until it returns False; store the position after each."""
+        """Deliver the new events of an output by the function `send`, in order, until it returns False.
+
+        After each event its number is stored, so the next call continues there. `output`: name of the output.
+        """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
                 return
@@ -370,7 +390,7 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Return the reason in one line if the error is an outage of the database, None for any other error.
+    """Describe an outage of the database in one line; return None if the error means no outage.
 
     Values that the database cannot store are no outage: it would refuse them again.
     """
@@ -382,7 +402,10 @@ def outage_reason(error: BaseException) -> str | None:
 
 
 def _pack(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -> bytes:
-    """Pack samples as a line of JSON and the arrays as little-endian doubles, times first."""
+    """Pack samples as bytes: a line of JSON, then the times and all channels as little-endian doubles.
+
+    The line has units, rate, `follows` (False after a gap), and the verdict if there is one.
+    """
     header = _format_header(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
     if verdict is not None:
         header = json.dumps({**json.loads(header), "verdict": vars(verdict)}).encode() + b"\n"
@@ -391,12 +414,15 @@ def _pack(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the line of JSON of `_pack`, without a verdict."""
+    """Format the line of JSON with which packed samples begin (`_pack`), without a verdict.
+
+    `units`: (channel, unit) of each channel; `rate` [Hz]; `follows`: False after a gap.
+    """
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
 def _unpack(data: bytes) -> StoredSamples:
-    """Unpack samples from the bytes of `_pack`."""
+    """Unpack the samples that `_pack` has packed as bytes."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)
@@ -407,7 +433,7 @@ def _unpack(data: bytes) -> StoredSamples:
 
 
 def _event_from_row(row: Any) -> dict[str, Any]:
-    """Convert a row of the table of events to the plain values that outputs send."""
+    """Convert a row of the table `events` to plain values, in the form in which outputs send events."""
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
     return {**values, "alarm": json.loads(row.alarm)}
 

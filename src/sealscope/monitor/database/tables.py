@@ -10,7 +10,7 @@ from sqlalchemy.types import TypeEngine
 metadata = MetaData()
 #: Version of the tables, kept in `facts`.
 SCHEMA = 4
-#: Figures of an estimate.
+#: Numbers in the row of an estimate.
 FIGURES = (
     *("total_lpm", "total_low_lpm", "total_high_lpm"),
     *("leak_lpm", "leak_low_lpm", "leak_high_lpm", "oil_celsius"),
@@ -19,9 +19,11 @@ _TYPES: dict[str, TypeEngine[Any]] = {"text": Text(), "int": Integer(), "double"
 
 
 def _table(name: str, columns: str, *indexes: Index) -> Table:
-    """Make a table from comma-separated columns, each with its name, its type or longest text, then its roles.
+    """Define a table of the database from a text that lists its columns, separated by commas.
 
-    Roles: ``key`` (primary key), ``counted`` (a running number as the key), ``indexed``, ``null`` (may be null).
+    Each column is written as its name, its type (``text``, ``int``, ``double``, ``bytes``, or a number for a text of
+    at most that length), and its roles: ``key`` (primary key), ``counted`` (a running number as the key),
+    ``indexed``, ``null`` (may be null).
     """
     table_columns: list[Column[Any]] = []
     for column, kind, *roles in map(str.split, columns.split(",")):
@@ -38,19 +40,19 @@ _block_order = Index("blocks_in_order", "actuator", "number")
 blocks = _table("blocks", "actuator 120 key, identity 120 key, number int", _block_order)
 #: Samples since the checkpoint, which a restart judges again.
 pending = _table("pending", "actuator 120 key, number int key, samples bytes")
-#: State of the detector and of the alarm, as of the checkpoint, in JSON.
+#: State of the detector and of the alarm at the checkpoint, in JSON.
 actuators = _table("actuators", "actuator 120 key, settings text, checkpoint text")
-#: Summary of each actuator, apart from the state: rows are written whole, and a state is large.
+#: Summary of each actuator; separate from the state, because rows are written whole and a state is large.
 summaries = _table("summaries", "actuator 120 key, summary text")
 _FIGURES = ", ".join(f"{name} double null" for name in FIGURES)
 estimates = _table("estimates", f"actuator 120 key, number int key, t double, status 160, {_FIGURES}")
 alarms = _table("alarms", "id 160 key, actuator 120 indexed, state 20 indexed, alarm text")
-#: What happened to alarms, and what persons said of them, in order; outputs keep how far they are.
+#: Changes of alarms and comments of persons, in order; each output stores the number of the last one it delivered.
 events = _table(
     "events",
     "number int counted, actuator 120 indexed, t double, kind 20, alarm_id 160, by_whom 80, text text, alarm text",
 )
-#: The last messages and files that could not be taken: when [s], from where, why, their size and how they begin.
+#: The last messages and files that were refused: when [s], why, their size, and their first bytes.
 refused = _table("refused", "number int counted, at double, reason 120, message text, size int, beginning bytes")
-#: Messages whose decoding has not ended: who reads them, their digest, and how often it was begun.
+#: Messages whose decoding has begun and not ended: reader, digest of the message, and number of attempts.
 decodings = _table("decodings", "reader 240 key, digest 40 key, attempts int")

@@ -1,1 +1,1 @@
-"""Outputs of alarms and states: JSON lines, webhook, Prometheus, Sparkplug B."""
+"""Outputs of a monitor's alarms and states: JSON lines, webhook, Prometheus and Sparkplug B."""

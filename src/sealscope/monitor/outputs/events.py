@@ -1,6 +1,7 @@
-"""Events as JSON lines on a stream and as posts to a web address, in order and at least once.
+"""Send the events of alarms as JSON lines to a stream and as POST requests to a web address, in order.
 
-The store has the position of each output. An event sent just before a crash is sent again, with the same number.
+Each event is sent at least once. The database stores how far each output has come; an event sent just before a crash
+is sent again, with the same number.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.supervisor import PartAway
 
 logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
-#: Events of the detector, which are not announced while an alarm is shelved.
+#: Events that the detector causes; they are not announced while an alarm is shelved.
 _DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
 
 def _is_announced(event: dict[str, Any]) -> bool:
-    """Return True if an event is announced; of a shelved alarm only the marks of persons are announced."""
+    """Return True if an event is to be sent; of a shelved alarm, only the marks of persons are."""
     return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
 class EventLines:
-    """Write the events of a store to a text stream.
+    """Writes the events in the database `store` to a text stream, as one line of JSON each.
 
-    If the stream accepts only a part of a line, the rest follows later: no line is cut off or written twice.
+    If the stream accepts only a part of a line, the rest is written later: no line is cut off or written twice.
     """
 
     def __init__(self, store: MonitorStore, stream: TextIO | None) -> None:
@@ -41,9 +42,9 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an event as a line, if it is announced.
+        """Write an event as a line unless its alarm is shelved; return True, or raise PartAway if that fails.
 
-        The line is not buffered, as a buffer would keep the lines that a full disk refuses.
+        The line is not buffered, because a buffer would keep lines that a full disk refuses.
         """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
@@ -66,10 +67,11 @@ class EventLines:
 
 
 class Webhook:
-    """Post the events of a store to a web address, each as the JSON object of its line.
+    """Posts the events in the database `store` to a web address, each as a JSON object.
 
-    Status 200 to 299 confirms an event. `Idempotency-Key` is its number. The token is sent as `Authorization: Bearer`;
-    it is never logged, and redirects are not followed. `timeout`: limit of a request with its answer [s].
+    An answer with status 200 to 299 confirms an event. The header `Idempotency-Key` has its number. The token, if
+    any, is sent as `Authorization: Bearer`; it is never logged, and redirects are not followed. `timeout` [s]:
+    longest time of a request with its answer.
     """
 
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
@@ -83,7 +85,7 @@ class Webhook:
         self._store.deliver("webhook", self._send_post)
 
     def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an event if it is announced; raise PartAway if it is not confirmed."""
+        """Post an event unless its alarm is shelved; return True, or raise PartAway if it is not confirmed."""
         if not _is_announced(event):
             return True
         try:
@@ -97,7 +99,7 @@ class Webhook:
         return True
 
     async def _post(self, event: dict[str, Any]) -> None:
-        """Send one request; raise OSError if its status is not 200 to 299."""
+        """Send one event in a request; raise OSError if the status of the answer is not 200 to 299."""
         headers = {**self._headers, "Idempotency-Key": str(event["number"])}
         client = httpx.AsyncClient(timeout=None)
         async with (

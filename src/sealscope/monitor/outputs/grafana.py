@@ -8,7 +8,7 @@ from typing import Any
 
 
 def dashboard() -> dict[str, Any]:
-    """Build the dashboard, with the actuator as a variable, in the JSON form of Grafana."""
+    """Build the Grafana dashboard, on which the actuator can be chosen, as plain values for Grafana's JSON."""
     tables: dict[str, Any] = tomllib.loads((files("sealscope.monitor.outputs") / "grafana.toml").read_text("utf-8"))
     panels, x, y, row_height = [], 0, 0, 0
     for number, (title, kind, query, legend, unit, width, height) in enumerate(tables["panels"], 1):

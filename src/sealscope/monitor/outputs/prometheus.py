@@ -12,7 +12,7 @@ from sealscope.monitor.bounded_queue import QueueLoad
 
 #: Content type of the text.
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-#: Metric of an actuator -> help text, and key in its summary. A name that ends in `_total` is a counter.
+#: By metric of an actuator: its help text, and its key in the summary. A name that ends in `_total` is a counter.
 _ACTUATOR_METRICS = {
     "sealscope_leak_lpm": ("Leak beyond the healthy machine over the cycles seen [L/min]", "leak_lpm"),
     "sealscope_leak_low_lpm": ("Lower end of its 95 % interval [L/min]", "leak_low"),
@@ -26,7 +26,7 @@ _ACTUATOR_METRICS = {
     "sealscope_blocks_total": ("Blocks since the beginning", "blocks"),
     "sealscope_block_time_seconds": ("Clock at the end of the last block", "t"),
 }
-#: Metric of a part of the monitor, or of its queue -> help text.
+#: Help texts of the metrics of each part of the monitor, and of its queue.
 _PART_METRICS = {
     "sealscope_reached": "1 while a part of the monitor or what it needs is reached, 0 in an outage",
     "sealscope_outages_total": "Outages since the start",
@@ -45,10 +45,11 @@ def format_metrics(
     parts: Mapping[str, tuple[bool, int, float]] | None = None,
     queue_load: QueueLoad | None = None,
 ) -> str:
-    """Format the metrics of all actuators and of the monitor as text.
+    """Format the metrics of all actuators and of the monitor in the text format of Prometheus.
 
-    `counters`: numbers of dropped messages and blocks, by reason; `parts`: for each part, such as the database, whether
-    it is reached, its number of outages, and their length [s].
+    `summaries`: summary of each actuator by name; `counters`: numbers of dropped messages and blocks, by reason;
+    `parts`: for each part, such as the database, (True if it works now, number of outages, their total length [s]);
+    `queue_load`: blocks that wait to be stored.
     """
     families: dict[str, Any] = {}
 

@@ -1,8 +1,9 @@
-"""Alarms as an edge node of Sparkplug B with one device per actuator; its death certificate is the last will.
+"""Publish alarms and values as an edge node of Sparkplug B with one device per actuator.
 
-Births state all metrics. Data messages state each event of an alarm at once and in order, and every few seconds the
-other metrics that have changed. bdSeq increases with each connection, also after a restart. Messages have QoS 0: a host
-that misses a sequence number requests a birth.
+Birth messages state all metrics. Data messages state each event of an alarm at once and in order, and every few
+seconds the other metrics that have changed. The death message is the last will of the connection. Its number bdSeq
+increases with each connection, also after a restart. Messages have QoS 0: a host that misses a sequence number
+requests a birth.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
 
 
 class SparkplugNode:
-    """The edge node of a monitor.
+    """The Sparkplug B edge node by which a monitor publishes its alarms and values.
 
-    `summaries`: returns the summary of each actuator; `count`: called with the reason for each dropped message;
-    `password`: that of the broker.
+    `store`: database with the events; `summaries`: function that returns the summary of each actuator; `count`:
+    function called with the reason for each received message that is dropped; `password`: password for the broker.
     """
 
     def __init__(
@@ -57,7 +58,10 @@ class SparkplugNode:
         self._next_update = 0.0
 
     def deliver(self) -> None:
-        """Send a birth if one is due, then new events and changed values."""
+        """Send the birth messages if they are due, then new events and, every few seconds, changed values.
+
+        Connects to the broker at the first call; does nothing while there is no connection.
+        """
         if not self._link.is_open:
             self._last_birth_number = self._store.position(_BIRTHS)
             self._link.open(clean_start=True)
@@ -94,23 +98,26 @@ class SparkplugNode:
             self._link.close()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
-        """Return the topic of a message of the node, or of one of its devices."""
+        """Build the topic of a message of this node, or of one of its devices; `kind`: its type, such as "DDATA"."""
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
-        """Return topic and payload of the last will for the next connection.
+        """Build topic and payload of the death message, which is the last will of the next connection.
 
-        Its bdSeq follows that of the last birth.
+        Its number bdSeq is the one after that of the last birth.
         """
         self._birth_number = (self._last_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands and make the birth due, or log that the broker refuses the connection."""
+        """Subscribe to commands and mark the birth as due, or log that the broker refuses the connection.
+
+        The library paho calls this after an attempt to connect.
+        """
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
             return
@@ -118,7 +125,7 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Acknowledge a command; if it requests a birth, make the birth due."""
+        """Acknowledge a received command, and mark the birth as due if the command requests it."""
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
@@ -131,7 +138,10 @@ class SparkplugNode:
             self._birth_due.set()
 
     def _send_event(self, event: dict[str, Any]) -> bool:
-        """Send an event and its alarm as data of the actuator's device; return True if they were sent."""
+        """Send an event and its alarm as a data message of the actuator's device; return True if it was sent.
+
+        An event of an actuator that is no longer in the settings is skipped, with True.
+        """
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
         if alarm["actuator"] not in self._sent_values:  # the actuator is no longer in the settings
             return True
@@ -151,7 +161,10 @@ class SparkplugNode:
             self._send_device_birth(actuator, summary, latest.get(actuator, {}))
 
     def _send_device_birth(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:
-        """Send the birth of an actuator's device; `alarm`: its latest, {} if there is none."""
+        """Send the birth message of an actuator's device, which states all its metrics.
+
+        `alarm`: its latest alarm as plain values, {} if there is none.
+        """
         values = _metric_values("summary", summary)
         metrics = _build_metrics("summary", values, _milliseconds(summary["t"]))
         metrics += _build_metrics("alarm", _metric_values("alarm", alarm), _milliseconds(alarm.get("updated_s")))
@@ -160,7 +173,10 @@ class SparkplugNode:
         self._sent_values[actuator] = values
 
     def _send(self, kind: str, metrics: list[spb.SparkplugMetric], actuator: str | None = None) -> bool:
-        """Send a message with the next sequence number; return True if it was sent."""
+        """Send a message of the node, or of an actuator's device, with the next sequence number.
+
+        `kind`: its type, such as "DDATA". Returns True if it was sent.
+        """
         self._seq = (self._seq + 1) % 256
         topic = self._topic(kind, None if actuator is None else topic_level(actuator))
         payload = spb.SparkplugPayload(_milliseconds(None), tuple(metrics), self._seq)
@@ -169,22 +185,25 @@ class SparkplugNode:
 
 @cache
 def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
-    """Load a table of `sparkplug_node.toml`: type, unit and path to the value, by name of the metric."""
+    """Load a table of `sparkplug_node.toml`: by name of a metric, its type, its unit and the path of its value."""
     file = files("sealscope.monitor.outputs") / "sparkplug_node.toml"
     table: dict[str, dict[str, str]] = tomllib.loads(file.read_text("utf-8"))[name]
     return table
 
 
 def _milliseconds(t: float | None) -> int:
-    """Convert a time of samples [s] to [ms since 1970].
+    """Convert a time of samples [s] to milliseconds since 1970.
 
-    The present time replaces None, and a time that is not counted from 1970.
+    If the time is None, or not counted from 1970, the present time is returned.
     """
     return round(1000.0 * (t if t is not None and counts_from_1970(t) else time.time()))
 
 
 def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Look up each metric of a table in the nested `values`, None if it is missing."""
+    """Look up the value of each metric of a table of `sparkplug_node.toml` in nested values.
+
+    Returns the values by name of the metric, with None for a missing one.
+    """
     result: dict[str, Any] = {}
     for name, row in _load_table(table).items():
         value: Any = values
@@ -196,7 +215,10 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build the metrics of a table from values by name, with `timestamp` [ms since 1970]."""
+    """Build metrics of a table of `sparkplug_node.toml` from their values by name.
+
+    `timestamp` [ms since 1970]: time of all of them.
+    """
     rows = {name: _load_table(table)[name] for name in values}
     return [
         spb.SparkplugMetric(name, values[name], getattr(spb, row["type"]), timestamp=timestamp, unit=row.get("unit"))

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-#: Wrong tokens of an address without a pause; first and longest pause [s]; time after which they are forgotten [s];
-#: number of addresses that are remembered.
+#: Number of wrong tokens that an address may state without a pause; first and longest pause [s]; time after which
+#: they are forgotten [s]; number of addresses that are remembered.
 _FREE_ATTEMPTS, _FIRST_PAUSE_S, _MAX_PAUSE_S, _FORGET_S, _MAX_ADDRESSES = 5, 1.0, 60.0, 3600.0, 10_000
 #: Most connections, and the largest fraction of the file descriptors of this process for them: sources, outputs and
 #: the database need the others.
@@ -24,25 +24,26 @@ BACKLOG = 64
 
 
 class Admission:
-    """The access check of a page, which delays an address after wrong tokens.
+    """The check of the token by which a page admits visitors; it delays an address after wrong tokens.
 
-    `token`: the valid token; `now`: returns the time of a monotonic clock [s].
+    `token`: the valid token; `now`: function that returns a monotonic time [s].
 
-    After five wrong tokens the next one of an address, right or wrong, is checked only after a pause of 1 s. Each
-    further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
+    After five wrong tokens the next one from the same address, right or wrong, is checked only after a pause of 1 s.
+    Each further wrong token doubles the pause, up to a minute. An IPv6 network (/64) counts as one address.
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
         self._token, self._now = token, now
-        #: Network -> number of wrong tokens, and time of the last one [s].
+        #: By network: number of wrong tokens, and time of the last one [s].
         self._failures: dict[str, tuple[int, float]] = {}
         #: Cookie of a browser that has stated the token.
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Compute the time [s] that an address must wait until its next token is checked; 0 if it need not wait.
+        """Compute the time [s] that an address must wait until its next token is checked, 0 if it need not wait.
 
-        After `_FREE_ATTEMPTS` failures from its network the pause doubles with each one, up to `_MAX_PAUSE_S`.
+        After `_FREE_ATTEMPTS` wrong tokens from its network the pause doubles with each further one, up to
+        `_MAX_PAUSE_S`.
         """
         n_failures, last = self._failures.get(_network(address), (0, 0.0))
         if n_failures < _FREE_ATTEMPTS:
@@ -51,9 +52,9 @@ class Admission:
         return max(0.0, last + min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S) - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right, else count the failure against its address.
+        """Return True if a token is right; if it is wrong, count that for its address and return False.
 
-        `session`: True if `token` is a browser's cookie instead.
+        `session`: True if `token` is the cookie of a browser that has stated the token before.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -88,20 +89,23 @@ def connection_limit() -> int:
 
 
 def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asyncio.Protocol]:
-    """Build a subclass of uvicorn's HTTP protocol that limits number and silence of the connections.
+    """Build a subclass of uvicorn's HTTP protocol that limits the number of connections and their idle time.
 
-    A connection is closed after `silent_s` seconds without activity. Above the limit the connection that has been
-    silent for longest is closed, or the new one if all others are being answered.
+    A connection is closed after `silent_s` seconds without activity. If there are more than `max_connections`, the
+    one that has been silent for longest is closed, or the new one if all others are being answered.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
     base: Any = AutoHTTPProtocol
 
     class LimitedProtocol(base):  # type: ignore[misc]
-        """A connection; `last_activity`: time of its last request, or of its last reading of an answer [s]."""
+        """A connection to the page.
+
+        `last_activity` [s]: time at which it last sent a request or read a part of an answer.
+        """
 
         def connection_made(self, transport: Any) -> None:
-            """Accept the connection; above the limit close the one that has been silent for longest."""
+            """Accept the connection; if there are too many, close the one that has been silent for longest."""
             super().connection_made(transport)
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:
@@ -116,7 +120,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
             return self.cycle is not None and not self.cycle.response_complete
 
         def check_silence(self) -> None:
-            """Close the connection if it has been silent for too long, else check again later."""
+            """Close the connection if it has been silent for too long; otherwise schedule the next check."""
             if self.transport.is_closing():
                 return
             now = self.loop.time()

@@ -1,4 +1,4 @@
-"""The last seconds of the actuators that somebody views, as the page draws them; no others are kept."""
+"""The last seconds of samples of the actuators that somebody views on the page, and their curves."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Samples kept of an actuator: the last `SPAN_S` [s], at slow rates more, as the details need `MIN_SAMPLES`; at most
-#: `MAX_SAMPLES`, and of at most `MAX_ACTUATORS` at a time.
+#: Samples kept of an actuator: the last `SPAN_S` [s], but at least `MIN_SAMPLES`, which the details need, and at most
+#: `MAX_SAMPLES`; they are kept for at most `MAX_ACTUATORS` at a time.
 SPAN_S, MIN_SAMPLES, MAX_SAMPLES, MAX_ACTUATORS = 20.0, 2500, 20_000, 20
 #: Bins of a chart, each with its minimum and maximum; rate of the drawn motion [Hz], and its length [s].
 _BINS, _MOTION_HZ, _MOTION_S = 400, 20.0, 8.0
@@ -38,7 +38,11 @@ PRESSURES = ("p_A", "p_B")
 
 @dataclass
 class _Window:
-    """The last samples without a gap; arrays are replaced, never changed, so that readers need no lock."""
+    """The last samples of an actuator without a gap.
+
+    `rate` [Hz]: sampling rate; `t` [s]: times; `version`: number of blocks added. The arrays are replaced and never
+    changed, so readers need no lock.
+    """
 
     rate: float = 0.0
     t: Array = field(default_factory=lambda: np.empty(0))
@@ -46,7 +50,10 @@ class _Window:
     version: int = 0
 
     def add(self, samples: Recording) -> None:
-        """Append samples; start the window anew after a gap, or at another rate or with other channels."""
+        """Append samples; start anew after a gap, or if the sampling rate or the channels change.
+
+        Samples that are in the window already, without channels, or with times that are not finite are ignored.
+        """
         max_samples = min(MAX_SAMPLES, max(MIN_SAMPLES, round(SPAN_S * samples.rate)))
         t = samples.t[-max_samples:]
         names = [name for name in CHANNELS if name in samples]
@@ -67,9 +74,9 @@ class _Window:
 
 
 class LiveSamples:
-    """The last seconds of the actuators that are viewed.
+    """The last seconds of samples of the actuators that somebody views; no others are kept.
 
-    `recall`: returns the last stored samples of an actuator, with which a new window is filled.
+    `recall`: function that returns the last stored samples of an actuator, which are shown first.
     """
 
     def __init__(self, recall: Callable[[str], Sequence[Recording]] = lambda name: ()) -> None:
@@ -80,7 +87,10 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of an actuator while the context lasts; yield False if too many are viewed already."""
+        """Keep the samples of an actuator while the context lasts, and yield True.
+
+        If too many actuators are viewed already, yield False and keep none.
+        """
         with self._lock:
             is_first = name not in self._windows
             is_admitted = not is_first or len(self._windows) < MAX_ACTUATORS
@@ -116,20 +126,22 @@ class LiveSamples:
 
     @property
     def viewed(self) -> frozenset[str]:
-        """The actuators that somebody views."""
+        """Names of the actuators that somebody views."""
         return frozenset(self._windows)
 
     def version(self, name: str) -> int:
-        """Return a number that increases whenever a viewed actuator gets new samples, 0 if there are none."""
+        """Return a number that increases when an actuator gets new samples, 0 if it is not viewed or has none."""
         window = self._windows.get(name)
         return 0 if window is None else window.version
 
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
-        """Compute the curves of a viewed actuator as plain values, None for a missing value.
+        """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
 
-        Times count back from the last sample, which is at 0 s. `pressures` [bar]; `details`: wavelet details d1 to d4
-        of one `pressure` [kPa], by `detail_form` as their RMS in windows of `WINDOW_SIZE` samples ("rms") or as samples
-        ("details"); `motion`: position [mm], pressures [bar], speeds of piston [mm/s] and pump [rpm].
+        Times are relative to the last sample, which is at 0 s. In the result, `pressures` has the chamber pressures
+        [bar]; `details` the wavelet details d1 to d4 of one pressure [kPa]; and `motion` the position [mm], the
+        pressures [bar], and the speeds of piston [mm/s] and pump [rpm]. `pressure`: channel for `details`;
+        `detail_form`: "rms" for the RMS of the details in windows of `WINDOW_SIZE` samples, "details" for the details
+        themselves.
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -151,15 +163,16 @@ class LiveSamples:
 
 
 def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
-    """Round numbers to `digits` decimals; those that are not finite become None."""
+    """Round numbers to `digits` decimals, and replace those that are not finite by None, as JSON needs."""
     rounded_values = np.round(values, digits)
     return [value if math.isfinite(value) else None for value in rounded_values.tolist()]
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce long series over `t` to minimum and maximum in each of about `_BINS` bins, in order of time.
+    """Reduce long series to the minimum and maximum in each of about `_BINS` bins, in the order in which they occur.
 
-    Series of at most two samples per bin are returned as they are, by name, with the times as `t`.
+    `series`: values by name, over the times `t` (n,). Returns the reduced times as "t", and the reduced series by
+    name. Series of at most two samples per bin are not reduced.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -176,10 +189,11 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 
 
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
-    """Compute the wavelet details of a pressure [Pa], or their RMS, in [kPa], for `LiveSamples.curves`.
+    """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
-    Only the samples after the last missing one are used; there are no curves if these are too few. `signal`: None if
-    the pressure is not recorded; `pressure`: its name.
+    `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name;
+    `detail_form`: "details" or "rms". Only the samples after the last missing one are used; if they are too few, the
+    curves are empty.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -202,14 +216,18 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 
 
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
-    """Average the channels over bins of 1/`_MOTION_HZ`, and compute the speeds of piston and pump from the means."""
+    """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
+
+    The channels, over the times `t` [s], are averaged over bins of 1/`_MOTION_HZ`, and the speeds computed from the
+    means. `rate` [Hz]: sampling rate. Returns plain values by name.
+    """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))
     if n_bins < 2:  # too few for a speed
         return {"t": []}
 
     def bin_means(values: Array) -> Array:
-        """Average values (n,) over the last bins, (n_bins,)."""
+        """Average values (n,) over each of the last `n_bins` bins; return the means (n_bins,)."""
         return np.asarray(values[values.size - n_bins * bin_size :].reshape(n_bins, bin_size).mean(axis=1))
 
     times = bin_means(t)
@@ -229,10 +247,11 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 
 @cache
 def describe_rig(rig: str) -> dict[str, Any]:
-    """Describe in plain values the parts of a rig that the page draws.
+    """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rods`: the sides that the rod leaves; `stroke` [mm]; `area` [L/min per mm/s] and `displacement` [L/rev] give flows;
-    `valve`: True if a servo valve drives the cylinder.
+    `rig`: name or path; `title`; `rods`: sides of the cylinder at which a rod leaves it; `valve`: True if a servo
+    valve drives the cylinder; `stroke` [mm]; `area` [L/min per mm/s]: mean piston area, flow per speed;
+    `displacement` of the pump [L/rev].
     """
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit

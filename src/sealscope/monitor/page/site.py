@@ -1,6 +1,6 @@
-"""The page as a web application, for this machine only or protected by a token.
+"""The monitor's page as a web application, for this computer only or protected by a token.
 
-Nothing is loaded from other sites, and all names and texts from outside are shown as text.
+Nothing is loaded from other sites, and all names and texts from outside are shown as plain text.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _RETRY_HEADERS = {"Retry-After": "5"}
 #: Name of the login's cookie, and its lifetime [s].
 _COOKIE, _COOKIE_S = "sealscope", 30 * 86_400
 _LOCAL = ("127.0.0.1", "localhost", "::1")
-#: Address -> static file and its media type.
+#: By address: static file and its media type.
 _FILES = {
     "/": ("page.html", "text/html"),
     **{f"/{name}": (name, "text/javascript") for name in ("page.js", "live.js", "twin.js")},
@@ -64,7 +64,7 @@ _FILES = {
     "/uPlot.js": ("vendor/uPlot.iife.min.js", "text/javascript"),
     "/uPlot.css": ("vendor/uPlot.min.css", "text/css"),
 }
-#: Address -> name of the method of `_Pages` that answers, and its HTTP methods.
+#: By address: name of the method of `_Pages` that answers, and its HTTP methods.
 _ROUTES = {
     **{path: ("file", "GET") for path in _FILES},
     "/login": ("login", "GET POST"),
@@ -83,9 +83,11 @@ def site(
     queue_load: Callable[[], QueueLoad] = QueueLoad,
     live: LiveSamples | None = None,
 ) -> Starlette:
-    """Build the web application of a monitor; if there is a token, only the login form is open without it.
+    """Build the web application that serves the page of a monitor.
 
-    `live`: the live samples of the service; by default only stored samples are shown.
+    `token`: token that a visitor must state for all but the login form, None to admit everybody; `queue_load`:
+    function that returns the load of the queue of blocks; `live`: the last samples of the service; by default only
+    stored samples are shown.
     """
     pages = _Pages(actuators, token, queue_load, live or LiveSamples(actuators.store.last_samples))
     routes = [Route(path, getattr(pages, name), methods=methods.split()) for path, (name, methods) in _ROUTES.items()]
@@ -111,25 +113,28 @@ class _Pages:
         self._admission = None if token is None else Admission(token)
 
     def file(self, request: Request) -> Response:
-        """Answer with a static file."""
+        """Answer with the static file of the request's address."""
         name, kind = _FILES[request.url.path]
         text = str(read_package_file(name)) if name.startswith("vendor/") else _read_packaged(name)
         return Response(text, media_type=kind)
 
     def _counters_and_outages(self) -> dict[str, Any]:
-        """Return counters, queued blocks and outages, which are known without the database."""
+        """Collect the counters, the number of queued blocks and the outages, which are known without the database."""
         counters, outages = self._actuators.counters, self._supervisor.outages()
         return {"counters": counters, "waiting": self._queue_load().n_blocks, "outages": outages}
 
     def fleet(self, request: Request) -> Response:
-        """Answer with all actuators by severity, and the state of the monitor."""
+        """Answer with the summaries of all actuators, most urgent first, and the state of the monitor, as JSON."""
         rows = rank_actuators(self._actuators.summaries(), self._store.alarms(open_only=True))
         rows = [{**row, "by_files": row["name"] in self._by_files} for row in rows]
         budget = self._actuators.false_alarms_per_1000_h
         return JSONResponse({"actuators": rows, **self._counters_and_outages(), "false_alarms_per_1000_h": budget})
 
     def actuator(self, request: Request) -> Response:
-        """Answer with summary, history, events and alarms of one actuator."""
+        """Answer with the summary, history, events and alarms of one actuator, as JSON.
+
+        Query: `name` of the actuator; `hours`, length of the history, all of it if missing.
+        """
         name, hours = request.query_params.get("name", ""), request.query_params.get("hours", "")
         summary = self._actuators.summaries().get(name)
         if summary is None:
@@ -149,7 +154,7 @@ class _Pages:
         return JSONResponse(details)
 
     async def mark(self, request: Request) -> Response:
-        """Apply a person's mark to an alarm, and answer with the alarm."""
+        """Apply the mark in the request's body to the alarm of an actuator, and answer with the alarm as JSON."""
         # against forged requests: a form of another site cannot send this header
         if request.headers.get("x-sealscope") != "mark":
             return _make_refusal("the header X-Sealscope is missing", 403)
@@ -167,7 +172,10 @@ class _Pages:
         return JSONResponse(alarm.as_dict())
 
     async def changes(self, request: Request) -> Response:
-        """Answer with a stream of change numbers, and of the live curves of one actuator if its name is given."""
+        """Answer with a stream of server-sent events: one after each change, and the live curves of an actuator.
+
+        Query: `actuator`, without which there are no curves; `pressure` and `drawn`, which details are drawn.
+        """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
         defaults = {"actuator": "", "pressure": "p_A", "drawn": "rms"}
@@ -183,7 +191,10 @@ class _Pages:
         self._n_listeners -= 1
 
     async def _lines(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
-        """Yield server-sent events: a number after each change, and curves of an actuator's last samples."""
+        """Yield the text of server-sent events: a number after each change, and curves of an actuator's last samples.
+
+        `name`: the actuator, "" for no curves; `pressure`, `detail_form`: as in `LiveSamples.curves`.
+        """
         live, actuators = self._live, self._actuators
         with ExitStack() as viewing:
             is_viewing = bool(name) and await asyncio.to_thread(viewing.enter_context, live.viewing(name))
@@ -201,7 +212,7 @@ class _Pages:
                 silence_s += _LOOK_S
 
     def metrics(self, request: Request) -> Response:
-        """Answer with the metrics for Prometheus."""
+        """Answer with the metrics of the monitor in the text format of Prometheus."""
         return Response(self._render_metrics(self._actuators.summaries()), media_type=CONTENT_TYPE)
 
     def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
@@ -209,7 +220,10 @@ class _Pages:
         return format_metrics(summaries, self._actuators.counters, totals, load)
 
     async def answer_outage(self, request: Request, error: Exception) -> Response:
-        """Answer with status 503 in an outage of the database, with what is known without it; re-raise other errors."""
+        """Answer with status 503 in an outage of the database; raise any other error again.
+
+        The answer has the counters, queue and outages, which are known without the database.
+        """
         reason = outage_reason(error)
         if reason is None:
             raise error
@@ -222,7 +236,7 @@ class _Pages:
         return JSONResponse({"error": text, **self._counters_and_outages()}, 503, _RETRY_HEADERS)
 
     async def login(self, request: Request) -> Response:
-        """Answer with the login form; set the cookie of a browser that posts the token."""
+        """Answer with the login form; if the right token is posted, set a cookie and redirect to the page."""
         status, admission, address = 200, self._admission, _client_address(request)
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
@@ -239,7 +253,7 @@ class _Pages:
         return Response(_read_packaged("login.html"), status, media_type="text/html")
 
     def _find_refusal(self, request: Request) -> Response | None:
-        """Return the refusal of a request without a valid token or cookie, None if it may pass."""
+        """Check the token or cookie of a request; return the answer that refuses it, or None if it is admitted."""
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None
@@ -259,14 +273,14 @@ class _Pages:
         return answer
 
     async def guard(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        """Refuse a request without a valid token or cookie, pass on any other, and add the security headers."""
+        """Refuse a request without a valid token or cookie, or answer it by `call_next`; add the security headers."""
         answer = self._find_refusal(request) or await call_next(request)
         answer.headers.update(_HEADERS)
         return answer
 
 
 class _EventStream(StreamingResponse):
-    """A response of server-sent events; `ended` is called when it ends for any reason."""
+    """A response of server-sent events; the function `ended` is called when it ends for any reason."""
 
     def __init__(self, lines: AsyncIterator[str], ended: Callable[[], None]) -> None:
         super().__init__(lines, media_type="text/event-stream")
@@ -288,12 +302,12 @@ def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None
 
 
 def _refuse_for_now(wait: float) -> Response:
-    """Refuse a request of an address that must wait `wait` [s] before its next token."""
+    """Build the answer to an address that must wait `wait` seconds before its next token (status 429)."""
     return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 
 def _format_event(kind: str, values: Mapping[str, Any]) -> str:
-    """Format a server-sent event; JSON keeps its data on one line."""
+    """Format a server-sent event of this kind, with its values as one line of JSON."""
     return f"event: {kind}\ndata: {json.dumps(values, allow_nan=False)}\n\n"
 
 
@@ -302,7 +316,7 @@ def _client_address(request: Request) -> str:
 
 
 async def _read_body(request: Request) -> bytes:
-    """Read the body of a request; raise InputError if it is too large, TimeoutError if it takes too long."""
+    """Read the body of a request; raise InputError if it is too large, and TimeoutError if it takes too long."""
     data = b""
     async with asyncio.timeout(_BODY_S):
         async for part in request.stream():
@@ -313,9 +327,9 @@ async def _read_body(request: Request) -> bytes:
 
 
 class PageServer:
-    """The page, served by a thread of its own until `close`.
+    """The web server of the page, which runs in a separate thread until `close`.
 
-    Raises InputError if its port is taken or its token cannot be read.
+    `queue_load`, `live`: as in `site`. Raises InputError if the port is taken or the token cannot be read.
     """
 
     def __init__(
@@ -345,7 +359,7 @@ class PageServer:
             raise InputError(f"page.port must be free, got {error.strerror or error} ({place})") from None
 
     def _serve(self) -> None:
-        """Serve the page until `leave`; uvicorn closes the socket at the end."""
+        """Serve the page until `leave` is called; uvicorn closes the socket at the end."""
         page_socket = self._socket or self._open_socket()  # after an error it is closed
         self._socket = None
         config = uvicorn.Config(
@@ -367,7 +381,7 @@ class PageServer:
             raise RuntimeError("the page's server has ended")
 
     def leave(self) -> None:
-        """Make the server end soon, without waiting."""
+        """Tell the server to end, without waiting for that."""
         self._actuators.closed = True
         if self._server is not None:
             self._server.should_exit = True

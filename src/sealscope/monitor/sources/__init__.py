@@ -1,1 +1,1 @@
-"""Where blocks of samples come from."""
+"""Sources of a monitor's samples: files, lines, MQTT, Sparkplug B and OPC UA."""

@@ -1,11 +1,13 @@
-"""Blocks from an MQTT 5 broker, acknowledged when they are stored; alarms to it, retained.
+"""Read blocks of samples from an MQTT 5 broker, and publish alarms and states to it as retained messages.
 
-The session outlives the connection (QoS 1, no clean start): messages in flight at a crash are sent again, and their
-blocks recognised by identity. The thread of the connection only queues messages; another thread decodes them and waits
-for the service. The start of decoding a large or repeated message is stored until it ends: a message during which the
-process has died twice is refused unread. Messages of QoS 0 that find the queue full are dropped and counted. If a
-broker sends more messages of QoS 1 than agreed (as mosquitto 2.0.11 does), the excess stays unacknowledged and is sent
-again in order over a new connection.
+A message is acknowledged when its block is stored. The session outlives the connection (QoS 1, no clean start):
+messages that were under way at a crash are sent again, and their blocks are recognised by identity. The thread of the
+connection only queues messages; another thread decodes them and waits for the service.
+
+The start of decoding a large or repeated message is stored until decoding ends. A message whose decoding has crashed
+the process twice is refused unread. Messages of QoS 0 that find the queue full are dropped and counted. If a broker
+sends more messages of QoS 1 than agreed (mosquitto 2.0.11 does), the surplus is not acknowledged; the broker sends it
+again, in order, over a new connection.
 """
 
 from __future__ import annotations
@@ -60,7 +62,11 @@ _ASKED_AGAIN = "messages of QoS 1 that found no room and were asked for again"
 
 
 def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
-    """Return the source of a broker's messages; raise InputError if a secret cannot be read."""
+    """Build a source that submits the messages of a broker as blocks, and publishes alarms to it.
+
+    Returns a function that takes the receiver of the blocks and runs until that stops. Raises InputError if a secret
+    cannot be read, and MissingExtra if the MQTT library is not installed.
+    """
     password = read_secret(settings.password_file, "mqtt.password_file")
     check_mqtt()
     return lambda service: _Connection(settings, password, service).run()
@@ -117,7 +123,7 @@ class _Connection:
             self._link.close()
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Publish the state of the host and subscribe, or begin an outage if the broker refuses the connection."""
+        """Publish that the host is online and subscribe to all topics, or begin an outage if the broker refuses."""
         self._connection += 1
         if reason.is_failure:
             self._broker.begin_outage(f"{self._settings.host} refuses the connection: {reason}")
@@ -131,22 +137,25 @@ class _Connection:
         self._arrived.put((self._connection, None), 0, always=True)
 
     def _offline_message(self) -> tuple[str, str]:
-        """Build the last will of a Sparkplug primary host, dated at the start of the coming connection."""
+        """Build topic and payload of the last will of a Sparkplug primary host, which says that it is offline.
+
+        Its timestamp is the present time, at which the connection is about to start.
+        """
         self._connected_ms = round(1000.0 * time.time())
         return self._state_message(online=False)
 
     def _state_message(self, *, online: bool) -> tuple[str, str]:
-        """Return topic and payload of the STATE message of a Sparkplug primary host."""
+        """Build topic and payload of the STATE message of a Sparkplug primary host."""
         state = json.dumps({"online": online, "timestamp": self._connected_ms})
         return f"{NAMESPACE}/STATE/{self._settings.host_id}", state
 
     def _on_disconnect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Begin an outage, unless this side has ended the connection."""
+        """Begin an outage after the connection is lost, unless this side has ended it."""
         if not self._service.stopping.is_set() and self._refusing != self._connection:
             self._broker.begin_outage(f"the connection to {self._settings.host} is lost: {reason}")
 
     def _on_connect_fail(self, client: Any, userdata: Any) -> None:
-        """Begin an outage with the reason why no connection was made."""
+        """Begin an outage after a failed attempt to connect, with the reason of the failure."""
         error = sys.exc_info()[1]  # paho calls while it handles the error
         reason = " ".join(str(getattr(error, "strerror", None) or error or "").split())[:120]
         if isinstance(error, ssl.SSLCertVerificationError):
@@ -155,7 +164,10 @@ class _Connection:
         self._broker.begin_outage(f"no connection to {place}: {reason}".removesuffix(": "))
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Queue a message without blocking, which would let the connection time out."""
+        """Queue a received message, without waiting for room: that would let the connection time out.
+
+        If the queue is full, a message of QoS 0 is dropped, and one of QoS 1 is left unacknowledged.
+        """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
             if not self._arrived.put(queue_entry, size):
@@ -189,7 +201,10 @@ class _Connection:
                     refusing_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
-        """Decode a message and submit its block or refusal; the message is acknowledged once that is stored."""
+        """Decode a message and submit its block, or its refusal; it is acknowledged once that is stored.
+
+        `connection`: number of the connection by which the message came.
+        """
         number, qos = message.mid, message.qos
 
         def acknowledge() -> None:
@@ -220,9 +235,9 @@ class _Connection:
 
     @contextmanager
     def _note_decoding(self, message: Any) -> Iterator[None]:
-        """Note in the database that a large or repeated message is being decoded, until the context ends.
+        """Store in the database, until the context ends, that a large or repeated message is being decoded.
 
-        Raises RefusedMessage if the decoding has begun twice without an end, as the process died both times.
+        Raises RefusedMessage if its decoding has begun twice and never ended, because the process died both times.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
@@ -240,7 +255,7 @@ class _Connection:
                 store.end_decoding(self._name, digest)
 
     def _deliver(self) -> None:
-        """Publish the alarms of new events and the changed states as retained messages."""
+        """Publish the alarms of new events, and the states that have changed, as retained messages."""
         if self._settings.alarms_topic is None or not self._client.is_connected():
             return
 
@@ -257,6 +272,9 @@ class _Connection:
                     self._published_states[name] = state
 
     def _publish(self, actuator: str, kind: str, message: str) -> bool:
-        """Publish a retained message of an actuator, an "alarm" or "state"; return True if acknowledged."""
+        """Publish a retained message about an actuator; return True if the broker acknowledges it.
+
+        `kind`: "alarm" or "state", the last level of its topic; `message`: its payload, as JSON.
+        """
         topic = f"{self._settings.alarms_topic}/{topic_level(actuator)}/{kind}"
         return self._link.publish(topic, message, qos=1, retain=True)

@@ -1,4 +1,4 @@
-"""Blocks from the files of a folder: one for each complete recording, in the order of their start times."""
+"""Read the files of a folder as blocks of samples, one for each complete recording, in order of their start times."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ _GAP_S = 1.0
 
 
 class _FoundFile(NamedTuple):
-    """A file of a folder: time of its last change [s since 1970], path, and identity of its contents."""
+    """A file in a watched folder.
+
+    `modified_s` [s since 1970]: time of its last change; `identity`: text from its name, size and time of change.
+    """
 
     modified_s: float
     path: Path
@@ -59,10 +62,10 @@ class _FoundFile(NamedTuple):
 
 
 class WatchedFolder:
-    """The recordings of one actuator in its folder.
+    """The folder with the recordings of one actuator, read file by file as they arrive.
 
-    `settle_s`: time without a change after which a file is read [s]; `is_stored`: tests whether the block of an
-    actuator and identity is stored; `newest_s`: time of the newest stored sample [s since 1970].
+    `settle_s` [s]: time without a change after which a file is read; `is_stored`: function that returns True if the
+    block of an actuator with an identity is stored; `newest_s` [s since 1970]: time of the newest stored sample.
     """
 
     def __init__(
@@ -86,11 +89,11 @@ class WatchedFolder:
         self._submitted, self._unreadable, self._outside_links = set[str](), set[str](), set[str]()
 
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
-        """Yield the blocks of files that are complete and not stored yet, in the order of their recordings.
+        """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
-        An unreadable file is tried again once it has not changed for long. If it fails again, or is older than the
-        samples watched so far, it is refused: stored as a block without samples, and not read again. Raises PartAway if
-        the folder cannot be read.
+        An unreadable file is tried again when it has not changed for a longer time. If it fails again, it is refused:
+        a block without samples is stored, and the file is not read again. A recording that is older than the samples
+        watched so far is refused too. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())
         self._first_seen = {file.identity: self._first_seen.get(file.identity, time.monotonic()) for file in files}
@@ -120,13 +123,14 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Compute the time since a file changed or was first seen [s], whichever is longer."""
+        """Compute the time [s] since a file changed or since it was first seen, whichever is longer."""
         return max(time.time() - file.modified_s, time.monotonic() - self._first_seen[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Return True if a file has settled, is not stored, and may be tried now.
+        """Return True if a file is to be read now: it has not changed for `settle_s` and is not stored yet.
 
-        A file that is stored already is marked as submitted.
+        An unreadable file is due again only when it has not changed for a longer time. A file that is stored already
+        is marked as submitted.
         """
         if file.identity in self._unreadable and self._may_be_incomplete(file):
             return False
@@ -142,7 +146,10 @@ class WatchedFolder:
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
     def _start_time(self, file: _FoundFile) -> float:
-        """Return the time of a file's first sample [s since 1970], or its modification time if it cannot be read."""
+        """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
+
+        The file is read for this; its recording is kept for `blocks` if there is memory for it.
+        """
         modified_s, path, identity = file
         if identity not in self._starts:
             samples, reason = self._read(path)
@@ -164,7 +171,10 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Return the reason to refuse a recording that is older than those watched before, "" for no refusal."""
+        """Find the reason to refuse a recording: it is older than those watched before; return "" to accept it.
+
+        A file that is dated in the future is logged, and does not count as newest.
+        """
         if samples is None:
             return ""
         path, now = file.path, time.time()
@@ -177,11 +187,11 @@ class WatchedFolder:
         return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
 
     def _judge_block(self, block: SourceBlock, recording: Recording, path: Path) -> SourceBlock:
-        """Add a recording's samples to a block, with the verdict on them if its machine has healthy recordings.
+        """Add a recording's samples to a block, and the verdict on the recording if its machine is commissioned.
 
-        Times are in [s since 1970]; a recording dated without a time of day follows those of the same day. The samples
-        are corrected as for `diagnose`. An oil temperature in the file's header becomes a channel. Raises PartAway if
-        the machine's file cannot be read.
+        The samples are corrected as `diagnose` does, and their times converted to seconds since 1970; a recording
+        that is dated without a time of day follows those of the same day. An oil temperature in the file's header
+        becomes the channel `T_oil`. Raises PartAway if the machine's file cannot be read.
         """
         start, corrected_samples = file_seconds(recording, path), remove_holes(correct_samples(recording).recording)
         if not len(corrected_samples):
@@ -202,9 +212,9 @@ class WatchedFolder:
     def _judge(
         self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
     ) -> RecordingVerdict | None:
-        """Judge a whole recording; after an error log it and return None, and only the blocks are watched.
+        """Judge a whole recording; if that raises an error, log it and return None: only its blocks are then watched.
 
-        `shift`: added to the recording's times to give the monitor's clock [s].
+        `shift` [s]: added to the recording's times to give the clock of the monitor.
         """
         try:
             return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
@@ -214,7 +224,10 @@ class WatchedFolder:
             return None
 
     def _read_machine(self) -> CommissionedMachine | None:
-        """Read the machine's file again, as it may have changed; return None if `rig` is not such a file."""
+        """Read the file of the commissioned machine, which may have changed; return None if there is no such file.
+
+        Raises PartAway if it cannot be read.
+        """
         try:
             return load_watched(self._rig).machine
         except (SealscopeError, OSError) as error:
@@ -245,12 +258,15 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit new files in the folders of a service's actuators until it stops; `once`: only the present ones."""
+    """Submit the new files in the folders of a service's actuators as blocks until the service stops.
+
+    `once`: True to submit only the present files.
+    """
     settle_s, part = 0.0 if once else service.settings.settle_s, service.supervisor.part
     summaries = service.summaries()
 
     def newest_time(name: str) -> float:
-        """Return the time of an actuator's newest stored sample [s], -inf if there is none."""
+        """Return the time of an actuator's newest stored sample [s since 1970], -inf if there is none."""
         t = summaries.get(name, {}).get("t")
         return -math.inf if t is None else float(t)
 
@@ -282,7 +298,7 @@ def _printable(name: str) -> str:
 
 
 def _is_date_of(start: float, newest: float) -> bool:
-    """Return True if `start` is midnight of the day that contains `newest`, both in [s since 1970].
+    """Return True if `start` is midnight (UTC) of the day that contains `newest`; both are in seconds since 1970.
 
     A recording that is dated without a time of day starts at midnight.
     """

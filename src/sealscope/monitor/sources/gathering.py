@@ -1,7 +1,8 @@
-"""Single values, each with its own time, gathered into blocks on one time axis.
+"""Gather values of single channels, each with its own time, into blocks of samples on one time axis.
 
-A source that reports changes (OPC UA) sends nothing for a constant channel: a missing sample repeats the value before
-it. A block is complete when every channel has reached its end; a channel silent for `SILENT_S` counts as constant.
+A source that reports changes (OPC UA) sends nothing while a channel is constant, so a missing sample repeats the
+value before it. A block is complete when every channel has values up to its end; a channel without a value for
+`SILENT_S` counts as constant.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ LATE = "values that came after their block"
 
 @dataclass
 class _Channel:
-    """One channel: `values` by index on the time axis, and `previous`, the value before them.
+    """The values of one channel that are not in a block yet.
 
-    `arrival`: time at which the last value arrived [s]; `newest`: index of the newest value so far.
+    `values`: by index on the time axis; `previous`: the value before them, None for none; `arrival` [s]: time at
+    which the last value arrived; `newest`: index of the newest value so far, None for none.
     """
 
     values: dict[int, float] = field(default_factory=dict)
@@ -36,11 +38,11 @@ class _Channel:
     newest: int | None = None
 
     def last_value(self) -> float | None:
-        """Return the value of the latest index, None if there is none."""
+        """Return the latest value on the time axis, or None if there is none."""
         return self.values[max(self.values)] if self.values else self.previous
 
     def pop_values(self, first: int, stop: int) -> Array:
-        """Remove and return the samples from index `first` up to `stop` (exclusive), (stop - first,).
+        """Remove the values before index `stop`, and return the samples (stop - first,) from index `first` on.
 
         A missing sample repeats the value before it.
         """
@@ -53,9 +55,10 @@ class _Channel:
 
 
 class ValueGatherer:
-    """The values of one actuator, gathered from single channels into blocks of `block_s` seconds at `rate` [Hz].
+    """Gathers the values of one actuator's channels into blocks of `block_s` seconds at `rate` [Hz].
 
-    `count`: called with the reason for each dropped value; `now`: returns a monotonic clock [s].
+    `count`: function called with the reason for each dropped value; `now`: function that returns a monotonic time
+    [s].
     """
 
     def __init__(
@@ -73,9 +76,9 @@ class ValueGatherer:
         self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Add samples of a channel in SI units from time `t` [s] on; return the blocks that they complete.
+        """Add samples of a channel in SI units; return the blocks that they complete.
 
-        NaN is an unknown value.
+        `t` [s]: time of the first sample. NaN is an unknown value.
         """
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
@@ -94,14 +97,14 @@ class ValueGatherer:
         return self._pop_blocks()
 
     def _continue_after_pause(self) -> None:
-        """Restart the time axis after a pause; the last value of each channel is kept as its `previous` one."""
+        """Restart the time axis after a pause in the values; each channel starts from its last value."""
         old_channels = self._channels
         self.discard_values()
         for name, old_channel in old_channels.items():
             self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
-        """Add values to a channel from index `first` on; drop and count those before the next block."""
+        """Add values to a channel from index `first` on; values that are too late for the next block are dropped."""
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
@@ -114,12 +117,12 @@ class ValueGatherer:
         target.arrival, target.newest = self._now(), last if target.newest is None else max(last, target.newest)
 
     def discard_values(self) -> None:
-        """Discard all values, for example after a lost connection, in which values may have been lost."""
+        """Discard all values, for example because others were lost with the connection."""
         self._channels = {name: _Channel() for name in self._channels}
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks that are complete in every channel that is not silent."""
+        """Remove and return the blocks for which every channel that is not silent has values up to the end."""
         channels = self._channels.values()
         if self._start is None:
             if any(channel.last_value() is None for channel in channels) or not any(

@@ -1,4 +1,4 @@
-"""Blocks from a stream of lines, one JSON message a line."""
+"""Read blocks of samples from a stream of lines, each of which is a JSON message."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from sealscope.monitor.sources.source_block import (
 
 
 def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
-    """Return the source that submits a stream's lines; empty lines are skipped."""
+    """Build a source that decodes the lines of a stream and submits their blocks; empty lines are skipped.
+
+    Returns a function that takes the receiver of the blocks and runs until the stream ends.
+    """
 
     def submit_lines(service: BlockReceiver) -> None:
-        """Submit the block or refusal of each line until the stream ends or the service stops."""
+        """Submit the block of each line, or its refusal, until the stream ends or the service stops."""
         units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
         while not service.stopping.is_set() and (line := stream.readline(MAX_MESSAGE_BYTES + 1)):
             if len(line) > MAX_MESSAGE_BYTES:

@@ -1,8 +1,8 @@
-"""Limits of JSON and CBOR messages, checked before decoding so that decoding takes time linear in their length.
+"""Check limits of JSON and CBOR messages before they are decoded; decoding then takes time linear in their length.
 
 One pass over the bytes of a CBOR message (RFC 8949) counts its depth, lists, pairs, texts and samples, and finds keys
-that are not texts and tags that are not typed arrays of floats (RFC 8746). In JSON the quotation marks and brackets are
-counted. `source_block.decode_message` calls both.
+that are not texts and tags that are not typed arrays of floats (RFC 8746). In JSON the quotation marks and brackets
+are counted. `source_block.decode_message` calls both.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from sealscope.compiled import kernel, law
 
 #: Most samples of a channel.
 MAX_SAMPLES = 1_000_000
-#: Largest depth of nested containers; largest numbers of containers, of pairs, and of pieces of text or bytes; longest
-#: key [bytes].
+#: Largest depth of nested containers; largest numbers of containers, of pairs, and of pieces of text or bytes;
+#: longest key [bytes].
 MAX_DEPTH, MAX_CONTAINERS, MAX_PAIRS, MAX_TEXTS, MAX_KEY_BYTES = 4, 64, 64, 1000, 200
 #: Quotation marks and brackets of JSON, at most, including those in texts.
 _MAX_QUOTES, _MAX_BRACKETS = 1000, 500
@@ -44,7 +44,7 @@ _RULES = (
 
 
 class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
-    """A message breaks a rule; `oversized`: True if a list is too long."""
+    """Raised if a message breaks a limit; `oversized`: True if a list in it is too long."""
 
     def __init__(self, rule: str, *, oversized: bool = False) -> None:
         super().__init__(rule)
@@ -52,7 +52,10 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check the limits of a CBOR message; return its number of pairs. Raises MessageLimit if it breaks a rule."""
+    """Check the limits of a CBOR message, and return its number of pairs of key and value.
+
+    Raises MessageLimit if it breaks a rule.
+    """
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
         raise MessageLimit(f"{_RULES[code]} (byte {position})", oversized=code == _LONG_LIST)
@@ -60,7 +63,7 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check the limits of a JSON message; return the number of its colons, including those within texts.
+    """Check the limits of a JSON message, and return the number of its colons, including those within texts.
 
     Raises MessageLimit if it has too many quotation marks or brackets.
     """
@@ -75,8 +78,8 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `n_colons`: number of colons that `check_json` counted. Each pair has a colon outside
-    texts; a repeated key leaves fewer pairs in `values` than colons in the `payload`.
+    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons that `check_json` counted. Each
+    pair has a colon outside texts; if a key is repeated, `values` has fewer pairs than there are such colons.
     """
     if _count_shallow_pairs(values) != n_colons:  # quick test: unequal also if a text contains a colon
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -84,23 +87,23 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that no key of a message is repeated; raise MessageLimit otherwise.
+    """Check that no mapping of a message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `n_pairs`: pairs before decoding, of which a repeated key loses some.
+    `values`: the decoded message; `n_pairs`: number of pairs in its bytes, which is larger if a key is repeated.
     """
     if _count_shallow_pairs(values) != n_pairs and (n_decoded := _count_pairs(values)) != n_pairs:
         raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} again")
 
 
 def _count_shallow_pairs(values: Any) -> int:
-    """Count the pairs of a mapping and of the mappings nested directly in it; lists are not searched."""
+    """Count the pairs of a mapping and of the mappings that are its values; lists are not searched."""
     if not isinstance(values, dict):
         return 0
     return len(values) + sum(len(value) for value in values.values() if isinstance(value, dict))
 
 
 def _count_pairs(values: Any) -> int:
-    """Count the pairs of all mappings at any depth."""
+    """Count the pairs of all mappings in `values`, at any depth."""
     if isinstance(values, dict):
         return len(values) + sum(map(_count_pairs, values.values()))
     return sum(map(_count_pairs, values)) if isinstance(values, list) else 0
@@ -108,7 +111,7 @@ def _count_pairs(values: Any) -> int:
 
 @kernel
 def _count_marks(data: Any) -> tuple[int, int, int]:
-    """Count the quotation marks, the opening brackets and braces, and the colons among bytes."""
+    """Count the quotation marks, the opening brackets and braces, and the colons among bytes (n,)."""
     n_quotes, n_brackets, n_colons = 0, 0, 0
     for byte in data:
         n_quotes += byte == 34  # "
@@ -119,10 +122,11 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Read the argument of a CBOR item; return it and the position after it, -1 if the data end before.
+    """Read the argument of a CBOR item, a number, and return it with the position after it.
 
-    `position`: first byte after the item's initial byte; `info`: low 5 bits of the initial byte. Below 24 `info` is the
-    argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
+    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of the
+    initial byte. Below 24, `info` is the argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
+    The returned position is -1 if the data end too early.
     """
     if info < 24:
         return info, position
@@ -137,10 +141,11 @@ def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
 
 @law
 def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int) -> tuple[int, int, int]:
-    """Skip a CBOR text or byte string of unknown length; all its pieces must have its major type `major`.
+    """Skip a CBOR text or byte string of unknown length, which consists of pieces with the same major type `major`.
 
-    `start`, `position`: first byte of the item, and of its first piece; `n_texts`: pieces of text or bytes so far.
-    Returns the broken rule's code (0: none), the position of the fault or else after the end, and the new `n_texts`.
+    `data` (n,): bytes of the message; `start`, `position`: index of the item's first byte, and of its first piece;
+    `n_texts`: number of pieces of text or bytes so far. Returns the code of the broken rule (0 for none), the
+    position of the fault or else the one after the item, and the new `n_texts`.
     """
     while True:
         n_texts += 1
@@ -158,11 +163,14 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 
 @kernel
 def _scan_items(data: Any) -> tuple[int, int, int]:
-    """Check a CBOR message in one pass; return the broken rule's code (0: none), its byte, and the number of pairs.
+    """Check the limits of a CBOR message, given as bytes (n,), in one pass.
 
-    Arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is unknown;
-    `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items`: items so far.
+    Returns the code of the broken rule (0 for none, an index into `_RULES`), the position of the fault, and the
+    number of pairs.
     """
+    # arrays by depth: `n_left` is the number of items that a container still needs, negative if its length is
+    # unknown; `role` is 0 in a list, in a mapping 1 before a key and 2 before a value; `n_items` counts the items so
+    # far
     size, position, depth = len(data), 0, 0
     n_left, role = np.zeros(MAX_DEPTH + 1, dtype=np.int64), np.zeros(MAX_DEPTH + 1, dtype=np.int64)
     n_items = np.zeros(MAX_DEPTH + 1, dtype=np.int64)

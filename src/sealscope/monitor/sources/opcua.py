@@ -1,8 +1,8 @@
-"""Blocks from an OPC UA server: values by subscription, gathered into blocks.
+"""Read samples from an OPC UA server by subscription, and gather them into blocks.
 
-Each channel of an actuator is a variable of the server, whose value is a number, or an array of samples from its source
-timestamp on. The server queues the changes of each item between two publications. Changes are lost while there is no
-connection, as OPC UA subscriptions end with their session.
+Each channel of an actuator is a variable of the server. Its value is a number, or an array of samples of which the
+first is at the source timestamp. The server queues the changes of each variable between two publications. Changes are
+lost while there is no connection, because OPC UA subscriptions end with their session.
 """
 
 from __future__ import annotations
@@ -35,7 +35,11 @@ _NO_NUMBER = "OPC UA values that are no number"
 
 
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
-    """Return the source of a server's values; raise InputError if a secret cannot be read."""
+    """Build a source that submits the values of an OPC UA server as blocks.
+
+    Returns a function that takes the receiver of the blocks and runs until that stops. Raises MissingExtra if the
+    library asyncua is not installed, and InputError if a secret cannot be read.
+    """
     if find_spec("asyncua") is None:  # before the service starts
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
     password = read_secret(settings.password_file, "opcua.password_file")
@@ -43,7 +47,10 @@ def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
 
 
 class _OpcUaSession:
-    """The subscriptions of a service at its server; asyncua calls `datachange_notification`."""
+    """The connection of a service to an OPC UA server, with its subscriptions.
+
+    The library asyncua calls `datachange_notification` for each value.
+    """
 
     def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
         self._settings, self._password, self._service = settings, password, service
@@ -70,7 +77,7 @@ class _OpcUaSession:
         submitting.join()
 
     async def _connect(self) -> None:
-        """Stay connected until the service ends; raise PartAway if the connection fails or is lost."""
+        """Connect, and stay connected until the service ends; raise PartAway if the connection fails or is lost."""
         try:
             await self._run_connection()
         except Exception as error:  # a lost connection raises errors of many types
@@ -78,7 +85,10 @@ class _OpcUaSession:
             raise PartAway(f"{self._settings.url}: {reason}") from None
 
     async def _run_connection(self) -> None:
-        """Connect, subscribe, and wait until the service ends; raise if the connection is lost."""
+        """Connect, subscribe to all nodes, and wait until the service ends.
+
+        Raises errors of many types if the connection fails or is lost, or a node does not exist.
+        """
         from asyncua import Client
 
         client = Client(self._settings.url, timeout=self._settings.timeout_s)
@@ -127,7 +137,7 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks until the session ends, in a separate thread, as the service may block."""
+        """Submit the queued blocks until the service stops, in a separate thread, because the service may block."""
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(1, _LOOK_S):
                 self._service.submit(block)

@@ -1,6 +1,7 @@
-"""A block of samples of one actuator with its identity, and its form as a message of JSON or CBOR.
+"""Blocks of samples of an actuator, and how they are decoded from JSON or CBOR messages.
 
-A message without a valid block raises RefusedMessage, whose reason is one of `REASONS`; messages are counted by reason.
+If a message has no valid block, RefusedMessage is raised. Its reason is one of `REASONS`, by which such messages are
+counted.
 """
 
 from __future__ import annotations
@@ -40,15 +41,18 @@ if TYPE_CHECKING:
 
 #: Largest message [bytes].
 MAX_MESSAGE_BYTES = 16_000_000
-#: Tags of CBOR for arrays of numbers -> their NumPy data types.
+#: NumPy data types of arrays of numbers, by their CBOR tag.
 _ARRAY_DTYPES = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True))
-#: Leading bytes of a refused message that are kept.
+#: Number of leading bytes of a refused message that are stored.
 _N_KEPT_BYTES = 4000
 _KNOWN_NAMES = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
 class BlockReceiver(Protocol):
-    """The receiver of a source's blocks, usually a service; `store` is its MonitorStore."""
+    """The receiver of a source's blocks, usually the service of a monitor.
+
+    `stopping`: event that is set when sources must end; `store`: its database, a MonitorStore.
+    """
 
     stopping: threading.Event
     store: Any
@@ -62,18 +66,18 @@ class BlockReceiver(Protocol):
         """Add `number` to the counter of `reason`, usually of dropped messages or blocks."""
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the last summary of each actuator."""
+        """Return the last summary of each actuator, by name."""
 
 
 def do_nothing() -> None:
-    """Accept a call without effect."""
+    """Do nothing; the default of functions that are called when a block is stored."""
 
 
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
-    """A message or a file does not contain a valid block.
+    """Raised if a message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size`: length of the `contents` [bytes]; `beginning`: their leading bytes, which are
-    stored; `bytes`: number of these; `done`: called when they are stored.
+    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: their first bytes, which are
+    stored; `bytes`: number of these; `done`: function called when they are stored.
     """
 
     def __init__(
@@ -85,7 +89,7 @@ class RefusedMessage(InputError):  # noqa: N818 (says what happened)
         self.bytes = len(self.beginning)
 
     def row(self) -> dict[str, Any]:
-        """Return the row for the table of refused messages; the text is escaped for any database."""
+        """Build the row for the table of refused messages; characters that a database may refuse are escaped."""
         message = str(self).encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
         values = {"reason": self.reason, "message": message, "size": self.size, "beginning": self.beginning}
         return {"at": time.time(), **values}
@@ -111,7 +115,7 @@ REASONS = (
 
 @contextmanager
 def raising_refused_message() -> Iterator[None]:
-    """Convert any other error within the context to a RefusedMessage; no message can then end its decoder."""
+    """Convert any unexpected error within the context to RefusedMessage; no message can then end its decoder."""
     try:
         yield
     except (RefusedMessage, MissingExtra):
@@ -122,11 +126,11 @@ def raising_refused_message() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class SourceBlock:
-    """Samples of one actuator.
+    """A block of samples of one actuator.
 
-    `identity`: text that no other block of the actuator has, also after a restart; `samples`: None if only the identity
-    is to be stored; `follows`: False if the samples do not continue those before; `done`: called when the block is
-    stored; `verdict`: on the whole recording, None if the samples are not judged as a recording.
+    `identity`: text that no other block of the actuator has, even after a restart; `samples`: None if only the
+    identity is to be stored; `follows`: False if there is a gap between these samples and those before; `done`:
+    function called when the block is stored; `verdict`: verdict on the samples as a whole recording, None for none.
     """
 
     actuator: str
@@ -138,7 +142,7 @@ class SourceBlock:
 
     @property
     def bytes(self) -> int:
-        """Approximate number of bytes of the samples."""
+        """Approximate number of bytes of the samples, 0 if there are none."""
         return 0 if self.samples is None else count_bytes(self.samples)
 
 
@@ -146,15 +150,16 @@ class SourceBlock:
 def decode_message(
     payload: bytes, actuator: str | None = None, units_of: Mapping[str, Mapping[str, str]] = MappingProxyType({})
 ) -> SourceBlock:
-    """Decode the block of a message: JSON if it begins with ``{``, else CBOR.
+    """Decode the block of samples in a message, which is JSON if it begins with ``{``, else CBOR.
 
-    The mapping has ``t``, the time of the first sample [s], ``rate`` [Hz], and for each channel a list of numbers with
-    null for missing samples, or in CBOR a typed array of floats (RFC 8746) with NaN for missing samples. A slow channel
-    (``T_oil``) may be a single number. Optional: ``units`` of channels that are not in SI; ``actuator``, needed if the
-    source does not state it; ``id``, else a digest of the message is the identity.
+    The message is a mapping. Its entries are ``t``, the time of the first sample [s]; ``rate``, the sampling rate
+    [Hz]; and for each channel a list of numbers, with null for a missing sample, or in CBOR a typed array of floats
+    (RFC 8746), with NaN for a missing sample. A slow channel (``T_oil``) may be a single number. Optional entries are
+    ``units``, of channels that are not in SI units; ``actuator``, needed if the source does not state it; and ``id``,
+    the identity of the block, by default a digest of the message.
 
-    `actuator`: name stated by the source; `units_of`: default units by actuator. Raises RefusedMessage if a rule is
-    broken.
+    `actuator`: name of the actuator that the source states, None for none; `units_of`: default units of channels, by
+    actuator. Raises RefusedMessage if a rule is broken.
     """
     if len(payload) > MAX_MESSAGE_BYTES:
         raise RefusedMessage(OVERSIZED, f"a message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(payload)}")
@@ -191,17 +196,17 @@ def decode_message(
 
 
 def count_bytes(samples: Recording) -> int:
-    """Return the approximate number of bytes of samples."""
+    """Compute the approximate number of bytes of a recording's samples and times."""
     return 8 * len(samples) * (1 + len(samples.channels))
 
 
 def compute_digest(payload: bytes) -> str:
-    """Compute the digest of contents that serves as their identity."""
+    """Compute the hash (hex) of the contents of a message, which serves as its identity."""
     return blake2b(payload, digest_size=16).hexdigest()
 
 
 def _parse_identity(value: Any) -> str:
-    """Convert the `id` of a message to text, "" for None; refuse an id that a database cannot store."""
+    """Convert the `id` of a message to text, "" for None; raise RefusedMessage if a database cannot store it."""
     if value is None:
         return ""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
@@ -215,7 +220,7 @@ def _parse_identity(value: Any) -> str:
 
 
 def _abbreviate(value: Any) -> str:
-    """Format a text or number in at most 40 characters, and any other value as the name of its type."""
+    """Format a value for an error message: a text or number in at most 40 characters, else the name of its type."""
     try:
         return str(value)[:40] if isinstance(value, (str, int, float, type(None))) else type(value).__name__
     except ValueError:  # CBOR integers may exceed Python's limit of digits
@@ -223,7 +228,7 @@ def _abbreviate(value: Any) -> str:
 
 
 def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
-    """Parse JSON or CBOR after checking its limits; refuse anything but a mapping."""
+    """Parse a message of JSON or CBOR after checking its limits; raise RefusedMessage if it is no mapping."""
     try:
         if payload.lstrip()[:1] == b"{":
             import orjson
@@ -252,7 +257,7 @@ def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
 
 
 def _parse_number(values: Mapping[str, Any], name: str) -> float:
-    """Read the entry `name` of a message as a finite number; refuse the message if it is anything else."""
+    """Read the entry `name` of a message as a finite number; raise RefusedMessage if it is anything else."""
     value = values.get(name)
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
@@ -264,7 +269,10 @@ def _parse_number(values: Mapping[str, Any], name: str) -> float:
 
 
 def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarray[Any, Any]:
-    """Convert a list or typed array of a channel to SI units; refuse anything else, and infinite values."""
+    """Convert the list or typed array of a channel to an array (n,) in SI units.
+
+    `name`: the channel; `units`: units by channel. Raises RefusedMessage for anything else, and for infinite values.
+    """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
         values = [values]  # a slow channel may be a single number
     dtype = _ARRAY_DTYPES.get(getattr(values, "tag", None) or 0)
@@ -283,7 +291,10 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel from `unit`, None for SI, to SI; refuse a unit of another dimension."""
+    """Convert values of a channel from `unit` to SI units; None means that they are in SI units already.
+
+    Raises RefusedMessage if the unit has another dimension.
+    """
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

@@ -1,9 +1,11 @@
-"""Blocks from edge nodes of Sparkplug B: births name the metrics, data messages bring samples, deaths end the session.
+"""Read blocks of samples from edge nodes of Sparkplug B.
 
-A node or one of its devices is an actuator, and its metrics are the channels: arrays of samples from their timestamp
-on, or single samples, which are constant while left out. Timestamps are whole milliseconds; a block that continues the
-one before within that resolution is joined to it. After a missing sequence number an alias may stand for another
-metric, so messages with aliases are refused until the node has sent the birth that is requested.
+Birth messages of a node name its metrics, data messages bring samples, and death messages end the session. A node or
+one of its devices is an actuator, and its metrics are the channels. The value of a metric is an array of samples, of
+which the first is at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps
+are whole milliseconds; a block that continues the one before within that resolution is joined to it. After a missing
+sequence number an alias may stand for another metric, so messages with aliases are refused until the node has sent
+the birth that is then requested.
 """
 
 from __future__ import annotations
@@ -49,9 +51,10 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 @dataclass
 class _Birth:
-    """The metrics of a birth that are channels or the rate.
+    """The metrics of a birth message that are channels or the sampling rate.
 
-    `names`: channel -> name of its metric; `aliases`: alias -> name; `metrics`: name -> metric with its last value.
+    `names`: name of the metric of each channel; `aliases`: name of the metric of each alias, a number; `metrics`: by
+    name, the metric with its last value.
     """
 
     names: dict[str, str] = field(default_factory=dict)
@@ -60,7 +63,10 @@ class _Birth:
 
     @classmethod
     def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
-        """Select the metrics of an actuator's channels; a name may be followed by a unit in brackets."""
+        """Select the metrics of a birth message that are channels of an actuator, or its sampling rate.
+
+        The name of a metric may be followed by a unit in brackets, such as "pressure [bar]".
+        """
         birth, channel_of = cls(), {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
         for metric in metrics:
             name, unit = metric.name or "", metric.unit
@@ -75,9 +81,11 @@ class _Birth:
         return birth
 
     def complete_metric(self, metric: spb.SparkplugMetric, *, is_complete: bool) -> spb.SparkplugMetric | None:
-        """Add name, type and unit of the birth to a metric; return None if it is no channel.
+        """Add the name, type and unit that the birth states to a metric of a data message.
 
-        `is_complete`: True if no message since the birth is missing; otherwise aliases are refused.
+        Returns None if the metric is no channel. `is_complete`: True if no message since the birth is missing. Raises
+        RefusedMessage if a message is missing and the metric has an alias instead of a name, or if its value does not
+        fit its type.
         """
         if metric.name is None and not is_complete:
             raise RefusedMessage(blocks.OUT_OF_SEQUENCE, "after a missing message an alias must wait for a birth")
@@ -92,7 +100,10 @@ class _Birth:
         return replace(metric, name=name, unit=metric.unit or birth_metric.unit)
 
     def rate(self, actuator: ActuatorSettings) -> float:
-        """Return the sampling rate [Hz] from the settings, else from the metric `rate`; refuse a missing one."""
+        """Find the sampling rate [Hz] in the settings or else in the metric `rate`.
+
+        Raises RefusedMessage if it is missing or not > 0.
+        """
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
@@ -103,10 +114,10 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """The session of an edge node.
+    """The state of the session of an edge node.
 
-    `births`: births of actuators by device, "" for the node itself; `birth_sequence`: bdSeq of the last birth; `seq`:
-    last sequence number, None before a birth; `is_complete`: True if no number since the birth is missing.
+    `births`: births by device, "" for the node itself; `birth_sequence`: number bdSeq of the last birth; `seq`: last
+    sequence number, None before a birth; `is_complete`: True if no sequence number since the birth is missing.
     """
 
     births: dict[str, _Birth] = field(default_factory=dict)
@@ -116,9 +127,10 @@ class _EdgeState:
 
 
 class SparkplugHost:
-    """The actuators that are nodes, or devices of nodes, of Sparkplug B; those without `sparkplug` are ignored.
+    """Receives the messages of Sparkplug B nodes and devices that are actuators, and converts them to blocks.
 
-    `publish`: sends a payload to a topic; `count_event`: increments the counter of that name, such as `GAPS`.
+    `actuators`: settings of all actuators; those without `sparkplug` are ignored; `publish`: function that sends a
+    payload to a topic; `count_event`: function that increments the counter of that name, such as `GAPS`.
     """
 
     def __init__(
@@ -127,7 +139,7 @@ class SparkplugHost:
         publish: Callable[[str, bytes], object],
         count_event: Callable[[str], None],
     ) -> None:
-        """Raise MissingExtra if protobuf is not installed."""
+        """Prepare the state of each node; raise MissingExtra if protobuf is not installed."""
         spb.payload_class()  # fails here rather than at the first message
         self._publish, self._count_event = publish, count_event
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
@@ -138,17 +150,17 @@ class SparkplugHost:
 
     @property
     def topics(self) -> list[str]:
-        """The topic filters of all messages of the nodes."""
+        """MQTT topic filters that include all messages of the nodes."""
         return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
 
     def request_all_births(self) -> None:
-        """Request the birth of every node, as messages may have been missed before a connection."""
+        """Request a birth message of every node, because messages may have been missed before a connection."""
         for (group, node), state in self._nodes.items():
             state.is_complete = False
             self._request_birth(group, node)
 
     def _request_birth(self, group: str, node: str) -> None:
-        """Request the birth of a node, unless that was done within the last `_REQUEST_PAUSE_S`."""
+        """Request a birth message of a node, unless that was done within the last `_REQUEST_PAUSE_S`."""
         now = time.monotonic()
         if now - self._last_requests.get((group, node), -math.inf) >= _REQUEST_PAUSE_S:
             self._last_requests[group, node] = now
@@ -159,7 +171,7 @@ class SparkplugHost:
 
     @raising_refused_message()
     def receive(self, topic: str, data: bytes) -> SourceBlock | None:
-        """Process a message; return its block, or None if it has no samples.
+        """Process a message of a node; return the block of its samples, or None if it has no samples.
 
         Raises RefusedMessage if the message breaks the protocol or its samples cannot be used.
         """
@@ -229,10 +241,11 @@ class SparkplugHost:
     def _build_recording(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent_ms: int | None
     ) -> Recording | None:
-        """Build a recording in SI from the samples of a message's metrics, None if there are no samples.
+        """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
-        `sent_ms`: time of sending [ms since 1970], for metrics without a time. A single value of a slow channel is no
-        sample: all recordings repeat it until the next value.
+        `birth`: the birth of the actuator; `sent_ms` [ms since 1970]: time of sending, which metrics without a time
+        get. A single value of a slow channel, such as the oil temperature, is no sample: all recordings repeat it
+        until the next value. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -267,10 +280,10 @@ class SparkplugHost:
         return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
-        """Compute the times [s] of `size` samples from `t` [s] on, joined to the block before if that is near.
+        """Compute the times [s] of `size` samples at `rate` [Hz]; the first has the stated time `t` [s].
 
-        A joined start is the end of the block before, shifted by at most `_MAX_SHIFT` samples towards the interval that
-        the rounding of `t` to milliseconds allows.
+        If the block before ends close to `t`, the times continue it: they start at its end, shifted by at most
+        `_MAX_SHIFT` samples towards the interval that the rounding of `t` to milliseconds allows.
         """
         start, expected = t, self._next_starts.get(actuator, math.nan)
         if abs(expected - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
@@ -283,10 +296,11 @@ class SparkplugHost:
 def _simultaneous_samples(
     group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
 ) -> dict[str, Array]:
-    """Return channel -> samples (n,) of the metrics that share one timestamp; single values give n = 1.
+    """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
-    `group`: channel -> metric; `channel_of`: name of a metric -> channel. A channel without a single value repeats its
-    last one.
+    `group`: metric by channel; `channel_of`: channel by name of its metric. If the values are single numbers, n is 1,
+    and a channel that is left out repeats its last value. Raises RefusedMessage if the values are no numbers, or
+    arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}

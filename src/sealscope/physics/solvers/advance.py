@@ -1,4 +1,4 @@
-"""Integration of a run by either method, with its outputs: under a command, or in a loop with a controller."""
+"""Integrate a run by either method and write its outputs, under a given command or in a loop with a controller."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ IMPLICIT: Implicit = (True,)
 
 
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
-    """Compute the times [s] within a step of h [s] at which inputs are evaluated.
+    """Compute the times [s] within a step of h [s] at which the integration method needs its inputs, (nodes,).
 
-    First and last lie just inside the step, so that an input that jumps between two steps is taken on the right side.
+    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. The first and last time lie just inside the step, so
+    that an input that jumps between two steps is taken on the right side of the jump.
     """
     nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
@@ -41,11 +42,12 @@ def advance(
     every: int,
     rows: np.ndarray,
 ) -> None:
-    """Integrate the state `y` (14,) in place over n steps of h [s], and write outputs before each `every`-th step.
+    """Integrate the state `y` (14,) in place over n steps of h [s], with outputs before each `every`-th step.
 
-    `u`, `G`, `C`: (n, nodes) command [V] and leakage coefficients at the nodes of each step (`step_nodes`); `F`: (n,
-    nodes) load [N] in addition to the rig's own, (0, 0) without one; `rows`: (n // every, 21) outputs;
-    `euler_integral`: see `rk4_step`.
+    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `u`, `G`, `C` (n, nodes): command [V] and leakage
+    coefficients (`piston_leakage`) at the nodes of each step (`step_nodes`); `F` (n, nodes): load [N] in addition to
+    the rig's own, of shape (0, 0) if there is none; `rows` (n // every, 21): receives the outputs; `euler_integral`:
+    see `rk4_step`.
     """
     z = state_of(y)
     for step in range(u.shape[0]):
@@ -74,9 +76,11 @@ def advance_closed(
     rows: np.ndarray,
     loop: Loop,
 ) -> int:
-    """Integrate as `advance` does, with the voltage of a controller; return the number of outputs written.
+    """Integrate a run whose voltage a controller sets; return the number of outputs written.
 
-    `start`: index of the first row's output in the run. Fewer outputs than rows are written if a voltage is not finite.
+    The arguments are those of `advance`, with the controller `loop` in place of a command. `start`: index of the
+    output in rows[0], counted from the beginning of the run. If the controller returns a voltage that is not finite,
+    the integration stops there and writes fewer outputs than `rows` has.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]
     u = np.empty((spacing * every, G.shape[1]))

@@ -59,17 +59,21 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """Compute z + h (e f + i s) from a stage's explicit rates `f` and the implicit rates `s` of its pressures."""
+    """Compute the state z + h (e f + i s) from the rates of one stage of the Runge-Kutta step.
+
+    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: their tableau
+    coefficients.
+    """
     return add_to_pressures(add_step(z, h * e, f), h * i, s)
 
 
 @contracted
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
-    """Solve an implicit stage: return its state, and the throttles' part `s` of the pressure rates [Pa/s].
+    """Solve one implicit stage of the step; return its state, and the pressure rates [Pa/s] due to the throttles.
 
-    `z`: the state without the stage's own implicit rates. r [Pa/m^3]: pressure rate of a volume per unit flow; g
-    [Pa s/m^3]: fall of a throttle's pressure difference over the stage per unit flow. Boiling oil keeps its pressure:
-    its r is 0.
+    `z`: the state without the implicit rates of this stage. In the body, r [Pa/m^3] is the pressure rate of an oil
+    volume per unit flow, and g [Pa s/m^3] the fall of a throttle's pressure difference over the stage per unit flow.
+    Boiling oil keeps its pressure, so its r is 0.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
@@ -106,10 +110,11 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 
 @contracted
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
-    """Advance the state by one step of h [s].
+    """Integrate the state `y` over one step of h [s] by the implicit-explicit method; return the new state.
 
-    Command `u` [V], leakage coefficients `G`, `C` and load `F` [N] at `IMEX_NODES`. Stage k solves for z and its
-    implicit rates s_k, then evaluates its explicit rates f_k; rows k of the tableaus are E_k and I_k, W the weights.
+    The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G`
+    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage k solves for its state z and its implicit rates
+    s_k, then evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)
@@ -139,7 +144,11 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
 def implicit_step(
     z: State, h: float, u: np.ndarray, G: np.ndarray, C: np.ndarray, F: np.ndarray, step: int, p: RigNumbers
 ) -> State:
-    """Advance the state by `imex_step` with the inputs in row `step`; `F` is read only if the rig has a load."""
+    """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
+
+    Row `step` of `u` [V], `G` and `C` (n, 6) holds the command and the leakage coefficients at the nodes of the step
+    (`imex_step`). `F` (n, 6) [N] is read only if the rig has an additional load.
+    """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])
     orifice = (C[step, 0], C[step, 1], C[step, 2], C[step, 3], C[step, 4], C[step, 5])

@@ -1,4 +1,4 @@
-"""Limits of the solver's step from a rig's numbers: its fastest oscillations and decays."""
+"""The longest steps with which the solver resolves a rig, from the rig's fastest oscillations and decays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ DECAY_LIMIT = 2.785
 
 
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
-    """Compute the volumes (V_A, V_B) [m^3] at each end of the stroke; one pair if the volumes are constant."""
+    """Compute the oil volumes (V_A, V_B) [m^3] at each end of the stroke.
+
+    Returns two pairs, or the one pair of mid-stroke volumes if the rig's volumes do not depend on the position.
+    """
     if not p.position_dependent:
         return ((p.V_A, p.V_B),)
     half_stroke = 0.5 * p.L
@@ -26,7 +29,7 @@ def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
 
 
 def _longest_mode_step(damping: float, stiffness: float) -> float:
-    """Compute the longest step [s] for the modes of s^2 + damping s + stiffness = 0.
+    """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
     `damping` [1/s], `stiffness` [1/s^2]. Infinite if the modes neither oscillate nor decay.
     """
@@ -38,15 +41,18 @@ def _longest_mode_step(damping: float, stiffness: float) -> float:
 
 
 def _steepest_rise(breakpoints: np.ndarray) -> float:
-    """Compute the steepest rise [N/m] or [N s/m] of a load (`piecewise_linear_force`), or 0 if it only falls."""
+    """Compute the steepest positive slope of a piecewise linear load, or 0 if it never rises.
+
+    `breakpoints`: as in `piecewise_linear_force`. The slope is in N/m over position and in N s/m over velocity.
+    """
     return max(0.0, float(np.cumsum(breakpoints[:, 1]).max()))
 
 
 def stiffest_rate(p: RigNumbers) -> float:
     """Compute the fastest decay rate lambda [1/s] of a rig with throttles; RK4 is stable for h lambda < 2.785.
 
-    lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): a line volume and a chamber, at the end of the stroke where it is
-    smallest, equalise through the throttle's laminar slope at dp = 0.
+    lambda = K_oil (1/V_1 + 1/V) c/sqrt(dp_0): the pressures of a line volume V_1 and of a chamber V equalise through
+    a throttle, whose slope at dp = 0 is c/sqrt(dp_0). V is the smallest chamber volume over the stroke.
     """
     c = max(p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out)
     min_chamber = min(volume for volumes in _end_volumes(p) for volume in volumes)
@@ -54,19 +60,21 @@ def stiffest_rate(p: RigNumbers) -> float:
 
 
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Compute the longest step [s] that resolves a rig apart from its throttles, for leakage coefficients `G`, `C`.
+    """Compute the longest step [s] that resolves all of a rig except its throttles and end stops.
 
-    The minimum over: speed loop (winding and shaft); piston between its oil columns, sliding, and within the linear
-    part of the friction (slope F_C/v_th, F_C at the charge pressure), with the load's spring and damper; pump and motor
-    between the volumes at the pump's ports; leakage between the chambers; external leakage and make-up. The stability
-    limit of a decay is that of RK4, which the explicit part of ARK4(3)6L[2]SA exceeds. Position-dependent volumes are
-    those at the end of the stroke with the stiffer oil; air is left out because it only makes the oil softer.
+    `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients. The result is the minimum over these parts: speed
+    loop (winding and shaft); piston between its oil columns, with the load's spring and damper, both while it slides
+    and within the linear part of the friction (slope F_C/v_th, F_C at the charge pressure); pump and motor between
+    the volumes at the pump's ports; leakage between the chambers; external leakage and make-up; a servo valve and its
+    supply. The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
+    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
+    only makes the oil softer.
     """
     ends = _end_volumes(p)
     chambers = p.K_oil * max(1.0 / V_A + 1.0 / V_B for V_A, V_B in ends)
     ports = p.K_oil * (1.0 / p.V_1 + 1.0 / p.V_2) if len(p.throttled) > 0 else chambers
     B_M, G_pump = p.B_M, p.G_pump
-    if len(p.lossy) > 0:  # friction at standstill, under the largest torque of the motor; slip at no pressure
+    if len(p.lossy) > 0:  # slopes at rest under the motor's largest torque, and at no pressure
         B_M += (p.T_f + p.C_f * p.C_m * p.i_max) / p.omega_f
         G_pump += p.c_slip / math.sqrt(p.dp_0)
     loop_stiffness = (p.R_c * B_M + p.C_m * (p.C_e + p.k_p)) / (p.L_c * p.J_M)
@@ -98,7 +106,11 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
 
 def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], ...]) -> float:
-    """Compute the longest step [s] for a servo valve: its spool, a chamber behind its laminar edges, the supply."""
+    """Compute the longest step [s] that resolves a servo valve with its supply.
+
+    It is the minimum over the spool, the smallest chamber behind the valve's edges in laminar flow, and the supply
+    line with the pump. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
+    """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # of one edge at full stroke, laminar
     chamber_slope = edge_slope * (1.0 + 2.0 * max(0.0, *(-o for o in overlaps)) / p.x_max)  # both edges of a chamber
@@ -113,5 +125,8 @@ def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], .
 
 
 def longest_step_on_stop(p: RigNumbers) -> float:
-    """Compute the longest step [s] that resolves the piston on an end stop: the mass M_eq on k_stop and d_stop."""
+    """Compute the longest step [s] that resolves the piston while it touches an end stop.
+
+    The mass M_eq then moves on the stop's spring k_stop and damper d_stop.
+    """
     return _longest_mode_step(p.d_stop / p.M_eq, p.k_stop / p.M_eq)

@@ -1,4 +1,4 @@
-"""A control loop around a rig, as compiled code sees it: the solver calls the controller by its address."""
+"""A control loop around a rig, as arrays for compiled code: the solver calls the controller by its address."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ COUNT_X, COUNT_THETA, MIN_PRESSURE, MAX_VOLTAGE, LAST_VOLTAGE = range(5)
 class Loop(NamedTuple):
     """Inputs, memory and outputs of a controller over a run, as arrays for compiled code.
 
-    `inputs` (samples, 5): time [s], target [m], target's speed [m/s], noise of p_A and p_B [Pa]; `volts` (samples +
-    delay,): voltage [V] from each sample on; `compensated` (samples,): leakage flow [m^3/s] that the controller
-    compensates; `measured` (7,): the last sample, as the control law reads it; `memory`: that of the control law, its
-    first number the compensated flow or NaN; `addresses` (3,): of the control law, its memory and `measured`;
-    `numbers`, `counters`: see above.
+    `inputs` (samples, 5): time [s], target [m], speed of the target [m/s], noise of p_A and of p_B [Pa]; `volts`
+    (samples + delay,): the voltage [V] that acts from each sample on; `compensated` (samples,): leakage flow [m^3/s]
+    that the controller compensates; `measured` (7,): the latest measurements, which the control law reads; `memory`:
+    state of the control law, which begins with the compensated flow, NaN if it reports none; `addresses` (3,): memory
+    addresses of the control law's machine code, of `memory` and of `measured`; `numbers`, `counters`: indexed by the
+    constants above.
     """
 
     inputs: np.ndarray
@@ -48,7 +49,8 @@ def quantize(value: float, count: float) -> float:
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
     """Measure the state `y` (14,) and call the controller for sample k; return False if its voltage is not finite.
 
-    A sample that is repeated, such as in a check of the solver's step, keeps its first voltage.
+    A sample that the controller has already taken, such as when the solver repeats a part of the run at half the
+    step, keeps its first voltage.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:

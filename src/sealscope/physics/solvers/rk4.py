@@ -18,17 +18,21 @@ Nodes = tuple[float, float, float]
 
 @contracted
 def freeze_integral(dy: State, euler_integral: bool) -> State:
-    """Set the rate of the controller's integral to 0 if eq. (4.2) is taken literally (`euler_integral`)."""
+    """Set the rate of the controller's integral to 0 in the state's rates `dy` if `euler_integral`, else return `dy`.
+
+    The integral is then updated once per step instead, which is eq. (4.2) taken literally (`rk4_step`).
+    """
     dI = 0.0 * dy[0] if euler_integral else dy[0]
     return dI, dy[1], dy[2], dy[3], dy[4], dy[5], dy[6], dy[7], dy[8], dy[9], dy[10], dy[11], dy[12], dy[13]
 
 
 @contracted
 def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers, euler_integral: bool) -> State:
-    """Advance the state by one step of h [s].
+    """Integrate the state `y` over one step of h [s] by the Runge-Kutta method of order four; return the new state.
 
-    Command `u` [V], leakage coefficients `G`, `C` and load `F` [N] at `RK4_NODES`. With `euler_integral` the
-    controller's integral is constant within the step and grows by h (omega_d - omega) once, as eq. (4.2) is printed.
+    The tuples hold the inputs at the beginning, middle and end of the step: command `u` [V], leakage coefficients `G`
+    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. With `euler_integral` the controller's integral is
+    constant within the step and then grows by h (omega_d - omega), as eq. (4.2) is printed.
     """
     first = rates(y, u[0], G[0], C[0], F[0], p)
     k1 = freeze_integral(first, euler_integral)
@@ -53,7 +57,11 @@ def explicit_step(
     p: RigNumbers,
     euler_integral: bool,
 ) -> State:
-    """Advance the state by `rk4_step` with the inputs in row `step`; `F` is read only if the rig has a load."""
+    """Integrate the state `z` over step number `step` by the Runge-Kutta method of order four; return the new state.
+
+    Row `step` of `u` [V], `G` and `C` (n, 3) holds the command and the leakage coefficients at the nodes of the step
+    (`rk4_step`). `F` (n, 3) [N] is read only if the rig has an additional load. `euler_integral`: see `rk4_step`.
+    """
     volts = (u[step, 0], u[step, 1], u[step, 2])
     laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])
     load = (F[step, 0], F[step, 1], F[step, 2]) if len(p.pushed) > 0 else (0.0, 0.0, 0.0)

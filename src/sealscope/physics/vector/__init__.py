@@ -1,1 +1,1 @@
-"""Many runs at once: the laws on lanes, eight runs to a vector register."""
+"""Many runs at once: the same physical laws on lanes, each lane of a vector register being one of eight runs."""

@@ -1,7 +1,8 @@
 """Integration of many runs at once: the same laws and methods on lanes, eight runs to a vector register.
 
-The last axis of an array is the lane. A group is WIDTH runs with the same choices of `RigNumbers` and the same shape of
-the command; numbers, leak, and the command's gain and offset may differ between lanes.
+The last axis of an array is the lane, that is the place of a run in the register. A group is WIDTH runs with the same
+choices of `RigNumbers` and the same shape of the command; numbers, leak, and the command's gain and offset may differ
+between lanes.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile the function `law` that a source text defines; `scope`: the names that it uses.
+    """Compile the function named `law` that the source `text` defines.
 
-    The source is text because numba needs each element of a tuple written out.
+    `scope`: the objects that the source uses, by name. The source is generated as text because numba needs each
+    element of a tuple written out.
     """
     scope["load"] = load
     exec(text, scope)
@@ -43,7 +45,10 @@ def _compile(text: str, **scope: Any) -> Any:
 
 
 def _row_loader(count: int) -> Any:
-    """Compile a function of (array, row) that loads `count` rows of lanes, beginning with row `row`."""
+    """Compile a function (array, row) that loads `count` successive rows of an array as a tuple, from row `row` on.
+
+    Each row holds one number for each lane.
+    """
     return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
 
 
@@ -55,18 +60,22 @@ load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.j
 
 @contracted
 def leak_opening(leak: Leak, t: float) -> float:
-    """Compute the opening of a leak (`LEAK_ROWS`) at t [s], which rises linearly from 0 at its start to 1."""
+    """Compute the opening of a leak, 0 to 1, at t [s]: it rises linearly from its start on and then stays at 1.
+
+    `leak`: the numbers of the leak, of which the third is its start [s] and the fourth its slope [1/s] (`LEAK_ROWS`).
+    """
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
 
 
 def _build_inputs_law(count: int) -> Any:
-    """Compile the function that computes the inputs u, G, C, F at the `count` nodes of step k.
+    """Compile the function that computes the inputs u, G, C, F of a group of runs at the `count` nodes of step k.
 
-    Its arguments are (t, nodes, shape, k, drive, leak, p): `t` [s] is the start of the step, `drive` and `leak` are of
-    one group, the others those of `advance`.
+    Its arguments are (t, nodes, shape, k, drive, leak, p): `t` [s] is the start of the step, `drive` and `leak`
+    belong to the group, the others are those of `advance`.
     """
 
     def for_nodes(text: str) -> str:
+        """Repeat a piece of source text for each node, with the node's number `n` filled in."""
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -88,9 +97,9 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Update the totals (`N_TOTALS`) of runs with the state `z` at an output.
+    """Add an output of a group of runs to their totals (`N_TOTALS`): sums, extremes, and the flag of diverged runs.
 
-    `t` [s]: time of the output; `q`: numbers of the runs' rigs.
+    `z`: states of the runs at the output; `t` [s]: its time; `q`: numbers of the runs' rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -125,14 +134,15 @@ def advance(
     begin: int,
     totals: np.ndarray,
 ) -> None:
-    """Integrate the groups `groups[0]` <= g < `groups[1]` in place over n steps of h [s], from step `start`.
+    """Integrate groups of runs in place over n steps of h [s]; write their pressures and add to their totals.
 
-    `implicit`: implicit-explicit method, else RK4; `y`: (groups, 14, WIDTH) states; `shape`: (n, nodes) the command's
-    shape at the times `nodes` [s] within each step, or (n, 2 nodes), then followed by the load [N]; `drive`: (groups,
-    2, WIDTH) gain and offset [V] of the command; `leaks`: (groups, LEAK_ROWS, WIDTH); `table`: (groups, cells, fields,
-    WIDTH) the rigs' numbers, constant within a cell, with `bounds` (cells + 1,) the steps at which cells begin; `p`:
-    the choices of the rigs; `pressures`: (groups, outputs, CHANNELS, WIDTH), written from output `begin` on, before
-    every `every`-th step; `totals`: (groups, N_TOTALS, WIDTH).
+    The groups are `groups[0]` <= g < `groups[1]`, the first step is `start`. `implicit`: `IMPLICIT` or `EXPLICIT`,
+    the method; `y` (groups, 14, WIDTH): states; `shape` (n, nodes): the command's shape at the times `nodes` [s]
+    within each step, or (n, 2 nodes) if the load [N] at the same times follows; `drive` (groups, 2, WIDTH): the
+    command's gain and offset [V]; `leaks` (groups, LEAK_ROWS, WIDTH); `table` (groups, cells, fields, WIDTH): the
+    rigs' numbers, constant within a cell, which is a span of steps; `bounds` (cells + 1,): steps at which the cells
+    begin; `p`: the choices that all rigs share; `pressures` (groups, outputs, CHANNELS, WIDTH): written from output
+    `begin` on, before every `every`-th step; `totals`: (groups, N_TOTALS, WIDTH).
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
@@ -164,11 +174,17 @@ def advance(
 
 @kernel
 def advance_lanes_rk4(*run: Any) -> None:
-    """Integrate groups of runs by RK4: `advance`, compiled."""
+    """Integrate groups of runs by the explicit Runge-Kutta method in compiled code.
+
+    The arguments are those of `advance` without the first.
+    """
     advance(EXPLICIT, *run)
 
 
 @kernel
 def advance_lanes_imex(*run: Any) -> None:
-    """Integrate groups of runs of rigs with throttles by the implicit-explicit method: `advance`, compiled."""
+    """Integrate groups of runs of rigs with throttles by the implicit-explicit method in compiled code.
+
+    The arguments are those of `advance` without the first.
+    """
     advance(IMPLICIT, *run)

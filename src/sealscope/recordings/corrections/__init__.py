@@ -1,1 +1,1 @@
-"""What loggers do to samples, and how it is undone before a recording is judged."""
+"""Corrections of a recording's samples before it is diagnosed: what loggers do to samples, and how it is undone."""

@@ -1,8 +1,8 @@
 """An even clock for samples that were polled at uneven times.
 
-The weak form integrates over an even clock. Uneven samples are interpolated linearly to the median rate, which is the
-trapezoidal rule over the recorded times. Samples between distant neighbours become missing; `corrections.gaps` bridges
-and marks them. Called by the inspection.
+The diagnosis integrates over an even clock. Uneven samples are interpolated linearly to the median rate; integrated,
+that is the trapezoidal rule over the recorded times. Between samples that are far apart values are missing;
+`corrections.gaps` bridges and marks them. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 
 
 def resample_evenly(recording: Recording) -> Recording:
-    """Resample a recording to an even clock, with NaN for lost rows.
+    """Resample a recording to an even clock, with NaN in rows that the logger has lost.
 
-    An even recording is returned unchanged. Rows without a time, and rows no later than an earlier row, are dropped. If
-    the clock steps back or leaps because the file contains several recordings, only the longest is used.
+    An even recording is returned unchanged. Rows without a time are dropped, and so are rows that are not later than
+    all rows before. If the clock steps back or leaps because the file contains several recordings, only the longest
+    is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -44,9 +45,10 @@ def resample_evenly(recording: Recording) -> Recording:
 
 
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the rows whose time is later than that of all rows before; return their indices.
+    """Find the indices of the rows that are later than all rows before.
 
-    If more than `MAX_LATE_FRACTION` of the times `t` (n,) are late, only the longest run without a step back is used.
+    `t` (n,): times [s], NaN where unknown. If more than `MAX_LATE_FRACTION` of the rows are not later, only the
+    longest run of rows without a step back in time is used.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
@@ -61,7 +63,10 @@ def _ordered_rows(t: Array) -> NDArray[np.intp]:
 
 
 def _longest_dense_stretch(t: Array, rate: float) -> slice:
-    """Find the longest slice of times `t` (n,) with at least 1 - `MAX_GAP_FRACTION` of the samples due at `rate`."""
+    """Find the longest stretch of rows in which at most the fraction `MAX_GAP_FRACTION` of the samples is lost.
+
+    `t` (n,): increasing times [s]; `rate` [Hz]: samples that are due per second.
+    """
     # samples beyond the fewest allowed since the first row: a stretch is dense enough if it does not decrease
     first_time = t[:1].sum()  # 0 if there is none
     surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
@@ -73,7 +78,10 @@ def _longest_dense_stretch(t: Array, rate: float) -> slice:
 
 
 def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArray[np.int64]) -> Recording:
-    """Insert rows of NaN for lost samples between `rows` (k,), which are `steps` (k - 1,) sampling steps apart."""
+    """Insert rows of NaN for the samples that were lost between recorded ones.
+
+    `rows` (k,): indices of the recorded rows; `steps` (k - 1,): number of sampling steps between them.
+    """
     row_index = np.concatenate([[0], np.cumsum(steps)])
     n = int(row_index[-1]) + 1
     channels = {name: np.full(n, np.nan) for name in recording.channels}
@@ -83,7 +91,7 @@ def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArr
 
 
 def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
-    """Interpolate the given rows to an even clock of the recording's rate."""
+    """Interpolate the rows with the indices `rows` linearly to an even clock with the recording's rate."""
     t = recording.t[rows]
     even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
     channels = {}
@@ -95,9 +103,10 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 
 
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
-    """Interpolate samples (n,) at times `t` (n,) linearly to `even_times` (m,).
+    """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,).
 
-    NaN outside the samples and, unless `is_slow`, in intervals longer than `MAX_INTERVAL` median intervals.
+    The result is NaN before the first and after the last sample. Unless `is_slow`, it is also NaN within intervals
+    longer than `MAX_INTERVAL` times the median interval.
     """
     if t.size < 2:
         return np.full(even_times.size, np.nan)

@@ -1,10 +1,11 @@
-"""Gaps in a recording: short ones are bridged and marked, so that the data on both sides can be analysed together.
+"""Gaps in a recording: they are bridged and marked, so that the data on both sides can be analysed together.
 
-A gap is a run of rows in which a needed channel has no value, or which the logger has lost: the clock shows this
-(`corrections.clock`), or both chamber pressures are zero (`remove_dropouts`). Up to `SPLINE` samples are bridged by a
-cubic spline; longer gaps, if the duty repeats, by the channel's values whole cycles before or after, with an offset so
-that both ends meet; others by a straight line. `Recording.bridged` marks these rows, which are no readings. The balance
-gives less weight to blocks with long gaps (`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
+A gap is a run of rows in which a needed channel has no value. The logger may have lost these rows, as the clock shows
+(`corrections.clock`), or may have written zeros for both chamber pressures (`remove_dropouts`). Up to `SPLINE`
+samples are bridged by a cubic spline. A longer gap is bridged by the channel's values whole duty cycles before or
+after, with an offset so that both ends meet, or by a straight line if the duty does not repeat. `Recording.bridged`
+marks these rows, which are no readings. The flow balance gives less weight to blocks of samples with long gaps
+(`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Flags = NDArray[np.bool_]
 #: impossible samples in a channel with the right unit.
 SPLINE, MAX_CYCLE_GAP, _MAX_IMPOSSIBLE_FRACTION = 3, 0.1, 0.1
 _GAPS = RECORDINGS.gaps
-#: Largest fraction of bridged samples in a block: up to it, they change its sums less than its scatter does.
+#: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
 #: Samples on either side of a gap whose means set the offset of a copied cycle.
 _N_END = 8
@@ -42,10 +43,10 @@ _SLACK = 2
 
 
 def remove_dropouts(recording: Recording) -> Recording:
-    """Mark the samples of all channels as missing where both chamber pressures are exactly zero.
+    """Set the samples of all channels to NaN in rows where both chamber pressures are exactly zero.
 
-    A converter that is off writes zeros; two noisy transducers never read zero together. Returns the same recording if
-    there are none.
+    A converter that is off writes zeros; two noisy transducers never read zero together. Returns the same recording
+    if there are no such rows.
     """
     chambers = chambers_of(recording)
     if len(chambers) < 2:
@@ -58,9 +59,10 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def remove_impossible(recording: Recording) -> Recording:
-    """Mark samples beyond the range of any sensor (`quality.flag_impossible`) as missing.
+    """Set samples that no sensor can read (`quality.flag_impossible`) to NaN.
 
-    A channel with many of them has a wrong unit and stays. Returns the same recording if there are none.
+    A channel with many of them, over a tenth, has a wrong unit and stays. Returns the same recording if there are
+    none.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
     is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
@@ -71,11 +73,11 @@ def remove_impossible(recording: Recording) -> Recording:
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Fill the inner gaps of the `needed` channels and flag them in `bridged`.
+    """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
-    A gap is filled by a spline if it is short, else from another cycle of the duty or by a line. Missing values of the
-    other channels in these rows are filled as well; recorded values stay. Gaps at the ends remain. Returns the same
-    recording if there is nothing to fill. The clock must be even (`clock.resample_evenly`).
+    A gap is filled by a spline if it is short, else from another cycle of the duty or by a straight line. In the rows
+    of a gap missing values of all channels are filled; recorded values stay. Returns the same recording if there is
+    nothing to fill. The clock must be even (`clock.resample_evenly`).
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -106,10 +108,11 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Interpolate short gaps of the channels that are not `needed`; return the same recording if there are none.
+    """Interpolate short gaps linearly in the channels that are not `needed`, except at the ends.
 
-    A gap is short up to `SPLINE` samples for pressures, and otherwise up to the prior `motion` [s], over which a mass
-    moves evenly: a slower sensor leaves such gaps between its samples. Gaps at the ends remain.
+    A gap is short up to `SPLINE` samples in a pressure, and up to the prior `motion` [s] in other channels, as a
+    moving mass moves evenly over that time: a slow sensor leaves such gaps between its samples. Returns the same
+    recording if these channels have no missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -127,9 +130,9 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks in which more than `MAX_BRIDGED_FRACTION` of the samples are bridged.
+    """Flag the blocks of samples in which more than the fraction `MAX_BRIDGED_FRACTION` is bridged.
 
-    `bounds` (n + 1,): sample indices between the blocks. Returns flags (n,).
+    `bounds` (n + 1,): sample indices at which the blocks begin and end. Returns the flags (n,).
     """
     bounds = np.asarray(bounds)
     if recording.bridged is None:
@@ -139,7 +142,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) in bridged gaps longer than the prior `hole` [s] and `MAX_INTERVAL` steps."""
+    """Flag the rows (n,) in long bridged gaps, longer than the prior `hole` [s] and `MAX_INTERVAL` sampling steps."""
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -149,16 +152,17 @@ def flag_holes(recording: Recording) -> Flags:
 
 
 def _finite_mean(values: Array) -> float:
-    """Average the finite values; NaN if there are none."""
+    """Compute the mean of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else math.nan
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Fill a gap in all channels, in place, from the nearest similar cycle.
+    """Fill a gap in all channels, in place, from the nearest similar cycle of the duty; return True if there is one.
 
-    Returns False if there is none. The gap has the samples `first` to `stop` - 1. A cycle is similar if its
-    `_cycle_mismatch` is small. `period`: length of a cycle [samples], known to within `_SLACK`.
+    The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`.
+    The nearest two cycles on either side of the gap are tried. A cycle is similar if its `_cycle_mismatch` is at most
+    `_MAX_MISMATCH`.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -176,11 +180,11 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute the mismatch of the duty around a gap with the duty `shift` samples away.
+    """Compute how much the duty around a gap differs from the duty `shift` samples away.
 
-    The mismatch is the rms difference of both stretches without their means, divided by the standard deviation of the
-    shifted one. They extend up to `half_cycle` samples beyond the gap, `first` to `stop`. Infinite if too few samples
-    are known, or if a `needed` channel lacks samples to copy.
+    Both stretches extend up to `half_cycle` samples beyond the gap, `first` to `stop`, on either side. The mismatch
+    is the rms difference of the two, without their means, divided by the standard deviation of the shifted one. It is
+    infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as it exists here and there
@@ -200,9 +204,9 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill the missing values from `first` to `stop`, in place, by the values `shift` samples away.
+    """Fill the missing values from index `first` to `stop`, in place, by the values `shift` samples away.
 
-    A linear offset makes both ends meet the values around the gap.
+    A linear offset is added, with which both ends meet the values around the gap.
     """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
@@ -214,7 +218,7 @@ def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
 
 
 def _fill_by_line(values: Array, rows: Flags) -> None:
-    """Fill the missing values (n,) at the flagged `rows` (n,), in place, by linear interpolation; not at the ends."""
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by linear interpolation, except at the ends."""
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
     if missing.size and known.size:
@@ -223,7 +227,7 @@ def _fill_by_line(values: Array, rows: Flags) -> None:
 
 
 def _fill_by_spline(values: Array, rows: Flags) -> None:
-    """Fill the missing values (n,) at the flagged `rows` (n,), in place, from a cubic spline through the known ones."""
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known values."""
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))

@@ -1,4 +1,4 @@
-"""All corrections of a recording's samples in order, as the inspection and the folder monitor apply them."""
+"""All corrections of a recording's samples in their order, as the inspection and the folder monitor apply them."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from sealscope.recordings.recording import Recording
 class CorrectedSamples(NamedTuple):
     """A recording after the correction of its samples.
 
-    `recording`: on an even clock, from the first to the last sample with all chamber pressures and the command;
-    `findings`: the corrections; `stuck`: names of chamber pressures that are stuck for too long to be used;
-    `used_fraction`: fraction of the original samples that lie in the time span of `recording`.
+    `recording`: on an even clock, from the first to the last row with all chamber pressures and the command;
+    `findings`: the corrections made; `stuck`: names of chamber pressures that are stuck for too long to be used;
+    `used_fraction`: fraction of the original samples within the time span of `recording`.
     """
 
     recording: Recording
@@ -47,7 +47,11 @@ class CorrectedSamples(NamedTuple):
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
-    """Correct the sample defects of loggers: spikes, stale samples, uneven clocks, missing signs and gaps."""
+    """Correct the samples of a recording for the defects of loggers, and report each correction as a finding.
+
+    In this order: impossible values, dropouts, rows and pressures that are stuck, spikes, repeated samples, an uneven
+    clock, speeds without a sign, gaps.
+    """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
     part = _set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
@@ -77,13 +81,13 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
 
 
 def _set_missing(recording: Recording, flags: Mapping[str, NDArray[np.bool_]]) -> Recording:
-    """Set the flagged samples (n,) of the channels in `flags` to NaN."""
+    """Set flagged samples of a recording to NaN; `flags`: channel -> flags (n,) of its samples."""
     channels = {name: np.where(rows, np.nan, recording[name]) for name, rows in flags.items()}
     return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to the span from the first to the last row with values in all `needed` channels."""
+    """Cut a recording to its rows from the first to the last one with values in all `needed` channels."""
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording
@@ -92,7 +96,7 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long bridged gaps (`flag_holes`) to NaN, for detectors that cannot give gaps a lower weight.
+    """Set long bridged gaps (`flag_holes`) to NaN, for detectors that cannot give them a lower weight.
 
     The result has no `bridged` flags. Returns the same recording if there are no long gaps.
     """
@@ -103,5 +107,5 @@ def remove_holes(recording: Recording) -> Recording:
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Apply `resample_evenly` as a correction without findings."""
+    """Resample a recording to an even clock (`resample_evenly`); the list of findings is empty."""
     return resample_evenly(recording), []

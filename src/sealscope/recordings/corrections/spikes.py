@@ -1,8 +1,8 @@
 """Spikes: single samples that a transmission error sets to zero or full scale.
 
-The value leaps and returns at once, by several times more than any other sample nearby that leaps and returns, than
-the channel's slope there, and than its usual changes. A pressure that rises within one sample stays: it does not
-return. Spikes are set to NaN and bridged as gaps. Called by the inspection.
+The value leaps and returns at once. The leap is several times larger than any other one nearby, than the channel's
+slope there, and than its usual changes. A pressure that rises within one sample is kept, because it does not return.
+Spikes are set to NaN and bridged as gaps. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ _N_CHANGES = 2**15
 
 
 def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Set spikes to NaN; return the recording and the findings."""
+    """Set spikes, samples that leap and return at once, to NaN in all channels but slow ones and the command.
+
+    Returns the recording, and a finding for each channel with spikes.
+    """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, values in recording.channels.items():
         spikes = find_spikes(values) if name not in SLOW and name != "u" else np.empty(0, dtype=np.intp)
@@ -44,10 +47,10 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def find_spikes(values: Array) -> NDArray[np.intp]:
-    """Find the rows in which a channel (n,) leaps and returns at once.
+    """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
-    Both changes must be several times larger than usual changes, neighbouring leaps and the local slope. Empty if there
-    are so many rows that the signal itself leaps.
+    The smaller of the two changes must be several times larger than usual changes, other leaps nearby and the local
+    slope. The result is empty if there are so many such samples that the signal itself leaps.
     """
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:

@@ -1,8 +1,9 @@
 """Stale samples: a slow channel, or a logger that got no new value, repeats the previous sample.
 
-Repeated samples are no readings. They are interpolated between fresh ones; otherwise a channel that repeats each sample
-for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value: the holding period is
-therefore estimated from runs that begin and end with more than a quantisation step. Called by the inspection.
+Repeated samples are no readings. They are interpolated between fresh ones; otherwise a channel that repeats each
+sample for 0.1 s would be 0.05 s late on average. A quantised channel at rest also repeats its value. The time for
+which a channel repeats its samples is therefore estimated from runs that begin and end with a jump of more than a
+quantisation step. Called by the inspection.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ _MAX_REPEAT = 3
 
 
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Interpolate repeated samples between fresh ones; return the recording and the findings.
+    """Interpolate samples that repeat the previous one between the fresh ones; return the recording and the findings.
 
-    A channel holds its samples if most runs of equal values, among those between jumps, have the same length. A row is
-    repeated if all channels stay the same for up to three rows and one of them jumps before and after.
+    Two kinds are found: a channel that repeats each sample for a fixed time (`estimate_holding_period`), and single
+    rows in which all channels repeat the row before (`_flag_repeated_rows`). Slow channels and the command stay as
+    they are.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -59,11 +61,11 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 
 
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which a chamber pressure is stuck while the machine moves.
+    """Flag the rows (n,) in which the chamber pressure `name` is stuck while the machine moves.
 
-    Motion is taken from the position, else from the pump's angle, else from the other chamber pressure, which may
-    change while valves hold the cylinder. Without any of them every stuck run is flagged. Runs at the smallest or
-    largest value are clipped and not flagged.
+    Motion is seen in the position, else in the pump's angle, else in the other chamber pressure, which may change
+    while valves hold the cylinder. If none of them is recorded, all stuck runs are flagged. Runs at the smallest or
+    largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))
@@ -80,8 +82,8 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
-    All channels are then constant or missing, and both chamber pressures are held (`motion.find_holds`). No channel
-    jumps at the beginning, and at least one does at the end; a machine at rest would continue smoothly.
+    In such rows all channels are constant or missing, and both chamber pressures are held (`motion.find_holds`). No
+    channel jumps where they begin, and at least one does where they end. A machine at rest would continue smoothly.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
@@ -107,14 +109,14 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 
 
 def _is_constant_or_missing(values: Array) -> bool:
-    """Test whether all values are equal, or all are missing."""
+    """Test whether all values (n,) are equal, or all are NaN."""
     return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
 
 
 def _jumps_at(values: Array, row: int) -> bool:
-    """Test whether a channel changes across a row by more than its usual change.
+    """Test whether a channel (n,) changes across the index `row` by more than it usually does.
 
-    The usual change, over as many samples, is a high quantile of all changes in the channel.
+    The usual change is a high quantile (the prior `leap`) of all changes of the channel over as many samples.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -122,23 +124,27 @@ def _jumps_at(values: Array, row: int) -> bool:
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Test whether a channel moves in the given rows by more than a fraction of its range."""
+    """Test whether a channel moves in the given rows by more than a small fraction of its range (the prior `moves`).
+
+    `rows` (k,): indices of the rows.
+    """
     all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     min_fraction: float = _PRIORS.moves
     return bool(values_in_rows.size and np.ptp(values_in_rows) > min_fraction * np.ptp(all_values))
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find runs of equal values (n,): the first index of each, and flags for those with jumps at both ends."""
+    """Find runs of equal values (n,); return their first indices (k,), and flags (k,) of those between two jumps."""
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _MIN_JUMP * estimate_quantum(values)
     return starts, np.r_[False, jumps] & np.r_[jumps, False]
 
 
 def estimate_holding_period(t: Array, values: Array) -> float | None:
-    """Estimate the time [s] for which a channel (n,) repeats each sample.
+    """Estimate the time [s] for which a channel (n,) repeats each of its samples.
 
-    `t` (n,): times [s]. None if the channel does not repeat samples, or too briefly to matter.
+    `t` (n,): times [s]. Most runs of equal values between jumps must last equally long; their mean duration is the
+    result. None if that is not the case, if there are too few runs, or if the time is too short to matter.
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -157,7 +163,10 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 
 
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
-    """Flag the samples (n,) that repeat an older one, for a channel sampled every `period` [s]."""
+    """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
+
+    `t` (n,): times [s].
+    """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
     times = t[known]
@@ -170,7 +179,11 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 
 
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which all moving channels repeat the previous row."""
+    """Flag the rows (n,) in which a logger repeats the previous row in all channels that move.
+
+    Up to `_MAX_REPEAT` such rows follow each other, and a channel jumps before and after them. No row is flagged if
+    there are not many more of them than would occur by chance.
+    """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:
         return np.zeros(channels[0].size if channels else 0, dtype=bool)

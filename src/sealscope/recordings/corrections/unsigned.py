@@ -1,10 +1,11 @@
 """Speeds and flows without a sign: an encoder or a flow meter that counts pulses does not measure the direction.
 
-If a speed is never negative while the piston moves both ways, it has no sign, or the pump turns one way and a valve
-chooses the side. In both cases the flow into A is about a v + c (p_A - p_B), fitted iteratively to the signed
-magnitude; the pressure term is the flow that replaces leakage while the piston stands. A sign changes only where the
-magnitude passes zero: the signs are the most likely path of a hidden Markov chain with two states. Without a position
-the sign is that of the command. Called by the inspection.
+If a speed is never negative while the piston moves both ways, either it has no sign, or the pump turns one way and a
+valve chooses the side. In both cases the flow into chamber A is about a v + c (p_A - p_B), with the piston speed v;
+the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to the signed
+magnitude, in turn with a search for the signs. A sign changes only where the magnitude passes zero: the signs are the
+most likely path of a hidden Markov chain with two states. Without a position the sign is that of the command. Called
+by the inspection.
 
 Source: A. J. Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260 (most likely path).
 """
@@ -27,7 +28,10 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 
 
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Restore the sign of a speed or flow, positive into chamber A; return recording and findings."""
+    """Restore the missing sign of a motor speed or of a flow meter, positive for flow into chamber A.
+
+    Returns the recording, and a finding for each channel that was changed.
+    """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():
         if name not in recording or not _has_one_sign(recording[name]):
@@ -51,10 +55,10 @@ def _has_one_sign(values: Array) -> bool:
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
-    """Find the sign (n,) of the flow into chamber A, and describe the channel that shows it.
+    """Find the signs (n,) of the flow into chamber A; also return the source of the signs, in words.
 
-    `magnitude` (n,): absolute speed or flow. Returns (None, "") if neither position nor command determines the sign, or
-    if the motion is in one direction only.
+    `magnitude` (n,): absolute speed or flow. Returns (None, "") if neither position nor command determines the signs,
+    or if the motion is in one direction only.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -68,9 +72,10 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
-    """Compute the piston speed (n,) [m/s] from its position (n,) [m] sampled at `rate` [Hz].
+    """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] sampled at `rate` [Hz].
 
-    Central differences over `_PRIORS.half` [s] on either side; missing positions are interpolated.
+    It is the central difference of the positions before and after, each at a distance of the prior `half` [s].
+    Missing positions are interpolated linearly.
     """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
@@ -83,7 +88,8 @@ def _piston_speed(x: Array, rate: float) -> Array:
 def _moves_both_ways(values: Array) -> bool:
     """Test whether a signal (n,) has enough motion in both directions.
 
-    The smaller of the sums of its positive and negative values must exceed the prior `least` times the larger.
+    Its positive and its negative values are summed. The smaller sum must exceed the larger one times the prior
+    `least`.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -101,10 +107,11 @@ def _correlation(first: Array, second: Array) -> float:
 
 
 def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
-    """Estimate the signs (n,) of the flow into chamber A by alternating a fit and a search for signs.
+    """Estimate the signs (n,) of the flow into chamber A from the piston speed and the chamber pressures.
 
-    The fit is sign x `magnitude` = a v + c (p_A - p_B), with `speed` v [m/s] and a coefficient a for each direction.
-    The first signs are those of the speed. At most `_MAX_ITERATIONS` rounds, fewer if no sign changes.
+    The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s] and a coefficient a
+    for each direction. Fits of the model alternate with searches for the signs, from the signs of the speed on, until
+    no sign changes, at most `_MAX_ITERATIONS` times.
     """
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
@@ -138,9 +145,9 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance of a piston speed (n,) sampled at `rate` [Hz].
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    Compares speeds whose position differences do not overlap; the median makes the estimate robust to motion.
+    Speeds are compared that are computed from different positions; the median makes the estimate robust to motion.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -148,7 +155,7 @@ def _noise_variance(speed: Array, rate: float) -> float:
 
 
 def _average_nearby(values: Array, rate: float) -> Array:
-    """Average values (n,) over `_PRIORS.nearby` [s] on either side."""
+    """Average values (n,) sampled at `rate` [Hz] around each sample, over the prior `nearby` [s] on either side."""
     n_half = max(1, round(_PRIORS.nearby * rate))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(values.size) - n_half, 0)
@@ -157,11 +164,10 @@ def _average_nearby(values: Array, rate: float) -> Array:
 
 
 def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
-    """Find the most likely sequence of signs (n,).
+    """Find the most likely sequence of signs (n,), +1 or -1, by the Viterbi algorithm.
 
-    `log_odds` (n,): of a positive sign in each sample; `cost_of_change` (n - 1,): log odds against a change of sign
-    after each sample. The log odds accumulate from sample to sample, clipped to the cost of a change (Viterbi
-    algorithm).
+    `log_odds` (n,): log odds of a positive sign in each sample; `cost_of_change` (n - 1,): log odds against a change
+    of sign after each sample. The log odds accumulate from sample to sample, limited to the cost of a change.
     """
     path_odds, odds = np.empty(log_odds.size), 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):

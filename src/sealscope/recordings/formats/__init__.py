@@ -1,1 +1,1 @@
-"""File formats: one file a format, and what they share."""
+"""Readers and writers of file formats, one module a format, and the functions that they share."""

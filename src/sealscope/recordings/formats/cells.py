@@ -1,4 +1,7 @@
-"""Cells of a text log: numbers, time stamps, missing samples, words in place of numbers, numbers with units."""
+"""Cells of a text log: numbers, time stamps, missing samples, words in place of numbers, numbers with units.
+
+`decimal` is the decimal separator of the log, "." or ",".
+"""
 
 from __future__ import annotations
 
@@ -45,31 +48,31 @@ _MAX_UNITS = 64
 
 
 def is_missing(cell: str) -> bool:
-    """Test whether a cell stands for a missing sample."""
+    """Test whether a cell stands for a missing sample: it is empty, or a mark such as `NaN` or `--`."""
     return cell.strip().lower() in MISSING
 
 
 def is_number(cell: str, decimal: str) -> bool:
-    """Test whether the cell is a number with this decimal separator."""
+    """Test whether a cell is a number with the decimal separator `decimal`, with or without thousands separators."""
     cell = cell.strip()
     return len(cell) <= _MAX_NUMBER and bool(_NUMBER[decimal].fullmatch(cell) or is_grouped(cell, decimal))
 
 
 def is_grouped(cell: str, decimal: str) -> bool:
-    """Test whether the cell is a number with thousands separators."""
+    """Test whether a cell is a number with thousands separators, such as `1,234.5` for the decimal separator "."."""
     return _GROUPED[decimal].fullmatch(cell.strip()) is not None
 
 
 def is_value(cell: str, decimal: str) -> bool:
-    """Test whether the cell is a number or a time stamp."""
+    """Test whether a cell is a number with the decimal separator `decimal`, or a time stamp."""
     return is_number(cell, decimal) or is_stamp(cell)
 
 
 def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Parse cells to doubles (n,), NaN for missing samples and words.
+    """Parse cells to doubles (n,); also return the indices of the words, cells that are no numbers.
 
-    Also return the indices of the words. `decimal`: decimal separator; `where`: index -> place of the cell for
-    messages. Raises InputError for an infinite number.
+    Words and missing samples become NaN. `decimal`: decimal separator; `where`: function from the index of a cell to
+    its place, for messages. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -87,7 +90,10 @@ def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str
 
 
 def _parse_number(cell: str, pointed: str, decimal: str) -> float:
-    """Parse a cell to a double, NaN for a word; `pointed`: the cell with a point as decimal separator."""
+    """Parse a cell to a double, NaN for a word.
+
+    `pointed`: the cell with "." in place of the decimal separator `decimal`.
+    """
     with suppress(ValueError):
         return np.nan if "_" in pointed else float(pointed)
     text = cell.strip().replace("\u2212", "-")
@@ -99,9 +105,10 @@ def _parse_number(cell: str, pointed: str, decimal: str) -> float:
 
 
 def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
-    """Test whether numbers in the cells of `rows` end in SI prefixes, such as `170.3m`, and not in units.
+    """Test whether the numbers in `rows` of cells end in SI prefixes, such as `170.3m`, and not in units.
 
-    The endings are prefixes if a column has several different ones, or the ending `k` or `u`, which is no unit.
+    The endings are prefixes if a column has several different ones, or if one of them is `k` or `u`, neither of which
+    is a unit.
     """
     prefixes_by_column: dict[int, set[str]] = {}
     for row in rows:
@@ -119,19 +126,25 @@ def has_prefixes(rows: Sequence[Sequence[str]]) -> bool:
 
 
 def expand_prefixes(line: str) -> str:
-    """Replace the prefixes at the end of a line's numbers by exponents: `170.3m` becomes `170.3e-3`."""
+    """Replace the SI prefixes at the ends of the numbers in a line by exponents: `170.3m` becomes `170.3e-3`."""
     return _PREFIXED.sub(lambda match: f"e{_POWERS[match['prefix']]}", line)
 
 
 def _trailing_unit(cell: str) -> str | None:
-    """Return the text after the number in a cell such as `20 bar`, a known unit or not; None for other cells."""
+    """Find the text after the number in a cell such as `20 bar`, whether it is a known unit or not.
+
+    None if the cell is no number with a short text after it.
+    """
     cell = cell.strip()
     match = _QUANTITY.fullmatch(cell) if len(cell) <= _MAX_QUANTITY else None
     return None if match is None else match["unit"]
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the columns in which over half of the cells are numbers with a known unit: column -> most frequent unit."""
+    """Find the columns in which over half of the cells are numbers with a known unit: column -> most frequent unit.
+
+    `rows`: cells of each line of a log.
+    """
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:
@@ -147,15 +160,16 @@ def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def remove_units(line: str, units: Iterable[str]) -> str:
-    """Remove `units` after the numbers at the ends of the cells in a line of a log."""
+    """Remove `units` from the cells of a line of a log, where they follow a number at the end of a cell."""
     pattern = "|".join(re.escape(unit) for unit in sorted(set(units), key=len, reverse=True))
     return re.sub(rf"(?<=[\d.])[ \u00a0\u202f]{{0,2}}(?:{pattern})(?=[ ]{{0,8}}\"?[ ]{{0,8}}(?:[;,|\t]|$))", "", line)
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add `units` (column -> unit in its cells) to labels that have none.
+    """Add the units found in the cells of columns to the labels of these columns, unless they state a unit.
 
-    Raises InputError if a label has another unit; `place`: name of the file in the message.
+    `units`: column -> unit in its cells; `place`: name of the file in messages. Raises InputError if a label states
+    another unit.
     """
     result = []
     for column, label in enumerate(labels):
@@ -172,9 +186,9 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[int], str]) -> list[str]:
     """Remove `unit` from the ends of a column's cells.
 
-    Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and is missing if it
-    does not end in `unit`; `where`: index -> place for the message. Raises InputError for a number with another unit or
-    with none.
+    Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
+    it does not end in `unit`; `where`: function from the index of a cell to its place, for messages. Raises
+    InputError for a number with another unit, and for one without a unit.
     """
     result = [cell.strip() for cell in cells]
     for index, text in enumerate(result):

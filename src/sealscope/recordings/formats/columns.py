@@ -1,4 +1,4 @@
-"""Choose the columns of a table to read as channels, by headings, their units, and the user's map."""
+"""Choose the columns of a table that are read as channels, by their headings, their units, and the user's map."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Request:
-    """A validated request to a reader.
+    """Request for reading a file; invalid values raise InputError.
 
-    `map`: choice of columns; `rate`: sampling rate [Hz] or None; `file`: name of the file for the provenance.
+    `map`: choice of the columns; `rate`: sampling rate [Hz] in place of a time column, or None; `file`: name of the
+    file for the provenance.
     """
 
     map: ChannelMap
@@ -56,7 +57,7 @@ class Request:
 
     @property
     def infers_rate(self) -> bool:
-        """True if the times determine the rate even in a file that states one.
+        """True if the times determine the sampling rate, even in a file of Sealscope's own that states it.
 
         A map may choose other times, and a data frame, which has no `file`, may lack rows.
         """
@@ -65,13 +66,14 @@ class Request:
 
 @dataclass
 class ColumnMap:
-    """Choice of the columns to read from a table with these `labels`; columns are numbered from 0.
+    """The columns of a table that are read, and their meaning; columns are numbered from 0.
 
-    `time`, `time_label`: the time column, and the name and unit used for it; `channels`: channel -> formula of columns;
-    `parts`: part of the time -> column, if several columns form the time; `date`: column of the date, if the time
-    column may be a time of day, or the time column itself if it is a date; `rate`: sampling rate [Hz] from the caller
-    or the file, or None; `names`: channel -> the file's name for it, if different; `unused`: measured pressures,
-    positions, speeds and flows that are in no channel; `notes`: lines for the history.
+    `labels`: headings of all columns; `rate`: sampling rate [Hz] from the caller or the file, or None; `time`: the
+    time column, or None; `time_label`: name and unit used for it; `channels`: channel -> formula of columns; `parts`:
+    part of the time, such as "hour" -> its column, if several columns form the time. `date`: column of the date if
+    the time column may be a time of day, or the time column itself if it is called a date. `names`: channel -> its
+    name in the file, if that differs; `unused`: names of columns with measured pressures, positions, speeds and flows
+    that are in no channel; `notes`: lines for the history.
     """
 
     labels: Sequence[Label]
@@ -87,14 +89,14 @@ class ColumnMap:
 
     @property
     def channel_of(self) -> dict[int, str]:
-        """Column -> channel that uses it, the last if there are several."""
+        """Mapping from each column to the channel that uses it, the last one if there are several."""
         return {column: name for name, formula in self.channels.items() for column in formula.factors}
 
     @property
     def columns(self) -> dict[int, str]:
-        """Column to read -> "numbers", or "time" for the time column, which is last.
+        """Mapping from each column to read to its kind, "numbers", or "time" for the time column, which is last.
 
-        A time column that is also a channel is read as numbers.
+        A time column that is also part of a channel is read as numbers.
         """
         read = {*self.channel_of, *self.parts.values()} - {self.time}
         columns = dict.fromkeys(sorted(read), "numbers")
@@ -104,7 +106,7 @@ class ColumnMap:
 
 
 def split_map_option(text: str) -> tuple[str, str]:
-    """Split ``p_A=PG_1`` or ``p_A=PG_1[psi]`` into channel and column; raise InputError for other text."""
+    """Split ``p_A=PG_1`` or ``p_A=PG_1[psi]`` into channel and column; raise InputError for any other text."""
     channel, equals, column = (part.strip() for part in text.partition("="))
     if not equals or not channel or not column:
         raise InputError(f"a map must read CHANNEL=COLUMN, such as p_A=PG_1 or p_A=PG_1[psi], got {text!r}")
@@ -122,7 +124,10 @@ def _check_channel(channel: str) -> None:
 
 
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
-    """Raise InputError for a map with unknown channels or values, and for a rate that is not positive."""
+    """Raise InputError for an invalid map, and for a sampling rate that is not positive.
+
+    A map is invalid if it has an unknown channel, or a word other than "auto" in place of columns.
+    """
     if isinstance(channel_map, str) and channel_map != "auto":
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     for channel in explicit_columns(channel_map):
@@ -134,19 +139,19 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def uses_names(channel_map: ChannelMap) -> bool:
-    """Test whether a map chooses channels by the columns' names."""
+    """Test whether a map lets channels be chosen by the names of the columns, i.e. contains "auto"."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
 def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
-    """Return the entries of a map, channel -> column, other than `REST`; empty for "auto"."""
+    """Return the entries of a map, channel -> column, that name a column; empty for the map "auto"."""
     return (
         {} if isinstance(channel_map, str) else {name: column for name, column in channel_map.items() if name != REST}
     )
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map, channel -> column, by which a recording was read, from its provenance."""
+    """Reconstruct the map, channel -> column, with which a recording was read, from its provenance."""
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
     proposed = proposed_map([Label.parse(heading) for heading in columns.values()])
@@ -154,7 +159,10 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_unit(label: Label, channel: str) -> str | None:
-    """Find a column's unit in its heading, or at the end of its name if the channel can have that unit."""
+    """Find the unit of a column in its heading, or at the end of its name if the channel can have that unit.
+
+    None if there is none.
+    """
     ending = split_unit(label.name)[1] if label.unit is None else None
     is_possible = ending is not None and same_dimension(ending, "s" if channel == "t" else CHANNEL_UNITS[channel])
     return ending if is_possible else label.unit
@@ -166,10 +174,10 @@ def _format_columns(labels: Sequence[Label]) -> str:
 
 
 def _find_column(labels: Sequence[Label], name: str, description: str, mapped: bool = False) -> int | None:
-    """Find the column with a name or a number (`#4`, from 1); None if there is none.
+    """Find the index of the column with a name, or with a number such as `#4`, counted from 1.
 
-    If `mapped`, the last words of a name are enough, such as `ch2`. Raises InputError if several columns match;
-    `description` begins the message.
+    None if there is none. If `mapped`, the last words of a column's name are enough, such as `ch2`. Raises InputError
+    if several columns match; `description` begins the message.
     """
     folded = name.casefold()
     for matches_name in (  # strict criteria first
@@ -192,9 +200,9 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
-    """Parse a map's entry for a channel, the name of a column or a formula, to a formula of column numbers.
+    """Parse the entry of a map for a channel, the name of a column or a formula, to a formula of column numbers.
 
-    A unit in the entry takes precedence over that of the heading, and this over that at the end of the column's name.
+    A unit in the entry takes precedence over one in the heading, and that over one at the end of the column's name.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -224,10 +232,10 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
-    """Choose the unit in which a channel is read; return the unit, and a note for the history or None.
+    """Choose the unit in which a channel is read; also return a note for the history, or None.
 
-    `unit`: unit of the column, None for raw counts; `description`: the column in the note. Raises InputError for a unit
-    of the wrong dimension.
+    `unit`: unit of the column, None if it has none, which means raw counts; `description`: the column in the note.
+    Raises InputError for a unit of the wrong dimension.
     """
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
@@ -242,7 +250,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add the channels and the time of a map to the choice; `columns`: channel -> column or formula."""
+    """Add the channels and the time of a user's map to `choice`; `columns`: channel -> column or formula."""
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole
@@ -260,7 +268,7 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Add the remaining channels from columns with the channels' names, and the time unless a map names it."""
+    """Add the channels whose names columns have to `choice`, and the time, unless a map has set them already."""
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
@@ -280,7 +288,11 @@ def _apply_names(choice: ColumnMap) -> None:
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
-    """Find the only column with a channel's name in a path or before a unit, as in `Rig.Cyl.p_A [bar]` or `p_A_bar`."""
+    """Find the only column with a channel's name within its own, as in `Rig.Cyl.p_A [bar]` or `p_A_bar`.
+
+    The name is part of a path or stands before a unit, and the unit must suit the channel. None if there is no such
+    column or several.
+    """
     matches = [
         i
         for i, label in enumerate(labels)
@@ -295,7 +307,7 @@ def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
 
 
 def _find_time(labels: Sequence[Label]) -> int | None:
-    """Find the time column by its name, one with a unit first; None if there is none."""
+    """Find the time column by its name, preferably one with a unit; None if there is none."""
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several
         return exact
@@ -311,10 +323,11 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 
 
 def _choose_time_columns(choice: ColumnMap) -> None:
-    """Add the columns that together form the time, or choose a time column if no name means the time.
+    """Choose the time of a table from several columns, or from columns whose names do not mean the time.
 
-    Hours, minutes and seconds may accompany a date; without one, the column of seconds or of hours is the time column.
-    If there is no other time and the file states no rate, a date is the time, or the only column in a unit of time.
+    Columns of hours, minutes and seconds form the time, alone or with a date. If there is no time column and the file
+    states no rate, a date is the time, or the only column in a unit of time. Columns with parts of a second are added
+    to the time.
     """
     labels, used = choice.labels, choice.channel_of
     parts = find_time_parts(labels, used)
@@ -339,15 +352,15 @@ def _choose_time_columns(choice: ColumnMap) -> None:
 
 
 def _date_columns(choice: ColumnMap) -> list[int]:
-    """List the columns named as a date, such as `Datum`, and not used by a channel."""
+    """List the columns that are called a date, such as `Datum`, and are used by no channel."""
     columns = [i for i, label in enumerate(choice.labels) if label.name.casefold() in WORDS["date"]]
     return [i for i in columns if i not in choice.channel_of]
 
 
 def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
-    """Note unused columns for the history, and collect the measured ones in `choice.unused`.
+    """Note the unused columns for the history, and collect the measured ones in `choice.unused`.
 
-    `used`: numbers of the other columns. The note contains a map with which the unused ones could be read.
+    `used`: numbers of the used columns. The note proposes a map that would read the unused ones.
     """
     unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
@@ -363,12 +376,12 @@ def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
 
 
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
-    """Choose the columns to read, and the channel of each.
+    """Choose the columns of a table to read, and the channel of each.
 
-    Without a time column the rate is the requested one, else the file's `stated_rate` [Hz]. "auto" in a map stands for
-    `proposed_map` of the columns that the map does not use. A mapped column takes precedence over a column with the
-    channel's name. Raises InputError if a mapped column is missing, if no column is a channel, if there is neither time
-    nor rate, and for a unit of the wrong dimension.
+    Without a time column the sampling rate is the requested one, else the `stated_rate` [Hz] of the file. "auto" in a
+    map stands for `proposed_map` of the columns that the map does not use. A column in the map takes precedence over
+    a column with the channel's name. Raises InputError if a column in the map does not exist, if no column is a
+    channel, if there is neither time nor rate, and for a unit of the wrong dimension.
     """
     choice, columns, rate = ColumnMap(labels, stated_rate), explicit_columns(request.map), request.rate
     if uses_names(request.map):

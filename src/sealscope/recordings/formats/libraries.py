@@ -12,10 +12,10 @@ from sealscope.errors import MissingExtra
 
 
 def import_library(module: str, purpose: str, package: str) -> ModuleType:
-    """Import a library of the extra `io` and silence its warnings and log; raise MissingExtra if it is not installed.
+    """Import a library of the extra `io`, and silence its warnings and log.
 
-    `purpose` ("a data frame") and `package`, its name for pip, appear in the error. Log handlers of a library that the
-    program has imported before stay.
+    `purpose` ("a data frame") and `package`, its name for pip, appear in the error message. Log handlers of a library
+    that the program has imported before stay. Raises MissingExtra if the library is not installed.
     """
     is_first = module not in sys.modules
     try:

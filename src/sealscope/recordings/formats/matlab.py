@@ -29,7 +29,7 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Test whether `head` begins a MATLAB 4 file: five integers, and a name that ends in a zero byte."""
+    """Test whether `head` begins a MATLAB 4 file, with five integers and a name that ends in a zero byte."""
     for machine, order in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
         if (
@@ -47,7 +47,7 @@ def is_matlab_4(head: bytes) -> bool:
 
 
 def read_matlab(path: Path, request: Request) -> RecordingFields:
-    """Read the requested series of a MATLAB file; raise MissingExtra without mat-io."""
+    """Read the requested series of a MATLAB file to the fields of a recording; raise MissingExtra without mat-io."""
     import h5py
 
     size = path.stat().st_size
@@ -87,9 +87,10 @@ def _check_links(file: Any) -> None:
 
 
 def _read_streams(file: Any) -> Iterator[Series]:
-    """Yield the series of doubles among the signal streams of a file.
+    """Yield the series of doubles among the signal streams of an open HDF5 file.
 
-    `CompressedTime` contains first time, step and count, `DataR2` the number of the stream.
+    In the file `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of the
+    stream.
     """
     import h5py
 
@@ -108,12 +109,12 @@ def _read_streams(file: Any) -> Iterator[Series]:
 
 
 def _decode_utf16(characters: Any) -> str:
-    """Decode a MATLAB text, an array of UTF-16; empty if there is none."""
+    """Decode a MATLAB text, an array of UTF-16 code units; the result is empty for None and other arrays."""
     if characters is None or characters.dtype != np.uint16:
         return ""
     return np.ravel(characters[()]).tobytes().decode("utf-16-le", errors="replace")
 
 
 def _read_doubles(data: Any, count: int) -> Array:
-    """Read the first `count` doubles of a data set of bytes."""
+    """Read the first `count` doubles from a data set of bytes."""
     return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)

@@ -20,7 +20,10 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, b
 
 
 def read_mdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of an MDF file in physical values; undecoded bus frames are not supported."""
+    """Read the requested channels of an MDF file, in physical values, to the fields of a recording.
+
+    Frames of a bus are not decoded. Raises MissingExtra without asammdf.
+    """
     with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         # a file without a date has 1980 or before
@@ -32,7 +35,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
             master = file.masters_db.get(number)
 
             def read_seconds(number: int = number) -> Any:
-                """Read the group's times (n,) [s] and the time stamp of 0 s, or None."""
+                """Read the times (n,) [s] of a group, and the time stamp of 0 s, None if the file has no date."""
                 return np.asarray(file.get_master(number), dtype=np.float64), start
 
             clock = None if master is None else Clock(number, read_seconds)
@@ -47,7 +50,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _open_file(MDF: Any, path: Path) -> Any:
-    """Open an MDF file with the class `MDF`.
+    """Open an MDF file with asammdf's class `MDF`.
 
     If that fails, the object is marked as closed, because its destructor would print an error.
     """
@@ -62,7 +65,10 @@ def _open_file(MDF: Any, path: Path) -> Any:
 
 
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
-    """Read a channel's samples (n,); texts of a conversion among numbers, such as `SNA`, become missing samples."""
+    """Read the samples (n,) of a channel by the numbers of its group and of the channel in it.
+
+    A conversion may give a few texts among the numbers, such as `SNA`; these become NaN.
+    """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":
         return values

@@ -1,4 +1,4 @@
-"""NetCDF-4 and other HDF5: recordings written by Sealscope, and foreign files with one-dimensional data sets."""
+"""NetCDF-4 and other HDF5 files: recordings written by Sealscope, and foreign ones with one-dimensional data sets."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ _CHANNEL_ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
 def read_netcdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested one-dimensional data sets, and fields of tables, of a NetCDF-4 or HDF5 file."""
+    """Read the requested data sets of a NetCDF-4 or HDF5 file to the fields of a recording.
+
+    A series is a one-dimensional data set, or a field of a data set of records.
+    """
     import h5py
 
     size = path.stat().st_size
@@ -72,13 +75,13 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
-    """Read a field of a data set of records as doubles (n,)."""
+    """Read the field `field` of a data set of records as doubles (n,); `name`: the data set in messages."""
     check_internal(name, data)
     return np.asarray(data[field], dtype=np.float64)
 
 
 def _is_series(item: Any) -> bool:
-    """Test whether an item of a file is a one-dimensional data set, other than a NetCDF dimension without values."""
+    """Test whether an item of a file is a one-dimensional data set; a NetCDF dimension without values is none."""
     import h5py
 
     if not isinstance(item, h5py.Dataset) or item.ndim != 1:
@@ -88,14 +91,14 @@ def _is_series(item: Any) -> bool:
 
 
 def check_internal(name: str, data: Any) -> None:
-    """Raise InputError for a data set whose samples are in other files."""
+    """Raise InputError if the samples of the data set `name` are stored in other files."""
     if data.external or data.is_virtual:
         storage = "external storage" if data.external else "a virtual data set"
         raise InputError(f"{name} must have its samples in the file itself, got {storage}")
 
 
 def _decode_text(value: Any) -> str | None:
-    """Decode an attribute or cell that is one text: a str, UTF-8 bytes, or an array of one; None for other values."""
+    """Decode an attribute or cell with a single text: a str, UTF-8 bytes, or an array of one; None for others."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
@@ -104,12 +107,12 @@ def _decode_text(value: Any) -> str | None:
 
 
 def _first_number(value: Any) -> float:
-    """Return the first number of an attribute."""
+    """Return the first number of an attribute, which may be an array."""
     return float(np.asarray(value).reshape(-1)[0])
 
 
 def _parse_label(name: str, data: Any) -> Label:
-    """Make the label of a data set from its name and its unit attribute."""
+    """Make the label of the data set `name` from its name and its attribute of units."""
     unit = next(
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
@@ -118,7 +121,10 @@ def _parse_label(name: str, data: Any) -> Label:
 
 
 def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
-    """Read a data set as texts, or as doubles with scale, offset and fill values of the CF conventions."""
+    """Read a data set as texts (n,), or as doubles (n,) with scale, offset and fill values of the CF conventions.
+
+    `name`: the data set in messages; `file_size` [bytes]. Raises InputError for other types.
+    """
     check_internal(name, data)
     if data.dtype.kind in "OSU":
         return np.array(_read_texts(data, name, file_size), dtype=object)
@@ -139,9 +145,10 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts in chunks that bound the memory.
+    """Read a data set of texts, in chunks that bound the memory.
 
-    Many cells may refer to one text, which may be as long as the file, `file_size` [bytes].
+    Many cells may refer to one text, which may be as long as the file, `file_size` [bytes]. `name`: the data set in
+    messages.
     """
     import h5py
 
@@ -160,7 +167,7 @@ def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
 
 
 def _read_description(file: Any) -> dict[str, Any]:
-    """Read rate, provenance and history of a recording written by Sealscope."""
+    """Read the description of a recording that Sealscope has written: rate, provenance and history."""
     history, provenance = (_decode_text(file.attrs[name]) for name in ("history", "provenance"))
     header = {"format": _first_number(file.attrs[FORMAT_ATTRIBUTE]), "rate": _first_number(file.attrs["rate"])}
     try:
@@ -171,7 +178,10 @@ def _read_description(file: Any) -> dict[str, Any]:
 
 
 def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
-    """Make the global attributes of a file; `provenance` and `history` are JSON, as NetCDF has no nested values."""
+    """Make the global attributes of a NetCDF file from the description of a recording (`table.make_description`).
+
+    `provenance` and `history` become JSON texts, as NetCDF has no nested values.
+    """
     return {
         "Conventions": "CF-1.11",
         "title": "Sealscope recording",
@@ -185,7 +195,7 @@ def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write a NetCDF-4 file without loss of precision.
+    """Write a NetCDF-4 file without loss of precision; arguments as from `Recording.series`.
 
     The file is made in memory first, because libhdf5 aborts the process if the disk is full.
     """

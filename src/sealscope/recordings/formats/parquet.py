@@ -1,4 +1,4 @@
-"""Parquet and Feather tables, with pyarrow: units in the columns' names, description in the table's metadata."""
+"""Parquet and Feather tables, with pyarrow: units are in the names of columns, the description in the metadata."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ _DESCRIPTION_KEY = b"sealscope"
 
 
 def read_parquet(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a Parquet or Feather table; raise MissingExtra without pyarrow."""
+    """Read the requested columns of a Parquet or Feather table to the fields of a recording.
+
+    Raises MissingExtra without pyarrow.
+    """
     import_library("pyarrow", "Parquet", "pyarrow")
     with path.open("rb") as beginning:
         is_feather = beginning.read(6) == b"ARROW1"
@@ -57,7 +60,11 @@ def _read_remarks(schema: Any) -> dict[str, str]:
 
 
 def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) -> list[Series]:
-    """List the series of a table; `read_column`: reads a column by its number."""
+    """List the columns of a table as series.
+
+    `schema`: pyarrow's schema of the table; `read_column`: function that reads a column by its number; `n_rows`:
+    number of rows.
+    """
     series = []
     for number, field in enumerate(schema):
         metadata = field.metadata or {}
@@ -71,12 +78,15 @@ def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) ->
 
 
 def _is_text(field: Any) -> bool:
-    """Test whether a field has a text type."""
+    """Test whether a column, a field of pyarrow's schema, has a text type."""
     return str(field.type) in ("string", "large_string")
 
 
 def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDArray[Any]:
-    """Read a column as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types."""
+    """Read a column as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types.
+
+    `read_column`: function that reads it; `field`: the column in pyarrow's schema; `n_rows`: number of rows.
+    """
     import pyarrow
     from pyarrow import compute, types
 
@@ -100,7 +110,10 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
 def write_parquet(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write columns `t [s]`, `p_A [Pa]`, ... as doubles, and the description to the table's metadata."""
+    """Write a Parquet file with columns `t [s]`, `p_A [Pa]`, ... of doubles; arguments as from `Recording.series`.
+
+    The description becomes metadata of the table. Raises MissingExtra without pyarrow.
+    """
     pyarrow = import_library("pyarrow", "Parquet", "pyarrow")
     columns = {f"{name} [{units[name]}]": pyarrow.array(series, from_pandas=False) for name, series in values.items()}
     table = pyarrow.table(columns).replace_schema_metadata({_DESCRIPTION_KEY: json.dumps(description).encode()})

@@ -24,9 +24,10 @@ _CHUNK = 2**20
 
 
 def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of the first sheet that has all of them; visible and then longer sheets come first.
+    """Read the requested columns of a spreadsheet, from the first sheet that has all of them.
 
-    Raises the first sheet's error if no sheet has them.
+    Visible sheets come before hidden ones, and longer before shorter ones. If no sheet has the columns, the error of
+    the first sheet is raised.
     """
     _check_members(path)
     workbook = import_library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(
@@ -51,7 +52,10 @@ def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
 
 
 def _check_members(path: Path) -> None:
-    """Check that a workbook's members unpack to at most the limit; raise UnreadableFile or BadZipFile otherwise."""
+    """Check that the members of a workbook, a ZIP archive, are whole and unpack to at most the permitted size.
+
+    Raises UnreadableFile or BadZipFile otherwise.
+    """
     if not zipfile.is_zipfile(path):
         return
     with zipfile.ZipFile(path) as archive:
@@ -64,7 +68,7 @@ def _check_members(path: Path) -> None:
 
 
 def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
-    """Read a sheet as a text log; errors name the sheet instead of the temporary file."""
+    """Read a sheet as a text log; errors name the sheet and the workbook `place` instead of the temporary file."""
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         text = Path(folder) / "sheet.tsv"
         with text.open("w", encoding="utf-8", newline="\n") as file:
@@ -81,7 +85,7 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
 
 
 def _format_cell(value: Any) -> str:
-    """Format a cell as text: numbers with all digits, dates and times as ISO stamps, durations in seconds."""
+    """Format a cell as text: numbers with all digits, dates and times in ISO form, durations in seconds."""
     if isinstance(value, bool | None):
         return ""
     if isinstance(value, float | int):

@@ -1,10 +1,11 @@
-"""Build a recording from the series in a file: choose channels, bring them to one clock, convert to SI units.
+"""Build a recording from the series in a file: choose channels, bring them to one clock, convert them to SI units.
 
-A reader of a format lists the series of a file; `build_fields` turns them into the fields of a recording. Groups of
-series may have different sampling rates. A name that occurs in several groups means the series in the group with most
-channels. Channels are brought to the clock of the chamber pressures: slower ones by linear interpolation, faster ones
-by averages over its intervals. Gaps of a series, and the time before its first and after its last sample, stay empty.
-In a long table, where a row is a sample of one channel, each name is a series.
+A reader of a format lists the series in a file, i.e. its named columns of samples; `build_fields` turns them into the
+fields of a recording. Series are in groups, which may have different sampling rates. If several groups have series of
+the same name, that in the group with most channels is used. Channels are brought to the clock of the chamber
+pressures: slower ones by linear interpolation, faster ones by averages over its intervals. Gaps of a series, and the
+time before its first and after its last sample, stay empty. In a long table, each row has one sample of one channel,
+and each name is a series.
 """
 
 from __future__ import annotations
@@ -66,10 +67,10 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 @dataclass(frozen=True)
 class Clock:
-    """The sampling times of series.
+    """Sampling times that one or more series have in common.
 
-    `key`: equal for series sampled together; `read`: function that returns the times (n,) [s] and the time stamp of 0
-    s, which is None if unknown.
+    `key`: equal for series that are sampled together; `read`: function that returns the times (n,) [s] and the time
+    stamp of 0 s, None if that is not known.
     """
 
     key: Hashable
@@ -77,16 +78,17 @@ class Clock:
 
     @classmethod
     def of_times(cls, key: Hashable, t: Array, start: np.datetime64 | None = None) -> Clock:
-        """Make a clock with the times `t` (n,) [s] after `start`."""
+        """Make a clock from its times `t` (n,) [s] after the time stamp `start`; `key`: as for the class."""
         return cls(key, lambda: (t, start))
 
 
 @dataclass(frozen=True)
 class Series:
-    """A named series of samples in a file, read when needed.
+    """A named series of samples in a file, which are read when they are needed.
 
-    `group`: name of its group, or empty; `count`: number of samples; `values`: function that reads the samples (n,) as
-    doubles, texts or datetime64; `clock`: sampling times, None if the file does not state them.
+    `group`: name of the group that it is in, or empty; `label`: its name and unit; `count`: number of samples;
+    `values`: function that reads the samples (n,) as doubles, texts or datetime64; `clock`: sampling times, None if
+    the file does not state them.
     """
 
     group: str
@@ -97,7 +99,7 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Name with the group before it, as a map may contain it."""
+        """Name of the series after the name of its group, as a map may contain it: `group/name`."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 
@@ -112,7 +114,7 @@ def uniform_clock(
 
 
 class RecordingFields(NamedTuple):
-    """The arguments of `Recording` in order, followed by the `kind` of the file in words."""
+    """The arguments of `Recording` in their order, followed by `kind`, the format of the file in words."""
 
     t: Array
     channels: dict[str, Array]
@@ -123,7 +125,7 @@ class RecordingFields(NamedTuple):
     kind: str
 
     def with_note(self, line: str) -> RecordingFields:
-        """Add a line at the beginning of the history."""
+        """Return the same fields with a line added at the beginning of the history."""
         return self._replace(history=(line, *self.history))
 
 
@@ -138,11 +140,12 @@ def build_fields(
     prepare: Prepare | None = None,
     size: int | None = None,
 ) -> RecordingFields:
-    """Build the fields of a recording from the requested series; raise InputError if they do not fit together.
+    """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    `kind`: the format, in words; `remarks`: the file's remarks on the recording; `rate` [Hz]: stated by the file, for
-    series without a clock; `description`: rate, provenance and history written by Sealscope; `prepare`: reads all used
-    columns together; `size`: of a file that may be compressed [bytes], for `check_size`.
+    `request`: choice of the series; `kind`: format of the file in words; `remarks`: entries in the file's header;
+    `rate` [Hz]: sampling rate stated by the file, for series without a clock; `description`: rate, provenance and
+    history in a file that Sealscope has written; `prepare`: function that reads all used columns together; `size`:
+    size of a file that may be compressed [bytes], for `check_size`.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
@@ -186,10 +189,11 @@ def convert_columns(
     description: Mapping[str, Any] | None = None,
     state: TimeState | None = None,
 ) -> RecordingFields:
-    """Convert the columns (n,) of a table, doubles or the time as datetime64, to the fields of a recording.
+    """Convert the columns of a table that were read to the fields of a recording.
 
-    `kind`, `remarks`, `description`: as for `build_fields`; `state`: of the time column after the previous part of a
-    text log; it is updated.
+    `choice`: meaning of the columns; `columns`: column -> values (n,), doubles or, for the time, datetime64; `kind`,
+    `remarks`, `description`: as for `build_fields`; `notes`: lines for the history; `state`: state of the time column
+    after the previous part of a text log, which is updated.
     """
     label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
     count = len(next(iter(columns.values())))
@@ -235,7 +239,10 @@ def convert_columns(
 def _convert_channels(
     choice: ColumnMap, columns: Mapping[int, NDArray[Any]]
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
-    """Convert the channels to SI units or counts; return values, units and, where they differ, units in the log."""
+    """Convert the chosen channels to SI units or counts; return (values, units, units in the log where they differ).
+
+    Each is a mapping from the names of channels.
+    """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
         unit = formula.unit or COUNTS
@@ -249,7 +256,11 @@ def _convert_channels(
 
 
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
-    """Combine the columns that form the time, or return the time column if they do not; add a line to the notes."""
+    """Combine the columns that form the time, and add a line to `notes`.
+
+    `label`: name and unit of the time. Returns the time column alone if the other columns are no parts of its time.
+    Raises InputError if it is a column of hours.
+    """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
     time = combine_time_parts(columns[choice.time], parts, label.unit)
@@ -266,16 +277,19 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
 
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:
-    """Test whether any value of a column of dates, used as the time, has a time of day."""
+    """Test whether any date stamp in `time` (n,) has a time of day other than midnight.
+
+    False if the values are no stamps.
+    """
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give series without a clock the times of their group's time series, and remove the time series.
+    """Give series without a clock the times of the time series in their group, and remove the time series.
 
-    A file's only time series stays, as a column. A series called `data` or `value` that is alone in its group gets the
-    group's name.
+    If the file has only one time series, it stays, as a column. A series with a name such as `data` or `value` that
+    is alone in its group gets the name of the group.
     """
     time_series: dict[str, Series] = {}
     for member in series:
@@ -300,8 +314,8 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the times (n,) [s] of a time series, and the time stamp of 0 s.
 
-    Time stamps count from the first of them, which is returned, or None for a series in a group. For other times the
-    stamp is `start`. Raises InputError if no row has a time.
+    Date stamps count from the first of them, which is returned, or None for a series in a group. For other times the
+    returned stamp is `start`. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
@@ -317,14 +331,15 @@ def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array,
 
 
 def timedelta_seconds(times: Any) -> Array:
-    """Convert timedelta64 of any shape to seconds."""
+    """Convert timedelta64 values of any shape to seconds."""
     return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
 
 
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
-    """Give each series a unique name: its label's, or its path if another group has a preferred series of that name.
+    """Give each series a unique name; return the series, and lines for the history.
 
-    Returns the series and lines for the history.
+    If several groups have series of one name, that in the group with most channels, or else with most samples, keeps
+    it. The others are called by their paths. A file without groups is returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -351,9 +366,9 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read a series' samples (n,) as doubles, or as datetime64 if `as_time`.
+    """Read the samples (n,) of a series as doubles, or as datetime64 if `as_time` and they are date stamps.
 
-    A few words in a column of texts are missing samples; raises InputError for more.
+    A few words in a column of texts become NaN; raises InputError for more, and for other types.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -375,7 +390,12 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the used columns to the clock of the chamber pressures; return columns with the time, and notes."""
+    """Resample the used columns to the clock of the chamber pressures.
+
+    Without these, the clock is that of the pressures at the pump, or of the longest series. `used`: column -> series.
+    Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no series has a
+    clock, or if one without has another number of samples.
+    """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
     # the chamber pressures first, then the longest series
@@ -407,7 +427,12 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 
 
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
-    """Resample the `values` of `member` to times `t` (n,) [s] after `start`; also return a note, empty if unchanged."""
+    """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after `start`.
+
+    Also returns a note for the history, which is empty if the clocks are equal. Slower series are interpolated,
+    except over long intervals, and faster ones are averaged. Raises InputError if the times of the series do not
+    increase.
+    """
     assert member.clock is not None
     times, member_start = member.clock.read()
     if member_start is not None and start is not None:
@@ -434,7 +459,10 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
 
 
 def _average(values: Array, times: Array, t: Array, step: float) -> Array:
-    """Average `values` (m,) at `times` (m,) over intervals of length `step` centred at `t` (n,); NaN in empty ones."""
+    """Average `values` (m,) at `times` (m,) over intervals of length `step` [s] centred at `t` (n,).
+
+    The result is NaN for an interval without values.
+    """
     begin, end = np.searchsorted(times, t - 0.5 * step), np.searchsorted(times, t + 0.5 * step)
     total = np.concatenate(([0.0], np.cumsum(values)))
     with np.errstate(invalid="ignore"):
@@ -442,7 +470,10 @@ def _average(values: Array, times: Array, t: Array, step: float) -> Array:
 
 
 def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
-    """Find the columns of a long table, "name", "value", "unit" or "valid" -> column; None for other tables."""
+    """Find the columns of a long table, in which each row has one sample of one channel; None for other tables.
+
+    Returns a mapping from their meanings, "name", "value" and, if they exist, "unit" and "valid", to the columns.
+    """
     names = [label.name.strip().casefold() for label in labels]
     columns_of_kind = {
         kind: [column for column, name in enumerate(names) if name in words] for kind, words in WORDS["long"].items()
@@ -455,10 +486,10 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 
 @dataclass(frozen=True)
 class _LongTable:
-    """The rows of a long table, in which each row is one value of a named channel.
+    """A long table, in which each row is one sample of a named channel.
 
-    `columns`: column -> cells (n,); `value`, `time`: columns of the values and times. The rows of each name are read as
-    a recording with the single channel `u` in counts.
+    `choice`, `request`: meaning of the columns; `columns`: column -> cells (n,); `value`, `time`: the columns of the
+    samples and their times. The rows of each name are read as a recording with the single channel `u` in counts.
     """
 
     choice: ColumnMap
@@ -468,16 +499,19 @@ class _LongTable:
     time: int
 
     def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
-        """Make the series of one channel of a long table from its rows (k,), which are read when they are needed.
+        """Make the series of one channel from its rows, which are read when they are needed.
 
-        `number`: of the channel, the key of its clock.
+        `number`: number of the channel, the key of its clock; `rows` (k,): indices of its rows.
         """
         read_rows = cache(partial(self._read_rows, label, rows))
         clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
         return Series("", label, rows.size, lambda: read_rows().channels["u"], clock)
 
     def _read_rows(self, label: Label, rows: NDArray[np.intp]) -> RecordingFields:
-        """Convert the rows (k,) that have a time to a recording; raise InputError if too many values are words."""
+        """Convert those of the rows that have a time to a recording; raise InputError if too many samples are words.
+
+        `rows` (k,): indices of the rows of one channel.
+        """
         times = self.columns[self.time][rows]
         timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
         columns = {column: cells[timed_rows] for column, cells in self.columns.items()}
@@ -488,7 +522,10 @@ class _LongTable:
         return convert_columns(self.choice, columns, "", self.request)
 
     def _read_clock(self, fields: RecordingFields, rows: NDArray[np.intp]) -> tuple[Array, np.datetime64 | None]:
-        """Return the times (n,) [s] of the rows' recording and the time stamp of 0 s."""
+        """Return the times (n,) [s] of one channel's recording, and the time stamp of 0 s, None if it is not known.
+
+        `fields`: the recording; `rows` (k,): indices of its rows in the table.
+        """
         start, times = fields.provenance, self.columns[self.time][rows]
         if "start_epoch_s" in start:
             return fields.t, np.datetime64(round(start["start_epoch_s"] * 1e9), "ns")
@@ -503,7 +540,8 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each name in a long table; also return lines for the history.
 
-    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
+    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`. Samples that the file calls
+    invalid become NaN.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -547,7 +585,7 @@ def _pivot_long_table(
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
     """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
 
-    `file_size`: size of the file [bytes]; None: not checked.
+    `file_size`: size of the file [bytes]; with None only the number of values is checked.
     """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(
@@ -570,7 +608,10 @@ def check_texts(count: int, width: int, name: str) -> None:
 
 
 def make_description(rate: float, provenance: Mapping[str, Any], history: Sequence[str]) -> dict[str, Any]:
-    """Return rate, provenance and history as JSON values; raise InputError for values that JSON does not have."""
+    """Collect rate, provenance and history of a recording as JSON values.
+
+    Raises InputError for a value that JSON does not have.
+    """
     description = {"format": FORMAT_VERSION, "rate": rate, "provenance": dict(provenance), "history": list(history)}
     try:
         return json.loads(json.dumps(description, default=_convert_numpy))  # type: ignore[no-any-return]
@@ -579,14 +620,17 @@ def make_description(rate: float, provenance: Mapping[str, Any], history: Sequen
 
 
 def _convert_numpy(value: Any) -> Any:
-    """Convert numpy values to JSON values; raise TypeError for others."""
+    """Convert a numpy number or array to a JSON value; raise TypeError for other values."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"got a {type(value).__name__}")
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Parse a description made by `make_description`, JSON or its values; raise InputError if it is damaged."""
+    """Parse the description of a recording from `make_description`, given as a JSON text or as its values.
+
+    Raises InputError if it is damaged, or was written by a newer version.
+    """
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])

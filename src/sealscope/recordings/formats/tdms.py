@@ -20,7 +20,10 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
 def read_tdms(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of a TDMS file; those with a waveform interval (``wf_increment``) have a clock."""
+    """Read the requested channels of a TDMS file to the fields of a recording.
+
+    Channels that state a waveform interval (``wf_increment``) have a clock. Raises MissingExtra without npTDMS.
+    """
     nptdms = import_library("nptdms", "TDMS", "npTDMS")
     # no warnings on a truncated last segment
     import_library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)
@@ -43,7 +46,7 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
 
 
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
-    """Make the clock of a channel from its waveform properties; None if they have no interval."""
+    """Make the clock of a channel of `count` samples from its waveform properties; None if they state no interval."""
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:
         return None

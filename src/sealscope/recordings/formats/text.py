@@ -1,7 +1,7 @@
-"""Text logs: CSV written by Sealscope, and logs of other programs.
+"""Text logs: CSV files written by Sealscope, and logs of other programs.
 
-A log is read in blocks of complete lines. Blocks of plain numbers are read by pyarrow if it is installed, others row by
-row.
+A log is read in blocks of complete lines. Blocks with numbers alone are read by pyarrow if it is installed, others
+row by row.
 """
 
 from __future__ import annotations
@@ -88,15 +88,16 @@ _NUMBER_SUFFIX = re.compile(r"[\s._(-]{0,4}\d{1,4}\b.{0,60}")
 
 
 def read_text(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a text log."""
+    """Read the requested columns of a text log to the fields of a recording."""
     return next(read_text_parts(path, request, inf))
 
 
 def read_text_parts(path: Path, request: Request, every: float) -> Iterator[RecordingFields]:
-    """Yield the requested columns of a text log in parts of `every` [s], in bounded memory.
+    """Yield a text log in parts of `every` [s], each as the fields of a recording, in bounded memory.
 
-    All parts have as many rows as `every` has at the rate of the first block. Logs with a time for each channel, logs
-    that begin with the last sample, and long tables are one part.
+    All parts have equally many rows, as many as `every` lasts at the sampling rate of the first block; the last may
+    have fewer. A log is a single part if it has a time column for each channel, if it begins with the last sample, or
+    if it is a long table.
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -116,7 +117,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     log = _Log(path, layout, choice.columns, choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert the rows of some blocks to the fields of a recording."""
+        """Convert the rows of some blocks to the fields of a recording; `more_notes`: lines for its history."""
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
@@ -139,7 +140,10 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log with several `time_columns`, each before its channels, or a long table if there are none."""
+    """Read a log with several time columns, each of them before its channels, or a long table.
+
+    `time_columns`: numbers of the time columns, empty for a long table.
+    """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
     time_of_column = {
@@ -147,7 +151,10 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
     }
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-        """Read the requested columns and their times; `kinds`: index in `columns` -> kind."""
+        """Read the requested columns and their times, and return lines for the history.
+
+        `kinds`: index in `columns` -> kind; `date`: column of the date, or None.
+        """
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
         log = _Log(path, layout, kinds_by_column | time_kinds, None if time_columns else date)
@@ -157,7 +164,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         return [*layout.notes, *notes, *log.describe_text_lines(), *notes_on_times]
 
     def make_series(column: int, clock: Clock | None = None) -> Series:
-        """Make the series of a column that `prepare` reads; its length is not known before."""
+        """Make the series of a column that `prepare` reads later; its length is not known before, and set to 0."""
         return Series("", layout.labels[column], 0, partial(cells_by_column.__getitem__, column), clock)
 
     start = scope_start(layout.remarks)
@@ -167,7 +174,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 
 
 def _find_channel_times(labels: Sequence[Label]) -> list[int]:
-    """Find the time columns of a log in which each is followed by its channels; empty for other logs."""
+    """Find the time columns of a log in which each time column precedes its channels; empty for other logs."""
     # the time columns differ only in a number at the end of their names
     names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]
     if names.count(names[0]) < 2 or not is_time(labels[0]):
@@ -179,7 +186,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup blocks to groups of `size` rows; the last group may be shorter."""
+    """Regroup blocks of rows into lists with `size` rows each; the last list may have fewer rows."""
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -195,7 +202,7 @@ def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block
 
 
 def read_layout(path: Path) -> Layout:
-    """Detect the layout of a text log from its beginning; raise InputError if it is no text log."""
+    """Detect the layout of a text log from its beginning; raise InputError if the file is no text log."""
     with path.open("rb") as file:
         head = file.read(SNIFF)
         encoding = detect_encoding(head)
@@ -210,10 +217,10 @@ def read_layout(path: Path) -> Layout:
 
 @dataclass
 class _Block:
-    """Rows of a log.
+    """Consecutive rows of a log.
 
-    `columns`: values (n,) by column; `word_rows`: column -> rows with a word in place of a number; `first_words`:
-    column -> the first of these words with its place.
+    `columns`: column -> values (n,); `word_rows`: column -> indices of the rows with a word in place of a number;
+    `first_words`: column -> the first of these words with its place, for messages.
     """
 
     columns: dict[int, NDArray[Any]] = field(default_factory=dict)
@@ -224,7 +231,7 @@ class _Block:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return the rows of a slice as a block."""
+        """Return a block with the rows of a slice."""
         first, stop, _ = rows.indices(len(self))
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
@@ -235,14 +242,16 @@ class _Block:
 class _Log:
     """Reader of the rows of a text log, block by block.
 
-    `kinds`: column -> kind, and `date`: column of the date or None, as for `table.Prepare`; `min_cells`: cells that a
-    row needs; `n_rows`, `n_repeated`, `n_text_lines`: rows, repeated heading lines and lines of text read until now;
-    `has_stamps`, `has_date`: kind of the time column, None until its first cell; `n_words`: number of words by column;
-    `last_width`: number of cells in the last row; `null_values`: texts that pyarrow reads as missing.
+    Of its attributes `kinds` is a mapping from the columns to read to their kinds, and `date` the column of the date
+    or None, as for `table.Prepare`. `min_cells`: number of cells that a row needs; `n_rows`, `n_repeated`,
+    `n_text_lines`: numbers of rows, repeated heading lines and lines of text that were read until now; `has_stamps`,
+    `has_date`: whether the time column contains stamps, and whether a date column completes them, not known before
+    its first cell; `n_words`: number of words by column; `last_width`: number of cells in the last row;
+    `null_values`: texts that pyarrow reads as missing.
     """
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
-        """Begin without rows; decide whether pyarrow can read this layout."""
+        """Set up the reader without reading rows, and decide whether pyarrow can read this layout."""
         self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
         self.min_cells = max(kinds) + 1
         self.n_rows = self.n_repeated = self.n_text_lines = 0
@@ -260,11 +269,14 @@ class _Log:
         self.null_values, self.last_width = ["", "NaN"], 0
 
     def iter_blocks(self) -> Iterator[_Block]:
-        """Yield the rows in blocks, in order, read by pyarrow where it can read them, else row by row."""
+        """Yield the rows in blocks, in order.
+
+        A block is read by pyarrow if that is possible, else row by row.
+        """
         is_first = True
 
         def n_bytes() -> int:
-            """Return the number of bytes to read next."""
+            """Compute the number of bytes to read next."""
             return _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1)
 
         with self.path.open("rb") as file:
@@ -281,7 +293,10 @@ class _Log:
                     yield block
 
     def _split_rows(self, first_line: int, block: bytes, is_cut: bool) -> tuple[list[list[str]], Sequence[int]]:
-        """Split a block from line `first_line` on into the cells of its samples; also return their line numbers."""
+        """Split a block of bytes into rows of cells; also return the line number of each row.
+
+        `first_line`: number of the block's first line; `is_cut`: the file ends within its last line.
+        """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
         if self.layout.prefixed:
@@ -297,12 +312,16 @@ class _Log:
         return self._remove_text_rows(rows, line_numbers)
 
     def _count_rows(self, n_rows: int) -> None:
-        """Add to the number of rows; raise InputError if the columns then have too many values."""
+        """Count `n_rows` more rows; raise InputError if the columns then have too many values."""
         self.n_rows += n_rows
         check_size(self.n_rows, len(self.kinds))
 
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
-        """Read a block from line `first_line` up to byte `end` by pyarrow; None unless all rows are plain numbers."""
+        """Read the rows of a block by pyarrow; None unless all of them are plain numbers that it can read.
+
+        `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete
+        line.
+        """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
         layout, start = self.layout, 0
@@ -342,7 +361,10 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the indices of the lines from `first` on that are not comments, blank or repeated headings."""
+        """List the indices of the lines with samples, from index `first` on.
+
+        Comments, blank lines and repeated headings are left out.
+        """
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
@@ -353,7 +375,11 @@ class _Log:
         return rows
 
     def _split_lines(self, lines: list[str], line_numbers: Sequence[int], is_cut: bool) -> list[list[str]]:
-        """Split lines into cells; a quotation mark must close on its line, except on a last line that is cut."""
+        """Split lines into cells.
+
+        A quotation mark must be closed on its line, unless it is the last line and `is_cut`; raises InputError
+        otherwise.
+        """
         delimiter = self.layout.delimiter
         if delimiter == " ":
             return [split_at_blanks(line) for line in lines]
@@ -375,9 +401,10 @@ class _Log:
     def _remove_text_rows(
         self, rows: list[list[str]], line_numbers: Sequence[int]
     ) -> tuple[list[list[str]], Sequence[int]]:
-        """Remove and count short rows of text; return the others and their line numbers.
+        """Remove short rows of text, such as the mark of an event, and count them.
 
-        Raises InputError for other rows with too few or too many cells.
+        Returns the other rows and their line numbers. Raises InputError for other rows with too few or too many
+        cells.
         """
         layout, max_cells, complete = self.layout, len(self.layout.labels), []
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:
@@ -401,7 +428,10 @@ class _Log:
         return [rows[i] for i in complete], [line_numbers[i] for i in complete]
 
     def _parse_rows(self, rows: Sequence[Sequence[str]], lines: Sequence[int], is_cut: bool) -> _Block:
-        """Parse rows of cells to a block; `lines`: their line numbers; `is_cut`: the last row is incomplete."""
+        """Parse rows of cells to a block of values.
+
+        `lines`: number of the line of each row; `is_cut`: the last row is incomplete.
+        """
         block = _Block()
         for column, kind in self.kinds.items():
             cells = [row[column] for row in rows]
@@ -426,9 +456,10 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Decide from its first cell whether the time column contains stamps.
+        """Test whether the time column contains stamps, as its first cell in the log shows.
 
-        Also finds out whether a date column completes these stamps (`has_date`).
+        `cells`: cells of the time column in `rows`. Also finds out whether a date column completes these stamps
+        (`has_date`).
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
@@ -440,7 +471,7 @@ class _Log:
         return bool(self.has_stamps)
 
     def _join_dates(self, rows: Sequence[Sequence[str]], column: int) -> list[str]:
-        """Return the cells of a column of stamps, prefixed by the date of the date column for times of day."""
+        """Return the cells of the time column `column`, each after the date in the date column if there is one."""
         if not self.has_date or self.date is None:
             return [row[column] for row in rows]
         days = [row[self.date].strip() if self.date < len(row) else "" for row in rows]
@@ -448,11 +479,18 @@ class _Log:
         return [f"{day} {time}" if day and time else "" for day, time in zip(days, times, strict=True)]
 
     def _format_place(self, index: int, lines: Sequence[int], column: int) -> str:
-        """Format the line, column and file of a cell for messages."""
+        """Format the line, column and file of a cell for messages.
+
+        `index`: row of the cell in its block; `lines`: line numbers of the block's rows.
+        """
         return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
     def _parse_dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
-        """Parse cells to datetime64 (n,), NaT for missing ones and words; also return the indices of words."""
+        """Parse cells to datetime64 (n,), NaT for missing ones and words; also return the indices of the words.
+
+        `where`: function from the index of a cell to its place. Raises InputError for a cell with digits that is no
+        stamp.
+        """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
             self.day_first = self._is_day_first()
@@ -472,7 +510,10 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
     def _is_day_first(self) -> bool:
-        """Decide whether the day is before the month in the log's dates, read up to the first unambiguous one."""
+        """Decide whether the day precedes the month in the dates of the log, such as 05/06/2024.
+
+        The log is read up to the first date that tells.
+        """
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
@@ -489,9 +530,9 @@ class _Log:
         return order
 
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-        """Join the columns of blocks, removing them there to save memory; also return lines for the history.
+        """Join blocks to whole columns, column -> values (n,); also return lines for the history.
 
-        Raises InputError if too many cells are words.
+        The columns are removed from the blocks to save memory. Raises InputError if too many cells are words.
         """
         labels, notes, columns = self.layout.labels, list[str](), dict[int, NDArray[Any]]()
         starts = [0, *accumulate(map(len, blocks))]
@@ -527,7 +568,10 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe text lines and repeated headings for the history; raise InputError for too many text lines."""
+        """Describe the lines of text and the repeated headings that were left out, for the history.
+
+        Raises InputError if there are too many lines of text.
+        """
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         lines = format_count(self.n_text_lines, "line")
@@ -539,10 +583,11 @@ class _Log:
 def _iter_line_blocks(
     file: BinaryIO, encoding: str, place: str, n_bytes: Callable[[], int]
 ) -> Iterator[tuple[int, bytes, int, bool]]:
-    """Yield a file in blocks as (number of the first line, bytes, end, is_cut).
+    """Yield a file in blocks: (number of the first line, bytes, end, is_cut).
 
     The bytes before `end` are complete lines; those after it come again in the next block. `is_cut`: the file ends
-    within the block's last line. `place`: path of the file, for errors; `n_bytes`: returns how many bytes to read next.
+    within the block's last line. `place`: path of the file for messages; `n_bytes`: function that returns how many
+    bytes to read next.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
@@ -570,7 +615,10 @@ def _iter_line_blocks(
 
 
 def _last_newline(block: bytes, newline: bytes) -> int:
-    """Find the last newline, in UTF-16 at a whole number of characters; -1 if there is none."""
+    """Find the index of the last newline in a block of bytes; -1 if there is none.
+
+    In UTF-16 the index is a multiple of a character's two bytes.
+    """
     end = block.rfind(newline)
     while end >= 0 and end % len(newline):
         end = block.rfind(newline, 0, end + 1)
@@ -578,7 +626,7 @@ def _last_newline(block: bytes, newline: bytes) -> int:
 
 
 def _decode_lines(block: bytes, layout: Layout) -> list[str]:
-    """Decode a block and split it into lines."""
+    """Decode a block of bytes and split it into lines, without their ends."""
     text = block.decode(layout.encoding, errors="replace").lstrip("\ufeff")
     if "\r" in text:
         text = text.replace("\r\n", "\n").replace("\r", "\n")
@@ -588,7 +636,10 @@ def _decode_lines(block: bytes, layout: Layout) -> list[str]:
 def write_text(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any], delimiter: str
 ) -> None:
-    """Write `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss."""
+    """Write a text log: `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss.
+
+    Arguments as from `Recording.series`. Raises InputError for an infinite sample.
+    """
     for name, series in values.items():
         if np.isinf(series).any():
             channel = name if name == "t" else f"channel {name}"
@@ -603,7 +654,10 @@ def write_text(
 
 
 def _arrow_values(cells: Any) -> Array:
-    """Return the values (n,) of a pyarrow ChunkedArray of doubles, NaN for null; its own `to_numpy` loads pandas."""
+    """Convert a pyarrow ChunkedArray of doubles to an array (n,), NaN for null.
+
+    Its own `to_numpy` would load pandas.
+    """
     parts = []
     for chunk in cells.chunks:
         validity, values = chunk.buffers()

@@ -1,4 +1,4 @@
-"""Detect the layout of a text log: encoding, delimiter, decimal separator, header, units, first row of samples."""
+"""Detect the layout of a text log: encoding, delimiter, decimal separator, heading, units, first row of samples."""
 
 from __future__ import annotations
 
@@ -53,10 +53,12 @@ _DELIMITER_NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " "
 class Layout:
     """The layout of a text log.
 
-    `delimiter`: a blank stands for any white space; `decimal`: separator; `first_row`: index of the first line of
-    samples; `description`: JSON written by Sealscope, or None; `remarks`: entries above the heading; `lines_above`:
-    lines above the first row, which some loggers repeat among the samples; `rate`: stated in them [Hz]; `cell_units`:
-    column -> unit after each of its numbers; `prefixed`: numbers end in prefixes of powers of ten.
+    `delimiter`: separator of cells, where a blank stands for any white space; `decimal`: decimal separator; `labels`:
+    headings of the columns; `first_row`: index of the first line of samples; `description`: JSON written by
+    Sealscope, or None; `notes`: lines for the history; `remarks`: entries above the heading, name -> text;
+    `lines_above`: lines above the first row, which some loggers repeat among the samples; `rate`: sampling rate
+    stated in them [Hz], or None; `cell_units`: column -> unit after each of its numbers; `prefixed`: numbers end in
+    SI prefixes.
     """
 
     encoding: str
@@ -80,7 +82,7 @@ class Layout:
 
 
 def detect_encoding(head: bytes) -> str | None:
-    """Detect the encoding of a text from its first bytes; None if they are not text."""
+    """Detect the encoding of a text from the first bytes of its file; None if they are no text."""
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
         (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -125,7 +127,7 @@ def split_cells(line: str, delimiter: str) -> list[str]:
 
 
 def _used_width(row: Sequence[str]) -> int:
-    """Count the cells up to the last one that is not empty."""
+    """Count the cells of a row up to the last one that is not empty."""
     width = len(row)
     while width and not row[width - 1].strip():
         width -= 1
@@ -133,7 +135,10 @@ def _used_width(row: Sequence[str]) -> int:
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Choose the delimiter, decimal separator and row width with which most cells of the lines `body` are values."""
+    """Detect the dialect of a log, (delimiter, decimal separator, number of cells in a row), from some of its lines.
+
+    In this dialect the largest fraction of the cells are numbers or time stamps.
+    """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
     for delimiter, decimal in _DIALECTS:
@@ -155,10 +160,10 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 
 
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
-    """Split a heading into names.
+    """Split a heading line into the names of columns.
 
-    If the delimiter is a blank, a unit in brackets stays with its name; names may contain single blanks if wider spaces
-    separate exactly `width` names.
+    If the delimiter is a blank, a unit in brackets stays with its name. Names may then contain single blanks, if
+    wider spaces separate exactly `width` names.
     """
     if delimiter == " ":
         words = _SPACED_LABEL.findall(line)
@@ -168,7 +173,10 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
-    """Parse a row of units; None for any other row. At least 60 % of its cells must be known units."""
+    """Parse a row of units: the unit of each cell, None for an empty one.
+
+    At least 60 % of its cells must be known units; None for any other row.
+    """
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
     n_known = sum(unit is not None and is_unit(unit) for unit in units)
@@ -178,10 +186,13 @@ def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
 def _parse_heading(
     lines: Sequence[str], first_row: int, delimiter: str, width: int, decimal: str
 ) -> tuple[list[Label], int]:
-    """Parse the heading above the line `first_row` of samples; return (labels, number of its lines)."""
+    """Parse the heading above the line `first_row` of samples; return (labels, number of heading lines).
+
+    `width`: number of cells in a row of samples.
+    """
 
     def split_names(line: str) -> list[str] | None:
-        """Split a line into names; None if it has another number of cells or only values."""
+        """Split a line into names; None if its number of cells does not fit the samples, or all are values."""
         cells = _split_heading(line, delimiter, width)
         if cells and not cells[-1]:  # drop empty cells beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]
@@ -216,7 +227,10 @@ def _parse_heading(
 
 
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Parse heading rows, lowest first, that begin with `Name` and `Unit`; return (labels, number of rows) or None."""
+    """Parse heading rows that begin with keys such as `Name` and `Unit`; return (labels, number of rows).
+
+    `rows`: cells of the rows, from the lowest up. None if there are no such keys.
+    """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     heading = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
     unit = next((i for i, key in enumerate(keys) if key in WORDS["row"]["unit"]), None)
@@ -230,7 +244,10 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows, lowest first, of rulers, names, units and groups; return (labels, number of rows)."""
+    """Parse heading rows of names, and possibly of units, groups and rulers; return (labels, number of rows).
+
+    `rows`: cells of the rows, from the lowest up.
+    """
     n_skipped = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
     row, *rows_above = rows[n_skipped:]
     names, n_rows = list(row), n_skipped + 1
@@ -261,7 +278,10 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
 
 
 def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
-    """Parse the row of units of Graphtec loggers, `NO.,Time,ms,V,...`; None for any other row."""
+    """Parse the row of units of Graphtec loggers, `NO.,Time,ms,V,...`: the unit of each cell or None.
+
+    None for any other row.
+    """
     cells = [cell.strip() for cell in row]
     if [cell.casefold() for cell in cells[:3]] != ["no.", "time", "ms"]:
         return None
@@ -269,16 +289,17 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Test whether a row is a ruler such as `----`, or repeats one text other than a unit in all cells."""
+    """Test whether a row is a ruler such as `----`, or repeats one text that is no unit in all cells."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)
 
 
 def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) -> Layout:
-    """Detect the layout of a log from its beginning `head`; `is_complete`: `head` is the whole log.
+    """Detect the layout of a log from its beginning `head` in the given encoding.
 
-    Raises InputError for a text without rows of numbers.
+    `place`: the file in messages; `is_complete`: `head` is the whole log. Raises InputError for a text without rows
+    of numbers.
     """
     text = head.decode(encoding, errors="replace").lstrip("\ufeff")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
@@ -330,7 +351,10 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
 
 
 def _no_rows_error(line: str, delimiter: str | None) -> InputError:
-    """Make the error for a text without rows of numbers, whose first line is `line`."""
+    """Make the InputError for a text without rows of numbers.
+
+    `line`: its first line; `delimiter`: the delimiter, or None if it is not known.
+    """
     kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
     if kind is not None:
         return InputError(f"a recording must be a table, got {kind}: export it as CSV")
@@ -345,7 +369,10 @@ def _is_content(line: str) -> bool:
 
 
 def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, decimal: str, width: int) -> int | None:
-    """Find the index of the first line with samples in over half of the numeric columns of `body`; None if none has."""
+    """Find the index of the first line with samples in over half of the numeric columns; None if there is none.
+
+    `body`: lines of samples that show which columns are numeric; `width`: number of cells in a row.
+    """
     rows = [row for row in (split_cells(line, delimiter) for line in body) if len(row) == width]
     is_value_cell = [[is_value(cell, decimal) for cell in row] for row in rows]
     max_values = max(map(sum, is_value_cell), default=0)
@@ -372,21 +399,24 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
 
 
 def _has_prefixes(body: Sequence[str]) -> bool:
-    """Test whether the numbers of a log end in SI prefixes, with any delimiter."""
+    """Test whether the numbers in lines of a log end in SI prefixes, with any of the usual delimiters."""
     return any(map(_QUANTITY.search, body)) and any(
         has_prefixes([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"
     )
 
 
 def _expand_sample_prefixes(line: str) -> str:
-    """Expand the prefixes of the numbers in a line if most of its cells are numbers."""
+    """Expand the SI prefixes of the numbers in a line if most of its cells are numbers; other lines stay."""
     expanded = expand_prefixes(line)
     cells = re.split(r"[;,|\t]", expanded)
     return expanded if 2 * sum(is_value(cell, ".") for cell in cells) > len(cells) else line
 
 
 def _find_units(body: Sequence[str]) -> dict[int, str]:
-    """Find the units after numbers in cells, column -> unit, with the delimiter that gives the most columns."""
+    """Find the units after the numbers in the cells of lines: column -> unit.
+
+    The delimiter is the one with which most columns have a unit.
+    """
     if not any(map(_QUANTITY.search, body)):
         return {}
     return max((find_cell_units([split_cells(line, delimiter) for line in body]) for delimiter in "\t;|,"), key=len)

@@ -1,4 +1,7 @@
-"""Convert a time column to seconds and a sampling rate: numbers in any unit, seconds since an epoch, date stamps."""
+"""Convert a time column to seconds and a sampling rate: numbers in any unit, seconds since an epoch, date stamps.
+
+A stamp is the text of a date, a time of day or both.
+"""
 
 from __future__ import annotations
 
@@ -71,11 +74,10 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 @dataclass
 class TimeState:
-    """The state of a log's time column between two parts of the log.
+    """State of a log's time column between two parts of the log; None where a value is not known.
 
     `head`: first times of a column without a unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of coarse times
-    that several samples share; `last_time`: the last time as in the file; `last_seconds`: the same in seconds. None:
-    not known.
+    that several samples share; `last_time`: last time as in the file; `last_seconds`: the same in seconds.
     """
 
     head: Array | None = None
@@ -86,7 +88,10 @@ class TimeState:
 
 
 def _parse_stamp(text: str) -> dict[str, str | None] | None:
-    """Parse a stamp to its parts by name (`year`, `clock`, ...), unused ones None; None for any other text."""
+    """Parse a date stamp or time of day to its parts by name (`year`, `clock`, ...); None for any other text.
+
+    Parts that the stamp lacks are None.
+    """
     text = text.strip()
     if len(text) > _MAX_STAMP or (_BARE_NUMBER.fullmatch(text) and len(text) != len("20240531")):
         return None
@@ -110,8 +115,8 @@ def is_stamp(text: str) -> bool:
 def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray[np.datetime64]:
     """Parse stamps (ISO, day.month.year, month/day/year) and times of day to datetime64[ns], NaT for empty cells.
 
-    `day_first`: order of dates such as 05/06/2024 and 05-06-2024, by default decided from these cells
-    (`is_day_first`). Raises ValueError with the index of the first cell that is no stamp.
+    `day_first`: True if the day precedes the month in dates such as 05/06/2024 and 05-06-2024; by default decided
+    from these cells (`is_day_first`). Raises ValueError with the index of the first cell that is no stamp.
     """
     if day_first is None:
         day_first = is_day_first([ambiguous_dates(cells)])
@@ -134,24 +139,28 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Collect the dates in which the day may precede the month or follow it, each once, in order."""
+    """Collect the dates in which either the day or the month may come first, such as 05/06/2024, each once, in order.
+
+    The result is a dict without values, whose keys are the dates.
+    """
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide from the first date with a number over 12 whether the day precedes the month.
+    """Decide whether the day precedes the month, from the first date with a day or month over 12.
 
-    None without such a date.
+    None if there is no such date.
     """
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((first for first, second in over_12 if first != second), None)
 
 
 def is_day_first(columns: Collection[Iterable[str]]) -> bool:
-    """Decide whether the day is before the month in the `ambiguous_dates` of columns in the same format.
+    """Decide whether the day precedes the month in dates such as 05/06/2024.
 
-    Criteria in order: a number over 12 (`explicit_order`), the order in which no column goes back, the order with the
-    shorter time span; else the day is first with hyphens, and the month with slashes.
+    `columns`: the `ambiguous_dates` of columns with the same format. Criteria in order: a number over 12
+    (`explicit_order`); the order in which no column goes back in time; the order with the shorter time span.
+    Otherwise the day comes first with hyphens, the month with slashes.
     """
     known_order = next((order for order in map(explicit_order, columns) if order is not None), None)
     if known_order is not None:
@@ -167,7 +176,7 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
-    """Return the ordinal (`date.toordinal`) of an ambiguous date read in this order; 0 if there is no such date."""
+    """Compute the day number (`date.toordinal`) of an ambiguous date in the given order; 0 if that is no date."""
     first, second, year = _date_numbers(text)
     try:
         return date(year, *((second, first) if day_first else (first, second))).toordinal()
@@ -176,13 +185,13 @@ def _ordinal_day(text: str, day_first: bool) -> int:
 
 
 def _date_numbers(text: str) -> tuple[int, int, int]:
-    """Split an ambiguous date into its first and second number and the year."""
+    """Split an ambiguous date into its first number, its second number and its year."""
     first, second, year = re.split("[/-]", text)
     return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
 
 
 def _is_datetime(text: str) -> bool:
-    """Test whether numpy can convert an ISO stamp."""
+    """Test whether a text in ISO form is a valid datetime64, which the 30th of February is not."""
     try:
         np.datetime64(text, "ns")
     except ValueError:
@@ -191,7 +200,7 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock reading [s] counts from 1970, not from the start of a machine."""
+    """Test whether a clock reading [s] counts from 1970, rather than from the start of a machine."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -202,14 +211,14 @@ def iso_moment(moment: np.datetime64) -> str:
 
 
 def clock_text(clock: float) -> str:
-    """Format a clock reading [s]: date and time in UTC if it counts from 1970, else seconds."""
+    """Format a clock reading [s] as date and time in UTC if it counts from 1970, else as seconds."""
     if not counts_from_1970(clock):
         return f"{clock:.0f} s"
     return str(np.datetime64(round(clock), "s")).replace("T", " ") + " UTC"
 
 
 def parse_epoch(stamp: str) -> float | None:
-    """Parse an ISO stamp to seconds since 1970, to a millisecond; None if it is none."""
+    """Parse a stamp in ISO form to seconds since 1970, to a millisecond; None if the text is no stamp."""
     try:
         moment = np.datetime64(stamp, "ms")
     except ValueError:
@@ -218,7 +227,10 @@ def parse_epoch(stamp: str) -> float | None:
 
 
 def _format_clock(text: str) -> str:
-    """Rewrite a time of day as `hour:minute:second.fraction`; `59:59.9` has no hour, `12:00:00:250` four parts."""
+    """Rewrite a time of day as `hour:minute:second.fraction`.
+
+    `59:59.9` has no hour; the last part of `12:00:00:250` is the fraction.
+    """
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -228,7 +240,7 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date of a stamp in ISO form; 1970-01-01 for a time of day without one."""
+    """Format the date of a stamp, given by its parts, in ISO form; 1970-01-01 for a time of day without a date."""
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -239,10 +251,10 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
 
 
 def nominal_rate(t: Array) -> float:
-    """Estimate the sampling rate [Hz] of times `t` (n,): the shortest decimal that agrees with them.
+    """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
-    Uses the mean interval if the times are uniform, else the median interval. Raises InputError if no interval is
-    positive.
+    It is the shortest decimal number that agrees with them, computed from the mean interval if the times are uniform,
+    else from the median interval. Raises InputError if no interval is positive.
     """
     steps = np.diff(t)
     span = float(t[-1] - t[0])
@@ -258,20 +270,22 @@ def nominal_rate(t: Array) -> float:
 
 
 def _shortest_decimal(value: float, slack: float) -> float:
-    """Return the decimal with the fewest digits that differs from a value by at most the fraction `slack`."""
+    """Find the decimal number with the fewest digits that differs from `value` by at most the fraction `slack`."""
     decimals = (float(f"{value:.{digits}g}") for digits in range(1, 16))
     return next((decimal for decimal in decimals if abs(decimal / value - 1.0) <= slack), value)
 
 
 def is_falling(times: NDArray[Any]) -> bool:
-    """Test whether all times (n,) decrease, as in logs that begin with the last sample."""
+    """Test whether times (n,) decrease from each sample to the next, as in logs that begin with the last sample."""
     return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
 
 
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
-    """Convert stamps (n,) to seconds from the first; times of day without a date continue from part to part.
+    """Convert date stamps (n,) to seconds from the first of them.
 
-    Jumps back at midnight or at the full hour, and those of daylight saving time, are removed.
+    Also returns the provenance of the start and lines for the history. Times of day without a date continue from part
+    to part of a log. Jumps back at midnight or at the full hour, and those of daylight saving time, are removed.
+    `name`: the column in messages. Raises InputError if no row has a stamp.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -301,7 +315,10 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 
 
 def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
-    """Remove clock jumps of `step` [s] from times (n,); None if there is none, or if there are several and `single`."""
+    """Remove clock jumps of `step` [s], such as -86400 s at midnight, from times (n,).
+
+    None if there is no jump, or if there are several although `single` permits only one.
+    """
     steps = np.diff(t)
     positive_steps = steps[np.isfinite(steps) & (steps > 0)]
     if not positive_steps.size:
@@ -315,7 +332,11 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 
 
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
-    """Convert numbers (n,) to seconds, by their unit or, without one, by their magnitude."""
+    """Convert a time column of numbers (n,) to seconds.
+
+    Also returns the provenance of the start and lines for the history. `unit`: unit of the column; without one the
+    magnitude of the numbers decides. `name`: the column in messages. Raises InputError if no row has a number.
+    """
     finite = values[np.isfinite(values)]
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
@@ -338,9 +359,10 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 
 
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
-    """Convert numbers (n,) without a unit to seconds.
+    """Convert a time column of numbers (n,) without a unit to seconds.
 
-    The size and the steps of the `finite` numbers show if they are days or seconds.
+    Also returns the provenance of the start and lines for the history. The size and the steps of the `finite` numbers
+    show whether they are days or seconds, and since when. Raises InputError if they count rows.
     """
     first, is_first_part = float(finite[0]), state.head is None
     state.head = head = finite if state.head is None else state.head
@@ -368,10 +390,10 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Detect numbers (n,) that count days.
+    """Detect whether numbers (n,) without a unit count days; return (origin, meaning in words), or None for seconds.
 
-    Returns (origin, meaning in words), or None if they count seconds. They count days if, taken as seconds, their steps
-    are shorter than any logger's. The origin is None for fractions of a day.
+    They count days if their steps, taken as seconds, would be shorter than those of any logger. The origin is None
+    for fractions of a day.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -391,12 +413,13 @@ def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
 def time_base(
     values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, state: TimeState | None = None
 ) -> tuple[Array, float, dict[str, Any], list[str]]:
-    """Convert a time column's `values` (n,), numbers in `unit` or datetime64, to seconds and a rate.
+    """Convert the values (n,) of a time column, numbers in `unit` or datetime64, to seconds and a sampling rate.
 
-    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps and epoch
-    times are relative to their first sample; other times stay as they are. The file's `stated_rate` [Hz] spaces samples
-    that share stamps. `state`: after the previous part, which the values may continue; it is updated. Raises InputError
-    for a column that is empty, counts rows, does not increase or has no unit of time.
+    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps and
+    epoch times become relative to their first sample; other times stay as they are. `name`: the column in messages;
+    `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced; `state`: state after the
+    previous part of the log, which the values continue; it is updated. Raises InputError for a column that is empty,
+    counts rows, does not increase or has no unit of time.
     """
     state = TimeState() if state is None else state
     if values.dtype.kind == "M":
@@ -419,10 +442,10 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Spread samples that share a coarse time evenly.
+    """Spread samples that share a coarse time evenly over its step.
 
-    Returns (resolution [s], new times (n,)), or None if none do. A part that is too short to estimate the resolution
-    uses that of `state`, and its rate, unless it has a gap.
+    `t` (n,): times [s]. Returns (resolution [s], new times (n,)), or None if no samples share times regularly. A part
+    that is too short for estimating the resolution uses that of `state`, and its rate, unless it has a gap.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)

@@ -28,7 +28,7 @@ from sealscope.reporting.messages import say
 from sealscope.reporting.picture import Picture, SvgText, log_ticks, ticks
 
 PAGE = "report.html"
-#: If there are more sizes of leaks, they are shown pooled in one column.
+#: If there are more sizes of leaks than this, one column shows all of them together.
 _MAX_SIZES = 8
 #: Size of a picture; points of a fitted curve; limits of points of any curve, and of measured fractions.
 WIDTH, HEIGHT = 460.0, 300.0
@@ -38,7 +38,7 @@ _MAX_NAMED = 3
 
 
 def _format_area(area: Area) -> str:
-    """Format an area under the ROC with its interval."""
+    """Format the area under an ROC curve with its interval."""
     return f"{area.value:.3f} ({area.low:.3f}–{area.high:.3f})"
 
 
@@ -52,9 +52,10 @@ def column_sizes(judgement: Judgement) -> list[float]:
 
 
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
-    """Build heads and rows of the main table, a row for each detector.
+    """Build the main table of a campaign as text: the headings of its columns, and a row for each detector.
 
-    The detectors of the plan come first, then those that always and never fire.
+    A row has the fractions of false alarms and of detected leaks, the area under the ROC curve, and the sizes a90 and
+    a90/95. The detectors of the plan come first, then two that always or never raise an alarm.
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
@@ -77,14 +78,18 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
 
 
 def _format_knowledge(known: PriorKnowledge | None) -> str:
-    """Format the information that a detector was given: `true onset`, `rig`, or a dash."""
+    """Format the information that a detector was given as "true onset", "rig", both, or a dash."""
     if known is None:
         return "–"
     return ", ".join(word for word, is_known in (("true onset", known.onset), ("rig", known.rig)) if is_known) or "–"
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format the leak sizes a90 and a90/95, as `> SIZE` beyond the tested sizes, and a dash if not known."""
+    """Format the leak sizes a90 and a90/95 of a detector.
+
+    The size a90 is detected with a probability of 90 %, and a90/95 is its upper 95 % confidence bound. A size above
+    all tested ones is written "> SIZE" with the largest of these; a dash stands for an unknown size.
+    """
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)
@@ -96,7 +101,7 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 
 
 def result_text(result: CampaignResult) -> str:
-    """Summarise in a few sentences the leaks that the best detectors find, and their false alarms."""
+    """Summarise a campaign in a few sentences: the leaks that the best detectors find, and their false alarms."""
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
     for pod in judgement.pods:
@@ -120,7 +125,7 @@ def result_text(result: CampaignResult) -> str:
 
 
 def campaign_text(result: CampaignResult) -> str:
-    """Format the main table and its notes as text."""
+    """Format the main table of a campaign and the notes on it as text for the terminal."""
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
@@ -131,7 +136,7 @@ def campaign_text(result: CampaignResult) -> str:
 
 
 def _notes(result: CampaignResult) -> list[str]:
-    """List the notes under the table, as sentences."""
+    """List the notes under the main table as sentences, such as those on thresholds and on missing records."""
     judgement, plan = result.judgement, result.plan
     notes = [_say("intervals", share=100 * plan.confidence, unit=plan.unit)]
     percentage = 100 * plan.false_alarm
@@ -151,12 +156,12 @@ def _notes(result: CampaignResult) -> list[str]:
 
 
 def _say(name: str, **values: Any) -> str:
-    """Return a text of the section `campaign` of `messages.toml` with `values` in its placeholders."""
+    """Format a text of the section `campaign` of `messages.toml` with `values` in its placeholders."""
     return say(f"campaign.{name}", **values)
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format a note for each set of channels, and for each rig, with the detectors to which it was given."""
+    """Format a note for each set of channels and for each rig that was given, with the names of the detectors."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -168,20 +173,23 @@ def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
 
 
 def _is_batched(result: CampaignResult) -> bool:
-    """Return True if the records were simulated in batches."""
+    """Return True if the records of a campaign were simulated in batches, not run by run."""
     return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
-    """Write the page of a result; `files`: names of the tables in its folder.
+    """Write the page of a campaign's result as HTML, and return its path; raise InputError if that fails.
 
-    Raises InputError if it cannot be written.
+    `files`: names of the files with tables in the same folder, to which the page links.
     """
     return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
-    """Render the page as HTML, which links only to the tables in its folder."""
+    """Render the page of a campaign's result as HTML.
+
+    `files`: names of the files with tables in the same folder; the page links to nothing else.
+    """
     judgement, plan = result.judgement, result.plan
     heads, rows = main_table(result)
     failed = [
@@ -209,7 +217,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 
 
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
-    """List the facts of the campaign for the page's head."""
+    """List the facts of a campaign for the head of its page, as pairs of label and text."""
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
         return [(group.label or group.files, f"{group.use}, size {group.size:g} {plan.unit}") for group in plan.sets]
@@ -243,7 +251,11 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 
 
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
-    """Build the template's values for one detector: plots, areas under the ROC, and detections by factor levels."""
+    """Build the template's values for the section of one detector.
+
+    They are its plots, the areas under its ROC curves, and the fractions of detections for each combination of
+    levels.
+    """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
     drawn_rocs = [roc for roc in rocs if not math.isnan(roc.leak_lpm)]
@@ -269,12 +281,12 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
-    """Format the leak size of an ROC."""
+    """Format the size of the leaks to which an ROC curve belongs."""
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score of a detector; "" for a detector that is not installed."""
+    """Describe the score of a detector in words; return "" for a detector that is not installed."""
     detector = parse_detector_name(name)
     through = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
@@ -285,7 +297,7 @@ def _describe_score(name: str) -> str:
 
 
 class _PlotCurve(NamedTuple):
-    """A curve y(x), and the lower and upper end of its band, if any."""
+    """A curve y(x) with its label, and the lower and upper end of its confidence band, None for none."""
 
     label: str
     x: Array
@@ -294,7 +306,11 @@ class _PlotCurve(NamedTuple):
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw detection over leak size: fractions with intervals, fitted curve with band, a90 and a90/95."""
+    """Draw a detector's fraction of detections over the size of the leak, on a logarithmic axis.
+
+    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 and a90/95.
+    Returns its title and the picture, or None if there are fewer than two sizes.
+    """
     if len(pod.sizes) < 2:
         return None
     first, last = pod.sizes[0].size, pod.sizes[-1].size
@@ -319,7 +335,11 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw detection over false alarms, a line for each size; a single line is drawn with its band."""
+    """Draw ROC curves, detections over false alarms, with a line for each size of leak.
+
+    A single line is drawn with its confidence band. Returns the title and the picture, or None if there are no
+    curves.
+    """
     if not rocs:
         return None
     curves = []
@@ -332,7 +352,10 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction, thinned to `_MAX_CURVE_POINTS`, with frame and axes."""
+    """Draw curves of the detected fraction into a picture, with frame and axes.
+
+    Each curve is reduced to at most `_MAX_CURVE_POINTS` points.
+    """
     thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))

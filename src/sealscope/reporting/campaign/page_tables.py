@@ -1,4 +1,4 @@
-"""Build the further tables of a campaign's page as text: onsets, flows, faults, families and causes."""
+"""Build the smaller tables of a campaign's page as text: errors of onsets and flows, faults, families and causes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,18 @@ def percent(proportion: Proportion | None) -> str:
 
 
 def _format_percent(fraction: float) -> str:
-    """Format a fraction in percent, with more digits if it is small."""
+    """Format a fraction in percent, without the sign, with more decimals if it is small."""
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
     return f"{value:.{digits}f}"
 
 
 class PageTable(NamedTuple):
-    """A table of the page; `about`: description of its content; `words`: number of leading columns with text."""
+    """A table of the campaign's page.
+
+    `id`: its identifier in the HTML; `about`: description of its content; `heads`: headings of the columns; `rows`:
+    cells as text; `words`: number of leading columns with text instead of numbers.
+    """
 
     id: str
     title: str
@@ -40,7 +44,10 @@ class PageTable(NamedTuple):
 
 
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Build the tables of `page_tables.toml` by name, without empty ones; `part`: purpose of the plan, for titles."""
+    """Build the tables that `page_tables.toml` lists, by name; empty ones are left out.
+
+    `unit`: unit of the leaks' sizes; `part`: purpose of the plan, which is added to titles.
+    """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
@@ -53,17 +60,21 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 
 
 def _format_cell(row: Any, content: str) -> str:
-    """Format one cell of a row by its column's `content`: an entry of `_FORMATS` or a format, and an attribute."""
+    """Format one cell of a table as text.
+
+    `content`: an entry of `_FORMATS` or a format specification, a space, and the dotted path of the value in `row`.
+    """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
     return _FORMATS[format_name](value) if format_name in _FORMATS else format(value, format_name)
 
 
 class CauseTable(NamedTuple):
-    """The causes that one detector names.
+    """The table of the causes that one detector names, as text.
 
-    A row: true cause, number of its records, and fraction with each named cause (`columns`). `right`: fraction of all
-    records for which exactly the true cause is named; `covered`: including ambiguous causes that contain it.
+    `columns`: the named causes; `rows`: for each true cause, its name, the number of its records, and the fraction of
+    them for which each cause is named; `right`: fraction of all records for which exactly the true cause is named;
+    `covered`: the same, also counting ambiguous causes that include the true one.
     """
 
     detector: str
@@ -90,12 +101,12 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
 
 
 def _format_fraction(proportion: Proportion) -> str:
-    """Format a proportion in percent, a dot for zero."""
+    """Format a proportion in percent, without its interval; a dot for zero."""
     return f"{100 * proportion.value:.0f} %" if proportion.count else "·"
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:
-    """Format a quantile with its interval; a dash for an infinite value or end."""
+    """Format a quantile with its interval; a dash stands for a value or an end that is not finite."""
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):

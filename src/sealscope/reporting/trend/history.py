@@ -22,7 +22,10 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A diagnosis, the start of its recording [s since 1970] or None, and a function that reads the recording."""
+    """A judged recording: its diagnosis, its start, and a function that reads it.
+
+    `start_s` [s since 1970]: start of the recording, None if it is not known.
+    """
 
     diagnosis: Diagnosis
     start_s: float | None
@@ -36,7 +39,11 @@ _Level = tuple[float, float | None, float]
 def write_history_page(
     path: str | os.PathLike[str], judged: Sequence[Judged], *, title: str, left_out: int = 0
 ) -> Path:
-    """Write the page of a machine atomically; arguments and errors as for `render_history_page`."""
+    """Write the page of a machine as .html, .htm or .pdf, and return its path.
+
+    `judged`: its recordings with their diagnoses; `title`: name of the machine; `left_out`: number of files that
+    could not be read. Raises InputError if `judged` is empty, or if the page cannot be written.
+    """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
 
@@ -74,9 +81,10 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Draw the leak of each recording over time; return a picture for each size in `SIZES`.
+    """Draw the leak of each recording over time, as a picture for each of the `SIZES`.
 
-    None if no recording states an estimate or a bound. Recordings are drawn by number, from 1, if a date is missing.
+    `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1.
+    Returns None if no recording states an estimate or a bound.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -93,7 +101,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     top = 1.08 * max(shown_values, default=0.0) or 1.0
 
     def format_day(day: float) -> str:
-        """Format a tick: its date, or the number of a recording, "" between two numbers."""
+        """Format a value of the time axis as a date, or as the number of a recording, "" between two numbers."""
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])
         return f"{day:g}" if day.is_integer() else ""
@@ -117,7 +125,10 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak of a diagnosis with its interval, or its bound; None if it states neither."""
+    """Return the leak of a diagnosis as (estimate, low, high), or its bound as (bound, None, bound), in L/min.
+
+    Returns None if the diagnosis states neither.
+    """
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
         return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
@@ -128,18 +139,18 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
 
 
 def _dates(ordered: Sequence[Judged]) -> list[str]:
-    """Format the start of each recording as a date, a dash if not known."""
+    """Format the start of each recording as a date, with the time of day if they are close; a dash if unknown."""
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0
     return [messages.ABSENT if entry.start_s is None else stamp(entry.start_s, span_days) for entry in ordered]
 
 
 def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], charts.DrawnCharts | None, list[str]]:
-    """Draw the channels of the newest recording over those of an earlier one.
+    """Draw the channels of the newest recording and of an earlier one in the same charts, from a common start.
 
-    The earlier one is the last before it that was judged `no leak`, or else the last of all. Both are drawn from a
-    common start. Returns (charts, drawn charts, names of the two files), empty if there is no earlier recording, no
-    common channel or a clock that does not increase.
+    The earlier recording is the last one with the verdict `no leak`, or if there is none, the last one before the
+    newest. Returns the charts, the charts as drawn, and the names of the two files. Returns ([], None, []) if there
+    is no earlier recording, no common channel, or a clock that does not increase.
     """
     *earlier, newest = ordered
     healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]

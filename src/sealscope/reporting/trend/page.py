@@ -1,4 +1,4 @@
-"""Write the page of a trend: one HTML file that works offline, with recordings, healthy band and limit as SVG."""
+"""Write the page of a trend, the leakage of one machine over its recordings, as one HTML file that works offline."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91
 
 
 def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
-    """Write the page of a trend atomically."""
+    """Write the page of a trend as .html, .htm or .pdf, and return its path.
+
+    `title`: title of the page. Raises InputError for another suffix, or if it cannot be written.
+    """
     return template.write(template.parse_page_path(path, card=False), render_trend_page(trend, title=title))
 
 
@@ -51,10 +54,11 @@ def level_pictures(
     format_day: Callable[[float], str],
     draw: Callable[[Picture], None],
 ) -> dict[str, Picture]:
-    """Draw leak levels over time, in each of the `SIZES`.
+    """Draw levels of leakage over time, as a picture for each of the `SIZES`.
 
-    `days`: first and last recording, with a tick at the first; `levels`: ends of the axis; `limit`: repair limit, drawn
-    if it is on the axis; `format_day`: text of a tick; `draw`: draws the recordings into a picture.
+    `days`: times of the first and last recording [d]; `levels`: ends of the axis of levels; `limit`: repair limit,
+    which is drawn if it is on the axis, None for none; `format_day`: function that formats a time [d] on the axis;
+    `draw`: function that draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5
     first, last = days[0] - margin, days[1] + margin
@@ -75,7 +79,7 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Draw a trend in each of the `SIZES`; None if no recording states a level."""
+    """Draw a trend as a picture for each of the `SIZES`; return None if no recording has a level of leakage."""
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
     ends, format_day = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
@@ -83,7 +87,7 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 
 
 def _draw_trend(trend: Trend, picture: Picture) -> None:
-    """Draw healthy band, recordings, fitted line, alarms and repairs into a picture."""
+    """Draw a trend into a picture: the healthy range, the recordings, the fitted line, alarms and repairs."""
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
         healthy = episode.wear.healthy
@@ -105,7 +109,7 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:
-    """Compute the limits of the axis of levels, which include a nearby repair limit."""
+    """Compute the limits of the axis of levels; they include all intervals, and the repair limit unless it is far."""
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)
@@ -118,7 +122,11 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 
 
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
-    """Return the vertices (day, level) of the line fitted to an episode: straight, or constant up to an onset."""
+    """Compute the vertices (day, level) of the line fitted to an episode, the recordings from one repair to the next.
+
+    The line is straight, or if there is an alarm with an onset, constant until then. `days`: times of all recordings
+    [d].
+    """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:
         growth_per_month = wear.growth.value if math.isfinite(wear.growth.value) else 0.0

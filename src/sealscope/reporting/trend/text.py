@@ -19,12 +19,12 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of the present level: `total` of pump and piston, or `now` for ringing."""
+    """Return the label of the present level: "total" for leakage of pump and piston, "now" for ringing."""
     return "now" if trend.basis == "ringing" else "total"
 
 
 def moment(trend: Trend, day: float) -> str:
-    """Format a day of a trend as a date, or as a number of days if the recordings have no dates."""
+    """Format a time of a trend, in days, as a date, or as "day N" if the recordings have no dates."""
     if not trend.dated or not trend.points:
         return f"day {day:.3g}"
     first, last = trend.points[0], trend.points[-1]
@@ -38,13 +38,13 @@ def stamp(seconds: float, span_days: float) -> str:
 
 
 def recordings_text(trend: Trend) -> str:
-    """Format the number of recordings, and the first and the last day."""
+    """Format the number of recordings of a trend, and the dates of the first and the last one."""
     count, ends = len(trend.points), [moment(trend, trend.points[k].day) for k in (0, -1) if trend.points]
     return ", ".join([format_count(count, "recording"), *([" to ".join(ends)] if ends else [])])
 
 
 def headline(trend: Trend) -> str:
-    """Format the verdict, the leak's onset or the last repair, and the recordings in one line."""
+    """Format a trend in one line: the verdict, the onset of the leak or the last repair, and the recordings."""
     wear, key, since = trend.wear, "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
         key, since = "trend_fell", moment(trend, trend.repairs[-1].day)
@@ -54,7 +54,7 @@ def headline(trend: Trend) -> str:
 
 
 def verdict_sentence(trend: Trend) -> str:
-    """Format the verdict as a sentence."""
+    """Format the verdict of a trend as a sentence."""
     if trend.decision.summary != trend.verdict:
         return trend.decision.summary.capitalize()
     key = "ringing"
@@ -68,9 +68,11 @@ def verdict_sentence(trend: Trend) -> str:
 
 
 def figures(trend: Trend) -> dict[str, str]:
-    """Format present level, leak, healthy range, onset, growth and time to the limit; "" for those not known.
+    """Format the numbers of a trend as text, by name; "" for a number that is not known.
 
-    The level is the leakage of pump and piston together, the leak its rise over the healthy level.
+    They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level;
+    `healthy`, the range of healthy recordings; `since`, the onset; `growth`; and `limit`, the time until the repair
+    limit is reached.
     """
     wear = trend.wear
     if wear is None:
@@ -100,13 +102,16 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Return the upper end of the healthy range, limited to the repair limit."""
+    """Compute the upper end of the healthy range for display: it is cut off at the repair limit.
+
+    It does not lie below the healthy level itself.
+    """
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
 def _format_estimate(interval: Interval, unit: str) -> str:
-    """Format an estimate with its interval; an infinite end is `open`."""
+    """Format an estimate with its interval and unit; "open" stands for an infinite end of the interval."""
     if not math.isfinite(interval.value):
         return "not known"
     ends = (number(end, 2) if math.isfinite(end) else "open" for end in (interval.low, interval.high))
@@ -114,9 +119,10 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 
 
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
-    """Format the repair limit and a prediction of the date at which the level reaches it.
+    """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach`: days from the last recording until then, with interval.
+    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then, with its interval. No
+    date is predicted if the recordings are too few or the date is too far away.
     """
     limit_text, first, last = f"{number(limit, 2)} {trend.unit} in all", trend.points[0].day, trend.points[-1].day
     max_days = TREND.history.furthest
@@ -134,7 +140,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
 
 
 def assumptions_text(trend: Trend) -> str:
-    """Format the assumptions behind the levels: method, machine data, oil temperature and healthy recordings."""
+    """Format the assumptions of a trend as sentences: method, machine data, oil temperature, healthy recordings."""
     machine = ""
     if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
@@ -149,7 +155,7 @@ def assumptions_text(trend: Trend) -> str:
 
 
 def limit_note(trend: Trend) -> str:
-    """Format the repair limit and its origin, with a remark if healthy recordings scatter beyond it."""
+    """Format the repair limit and its origin, with a remark if healthy recordings exceed it."""
     origin = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
     wear = trend.wear
     is_in_scatter = wear is not None and wear.limit is not None and wear.limit < wear.healthy.high
@@ -158,7 +164,7 @@ def limit_note(trend: Trend) -> str:
 
 
 def events(trend: Trend) -> list[str]:
-    """List alarms and repairs in the order of their times, as text."""
+    """List the alarms and repairs of a trend as lines of text, in the order of their times."""
     lines = []
     for episode in trend.episodes:
         if episode.fell:
@@ -171,7 +177,10 @@ def events(trend: Trend) -> list[str]:
 
 
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
-    """Format the trend as lines of at most 80 columns; `whole`: with reason, assumptions and all findings."""
+    """Format a trend as text for the terminal, in lines of at most 80 columns.
+
+    `whole`: True to add the reason, the assumptions, the origin of the limit and all findings.
+    """
     known_figures, findings = figures(trend), [finding.text for finding in trend.findings]
     rows = [("state", state_text(trend.state))]
     rows += [(level_name(trend), known_figures["total"])]
@@ -189,7 +198,7 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 
 
 def trend_csv(trend: Trend) -> str:
-    """Format the recordings of a trend as CSV, one row each."""
+    """Format a trend as CSV text, with a row for each recording: its time, level with interval, and notes."""
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
     with io.StringIO(newline="") as text:

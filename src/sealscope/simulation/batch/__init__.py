@@ -1,1 +1,1 @@
-"""Many experiments at once, reduced to statistics as they run."""
+"""Many experiments at once, reduced to statistics while they run."""

@@ -1,7 +1,7 @@
-"""Many experiments at once: eight to a vector register, over all cores, reduced to statistics as they run.
+"""Many experiments at once: eight to a vector register, over all cores, reduced to statistics while they run.
 
-Pressures, readings and details are kept for a few seconds of each run only, so that memory does not grow with the
-length of the runs, and with their number only by the description and the result of each.
+Pressures, readings and wavelet details are kept for a few seconds of each run only. Memory therefore does not grow
+with the length of the runs, and with their number only by the description and the result of each.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ _N_SAMPLE_RUNS, _SAMPLE_DURATION = 4, 2.0 * FIRST_WINDOW
 class Batch:
     """Result of `simulate_batch`: the RMS of wavelet details by run and segment, and the leaks of the runs.
 
-    `rms`: (runs, 2, segments, 5), by chamber (`CHAMBERS`: p_A, p_B), segment and detail (`QUANTITIES`: d1, d2, d3, d4
-    [Pa], d3d4 [Pa^2]); `bounds`: (segments + 1,) limits of the segments [s]; `mean_leak_lpm`: (runs,) mean abs(Q) while
-    open [L/min]; `coefficients`: (runs,) leaks' G [m^3/(s Pa)] or C [m^3/(s Pa^0.5)]; `steps`: (runs,) solver step [s].
+    `rms` (runs, 2, segments, 5): RMS by run, chamber pressure (`CHAMBERS`: p_A, p_B), segment and wavelet detail
+    (`QUANTITIES`: d1, d2, d3, d4 [Pa], d3d4 [Pa^2]); `bounds` (segments + 1,): limits of the segments [s];
+    `mean_leak_lpm` (runs,): mean leakage flow abs(Q) while the leak is open [L/min]; `coefficients` (runs,): G
+    [m^3/(s Pa)] or C [m^3/(s Pa^0.5)] of the leaks; `steps` (runs,): solver's step [s].
     """
 
     rms: Array
@@ -57,13 +58,19 @@ class Batch:
 
     @checked_call
     def rms_of(self, channel: str, detail: str) -> Array:
-        """Return the RMS of one detail of one channel in each segment, (runs, segments)."""
+        """Return the RMS of one wavelet detail of one channel, (runs, segments).
+
+        `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 [Pa] or d3d4 [Pa^2].
+        """
         i, k = _index_of(channel, CHAMBERS, "channel"), _index_of(detail, QUANTITIES, "detail")
         return np.asarray(self.rms[:, i, :, k])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
-        """Compute the relative change of an RMS from segment `before` to `after`, (runs,) [%]: the thesis's statistic.
+        """Compute the relative change of a wavelet detail's RMS from one segment to another, (runs,) [%].
+
+        It is the thesis's statistic of a leak. `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 or d3d4; `before`,
+        `after`: indices of the segments.
 
         Examples
         --------
@@ -76,12 +83,12 @@ class Batch:
         return np.asarray(100.0 * (rms[:, after] / rms[:, before] - 1.0))
 
     def to_pandas(self) -> pd.DataFrame:
-        """Convert the batch to a table, one row for each run and segment.
+        """Convert the batch to a pandas table with one row for each run and segment.
 
-        Raises MissingExtra where pandas is not installed.
+        The columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each channel (such as
+        `d3 of p_A [Pa]`), mean_leak [L/min], coefficient and step [s].
 
-        Columns: run, segment, start [s], stop [s], the RMS of each detail of each channel (`d3 of p_A [Pa]`), mean_leak
-        [L/min], coefficient, step [s].
+        Raises MissingExtra if pandas is not installed.
         """
         try:
             import pandas as pd
@@ -102,7 +109,10 @@ class Batch:
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of a name in `names`; raise InputError, which calls it `what`, if it is unknown."""
+    """Return the index of `name` in `names`.
+
+    Raises InputError, which calls the name `what`, if it is none of them.
+    """
     if name not in names:
         raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
     return names.index(name)
@@ -119,10 +129,11 @@ def simulate_batch(
 ) -> Batch:
     """Simulate many experiments at once, and compute the RMS of the db8 details of p_A and p_B as recorded.
 
-    All runs must have one duration and one sampling rate; rigs, leaks (at most one each, opening abruptly or linearly),
-    drifts, faults of the machine and loads may differ. The step of a run is its own `step` if stated; otherwise one
-    step is chosen for all runs with the same laws, command, load and error (their own, or `error`). Results do not
-    depend on the runs' order or number, nor on `threads`. The noise differs from that of `simulate`.
+    All runs must have the same duration and sampling rate. Rigs, leaks (at most one per run, opening abruptly or
+    linearly), drifts, faults of the machine and loads may differ. The solver's step of a run is its own `step` if
+    stated; otherwise one step is chosen for all runs with the same laws, command, load and error (their own, or
+    `error`). Results do not depend on the runs' order or number, nor on `threads`. The noise differs from that of
+    `simulate`.
 
     Parameters
     ----------
@@ -175,7 +186,11 @@ def simulate_batch(
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the completed fraction of the batch from that of this set; `before`: that at the set's start."""
+            """Report the completed fraction of the batch from the completed `fraction` of the current set.
+
+            `before`: fraction of the batch that was complete when the set began; `set_fraction`: the set's fraction
+            of the batch.
+            """
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
 
@@ -188,7 +203,10 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Run a set of experiments, and write its results into the rows of `batch`."""
+    """Simulate a set of experiments, and write the results into their rows of `batch`.
+
+    `error` [Pa]: allowed rms error of a pressure; `progress` is called with the completed fraction of the set.
+    """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     rows = [member.row for member in members]
     coefficients = np.array([member.leak.coefficient or 0.0 for member in members])
@@ -205,10 +223,11 @@ def _run_set(
 
 
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
-    """Choose the solver's step [s] of a set: the shortest that error control finds for a few sample runs.
+    """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    The sample runs are simulated for their first seconds only. `coefficients` (runs,): of the leaks; `error` [Pa]:
-    largest rms error of a pressure. The step is no longer than any run of the set allows (`longest_allowed_step`).
+    It is the shortest step that error control finds for the first seconds of a few runs of the set, and no longer
+    than any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients; `error`
+    [Pa]: allowed rms error of a pressure.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -219,9 +238,10 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 
 
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
-    """Compute the longest step [s] that resolves all runs of a set with leaks of `coefficients` (runs,).
+    """Compute the longest step [s] that resolves all runs of a set of experiments.
 
-    The result is no shorter than the shortest step that error control tries.
+    `coefficients` (runs,): leakage coefficients. The result is no shorter than the shortest step that error control
+    tries.
     """
     from sealscope.physics.solvers.limits import longest_step
 
@@ -233,12 +253,18 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 
 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
-    """Find the coefficients of all members' leaks that give their stated mean flows, starting from `coefficients`."""
+    """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks.
+
+    The search starts from `coefficients`; those of leaks without a stated mean flow stay.
+    """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
-        """Run the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None."""
+        """Simulate the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None.
+
+        The None stands for the further results that `size_leaks` passes on.
+        """
         flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
         run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)

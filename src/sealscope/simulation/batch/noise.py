@@ -1,8 +1,8 @@
-"""White noise for runs on lanes: normal random numbers from a counter and a key for each lane.
+"""White noise for runs on lanes: normal random numbers from a counter and a key for each lane, that is each run.
 
 The generator is SplitMix64, evaluated directly at any position of its sequence (Steele, Lea, Flood, Fast splittable
-pseudorandom number generators, OOPSLA 2014): a sample's number depends only on the run's key and the sample's position,
-never on lane, group or block. The stream differs from that of a single run (`instruments.record`).
+pseudorandom number generators, OOPSLA 2014): a sample's number depends only on the run's key and the sample's
+position, never on lane, group or block. The stream differs from that of a single run (`instruments.record`).
 """
 
 from __future__ import annotations
@@ -31,17 +31,23 @@ def _integer_constant(value: int) -> Any:
 
 
 def noise_keys(seeds: list[int]) -> Array:
-    """Compute the 64-bit noise key of each run from its seed, (runs,), stored as the bits of doubles."""
+    """Compute the 64-bit key of each run's noise from its seed, (runs,).
+
+    The bits are stored as doubles, so that they can be loaded as lanes.
+    """
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
 
 def uniform(key: Any, position: int) -> Any:
-    """Draw uniform numbers in (0, 1], one a lane, at `position` >= 0 of the keys' sequences (`_lower_uniform`)."""
+    """Draw uniform random numbers in (0, 1], one for each lane, in compiled code.
+
+    `key`: keys of the lanes (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
+    """
 
 
 def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Emit `uniform` in LLVM: SplitMix64 (`commands.PseudoRandom`).
+    """Build the LLVM instructions of `uniform`, which evaluate SplitMix64 (`commands.PseudoRandom`).
 
     The state at position k is key + (k + 1) GOLDEN; its mixed bits become the mantissa of a number in (0, 1].
     """
@@ -61,21 +67,21 @@ def _lower_uniform(context: Any, builder: Any, arg_types: Any, values: Any) -> A
 
 
 def _exponent(x: Any) -> Any:
-    """Extract the binary exponent of positive normal doubles, as doubles (`_lower_exponent`)."""
+    """Extract the binary exponent of positive normal doubles, returned as doubles, in compiled code."""
 
 
 def _lower_exponent(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Emit `_exponent` in LLVM: the bits above the mantissa less the bias."""
+    """Build the LLVM instructions of `_exponent`: the bits above the mantissa, minus the exponent's bias."""
     biased_exponent = builder.lshr(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_BITS))
     return builder.sitofp(builder.sub(biased_exponent, _integer_constant(_EXPONENT_BIAS)), _DOUBLES)
 
 
 def _fraction(x: Any) -> Any:
-    """Extract the significand 1 <= m < 2 of positive normal doubles (`_lower_fraction`)."""
+    """Extract the significand 1 <= m < 2 of positive normal doubles in compiled code."""
 
 
 def _lower_fraction(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Emit `_fraction` in LLVM: the mantissa with the exponent of 1."""
+    """Build the LLVM instructions of `_fraction`: the bits of the mantissa with the exponent of 1."""
     bits = builder.and_(builder.bitcast(values[0], _INTEGERS), _integer_constant(_MANTISSA_MASK))
     return builder.bitcast(builder.or_(bits, _integer_constant(_ONE_BITS)), _DOUBLES)
 
@@ -90,7 +96,7 @@ for _function, _arity, _build in (
 
 @contracted
 def logarithm(x: Any) -> Any:
-    """Compute ln x for lanes of normal numbers x > 0, to 2e-15 (absolute near 1, relative elsewhere).
+    """Compute ln x for lanes of normal numbers x > 0, with an error of 2e-15 (absolute near 1, else relative).
 
     ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)) with x = 2^e m and m in sqrt(1/2)..sqrt(2), by the series of artanh.
     """
@@ -107,7 +113,7 @@ def logarithm(x: Any) -> Any:
 
 @contracted
 def half_turn_sine(v: Any) -> Any:
-    """Compute sin(pi v) for -1/2 <= v <= 1/2 to 5e-14, by Taylor's polynomial (1/(2k + 1)!) of degree 17."""
+    """Compute sin(pi v) for -1/2 <= v <= 1/2 to 5e-14, by Taylor's polynomial of degree 17."""
     x = v * math.pi
     s = x * x
     q = s * s
@@ -118,9 +124,11 @@ def half_turn_sine(v: Any) -> Any:
 
 @contracted
 def normals(key: Any, pair: int) -> tuple[Any, Any]:
-    """Draw two independent standard normal numbers a lane, from positions 2 `pair` and 2 `pair` + 1 of the sequences.
+    """Draw two independent standard normal random numbers for each lane, in compiled code.
 
-    Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611; cos 2a = 1 - 2 sin^2 a.
+    They are computed from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key`
+    selects (`uniform`). Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611; cos 2a = 1 - 2
+    sin^2 a.
     """
     radius = math.sqrt(-2.0 * logarithm(uniform(key, 2 * pair)))
     s = half_turn_sine(uniform(key, 2 * pair + 1) - 0.5)

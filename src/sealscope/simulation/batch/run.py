@@ -1,4 +1,4 @@
-"""Sets of experiments that can run on the lanes of one vector register, and the run of a set, chunk by chunk."""
+"""Sets of experiments that can run on the lanes of one vector register, and the simulation of such a set."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ ABRUPT = 1e15
 
 @dataclass(frozen=True)
 class Member:
-    """One experiment of a set.
+    """One experiment of a set of experiments that are integrated together.
 
-    `row`: its index in the batch; `numbers`: the model's parameters, and `effects`: their changes within the run. The
-    command is `gain` times the set's command shape plus `offset` [V].
+    `row`: its index in the batch; `numbers`: the model's parameters; `effects`: changes of them within the run. Its
+    command is `gain` times the command shape that the set shares, plus `offset` [V].
     """
 
     row: int
@@ -49,31 +49,34 @@ class Member:
 
     @property
     def leak(self) -> Leak:
-        """The leak of the run; a leak of coefficient 0 if the experiment has none."""
+        """The leak of the experiment; a leak of coefficient 0 if it has none."""
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", 0.0)
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The parameter sets of the run that limit the solver's step (`changes.step_limiting_parameters`)."""
+        """The sets of model parameters in this run that limit the solver's step."""
         return step_limiting_parameters(self.effects, self.numbers)
 
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: equal laws, command shape, load and solver settings."""
+    """Experiments that are integrated together: their laws, command shape, load and solver settings are equal."""
 
     members: tuple[Member, ...]
     shape: Command
 
     @property
     def experiment(self) -> Experiment:
-        """The first experiment, which stands for the settings that all members share."""
+        """The first experiment of the set, from which the settings that all members share are read."""
         return self.members[0].experiment
 
 
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
-    """Raise InputError for an experiment that cannot be part of a batch; `row`: its index there."""
+    """Raise InputError for an experiment that cannot be part of a batch.
+
+    `row`: its index in the batch, for the message.
+    """
     rig, leaks = experiment.rig, experiment.leaks
     violated_rules = []
     if experiment.active_controller is not None:
@@ -100,7 +103,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 class _ScaledCommand(NamedTuple):
-    """A command as gain times shape plus offset [V]; `key`: text that is equal for equal shapes."""
+    """A command as gain times shape plus offset [V]; `key` is a text that is equal for equal shapes."""
 
     key: str
     shape: Command
@@ -109,7 +112,7 @@ class _ScaledCommand(NamedTuple):
 
 
 def _split_command(command: Command) -> _ScaledCommand:
-    """Split a sine into gain, shape and offset; any other command is its own shape."""
+    """Split a command into gain, shape and offset; the shape of a command that is no sine is the command itself."""
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
         return _ScaledCommand(str(identity_values(shape)), shape, command.amplitude, command.offset)
@@ -117,7 +120,7 @@ def _split_command(command: Command) -> _ScaledCommand:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group the experiments into sets with the same laws, command shape, load and solver settings.
+    """Group experiments into sets that can be integrated together: equal laws, command shape, load, solver settings.
 
     Raises InputError if one of them cannot be in a batch, or if they differ in duration or sampling rate.
     """
@@ -156,14 +159,17 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
 
 
 def pack_lanes(values: Array, width: int) -> Array:
-    """Rearrange values of runs (runs, ...) as (groups, ..., width); copies of the last run fill the spare lanes."""
+    """Rearrange an array (runs, ...) by groups of `width` runs as (groups, ..., width), for vector registers.
+
+    If the last group is not full, copies of the last run fill it.
+    """
     groups = math.ceil(len(values) / width)
     padded = np.concatenate([values, np.repeat(values[-1:], groups * width - len(values), axis=0)])
     return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, width, *values.shape[1:]), 1, -1))
 
 
 def unpack_lanes(lanes: Array, runs: int) -> Array:
-    """Rearrange lanes (groups, ..., width) as values of runs (runs, ...), the inverse of `pack_lanes`."""
+    """Rearrange an array (groups, ..., width) as (runs, ...), the inverse of `pack_lanes`; `runs`: number of runs."""
     lanes_second = np.moveaxis(lanes, -1, 1)
     return lanes_second.reshape(-1, *lanes_second.shape[2:])[:runs]
 
@@ -171,9 +177,10 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the leaks' parameters (runs, LEAK_ROWS) for the compiled laws (`physics.vector.runs`).
 
-    Columns: G and C that act in the run, start [s] and slope [1/s] of the opening, G and C whose mean flow is computed.
-    `coefficients` (runs,) give the first two, `flow_coefficients` (runs,) the last two. They differ while a leak is
-    sized: a run without a leak gives the flow that a unit leak would have under its pressures.
+    The columns are G and C that act in the run, start [s] and slope [1/s] of the opening, and G and C whose mean flow
+    is computed. `coefficients` (runs,) give the first two, `flow_coefficients` (runs,) the last two. They differ
+    while leaks are sized: a run without a leak then computes the flow that a unit leak would have under its
+    pressures.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -191,8 +198,9 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 class Cells:
     """Model parameters of the runs of a set over time, constant within cells.
 
-    A cell is a span of outputs, the same for all runs. `bounds` (cells + 1,): outputs at which cells begin; `base`
-    (runs, parameters); `changing`: indices of the parameters that change, with `values` (runs, changing, cells).
+    A cell is a span of outputs, the same for all runs. `bounds` (cells + 1,): outputs at which the cells begin, and
+    the end; `base` (runs, parameters): parameters without changes; `changing`: indices of the parameters that change,
+    with their `values` (runs, changing, cells).
     """
 
     bounds: np.ndarray
@@ -201,7 +209,10 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Build the parameters (groups, cells, parameters, width) of the cells first <= cell < last."""
+        """Build the parameters (groups, cells, parameters, width) in the cells first <= cell < last.
+
+        `width`: number of runs in a group, the last axis.
+        """
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, parameter in enumerate(self.changing):
             table[:, :, parameter] = self.values[:, k, first:last]
@@ -209,7 +220,7 @@ class Cells:
 
 
 def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Build the cells of a set, short enough for the effects of all its members.
+    """Build the model parameters of a set of runs over time, in cells so short that no effect changes much in one.
 
     `n_out`: number of outputs of the run, at `rate` [Hz].
     """
@@ -230,7 +241,7 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Replace the size of an experiment's leak by a coefficient.
+    """Return the experiment with a leak of this coefficient in place of the stated mean flow or coefficient.
 
     An experiment without a leak is returned unchanged.
     """
@@ -240,7 +251,10 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 
 
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the parameters (runs, 2, INSTRUMENT_ROWS) of p_A's and p_B's instruments from sample `first` to `last`."""
+    """Build the parameters of the instruments of p_A and p_B, (runs, 2, INSTRUMENT_ROWS), for a span of samples.
+
+    Parameters that change are linear from sample `first` to sample `last`.
+    """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
     ends = np.array([first, last]) / members[0].experiment.rate
@@ -254,9 +268,10 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of the instruments of p_A and p_B between the two times `ends` [s].
+    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments of p_A and p_B between two times.
 
-    Parameters that change are taken as linear over the `samples` between them.
+    `ends` (2,): the times [s]; `samples`: number of samples between them, over which changing parameters are taken as
+    linear; `readings`: changes of the instruments.
     """
     from sealscope.simulation.batch import signals
 
@@ -281,7 +296,7 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
 
 
 class _Chunk(NamedTuple):
-    """A part of a run that is advanced at once: first_cell <= cell < end_cell, start <= output < stop."""
+    """A part of a run that is integrated at once: first_cell <= cell < end_cell, start <= output < stop."""
 
     first_cell: int
     end_cell: int
@@ -294,10 +309,11 @@ MAX_CHUNK_STEPS = 4096
 
 
 class SetRun:
-    """The simulation of all runs of an `ExperimentSet`.
+    """The simulation of all runs of an `ExperimentSet`, on several threads.
 
-    `coefficients` (runs,): those of the leaks; `flow_coefficients` (runs,): those whose mean flow is computed
-    (`build_leak_rows`); `bounds` [s]: segments of the detail statistics, None to compute flows only.
+    `coefficients` (runs,): leakage coefficients that act; `flow_coefficients` (runs,): those whose mean flow is
+    computed (`build_leak_rows`); `bounds` [s]: limits of the segments over which the RMS of the wavelet details is
+    computed, None to compute mean flows only.
     """
 
     #: Runs of a group.
@@ -312,7 +328,10 @@ class SetRun:
         flow_coefficients: Array,
         bounds: Array | None,
     ) -> None:
-        """Prepare the runs at standstill; raise SimulationFailed if `step` [s] cannot resolve one of them."""
+        """Prepare the runs at standstill, to be integrated with a step of at most `step` [s].
+
+        Raises SimulationFailed if this step cannot resolve one of the runs.
+        """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
         from sealscope.physics.vector.runs import CHANNELS, MIN_PRESSURE, N_TOTALS
@@ -352,9 +371,10 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Compute the anti-alias filter of each lane.
+        """Compute the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        Tap k multiplies the output k - `taps_before` steps from the sample.
+        Coefficient k multiplies the output k - `taps_before` outputs after the sample. `rate` [Hz]: rate of the
+        outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -369,7 +389,11 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Allocate the sums of squared details, and clip segments to the samples whose details need no padding."""
+        """Prepare the sums of squared wavelet details over the segments, and the keys of the runs' noise.
+
+        The segments between `bounds` [s] are clipped to the samples that the wavelet's filters reach within the
+        record.
+        """
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys
         from sealscope.simulation.batch.signals import QUANTITIES
@@ -382,12 +406,15 @@ class SetRun:
         self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Run all groups, divided among `threads` (compiled code releases Python's lock)."""
+        """Simulate all runs on `threads` threads (compiled code releases Python's lock).
+
+        `progress` is called with the completed fraction of the set.
+        """
         cuts = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Add to the completed fraction of all groups, and report it; called by all threads."""
+            """Add `fraction` to the completed fraction of the set, and report the sum; called by all threads."""
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -398,7 +425,7 @@ class SetRun:
             list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(cuts)))
 
     def _chunks(self) -> list[_Chunk]:
-        """Divide the run into chunks: several whole cells, or a part of a long cell."""
+        """Divide the run into chunks that are integrated at once: several whole cells, or a part of a long cell."""
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
         chunks = []
@@ -413,15 +440,15 @@ class SetRun:
         return chunks
 
     def _readable_samples(self, stop: int) -> int:
-        """Count the samples that can be read once the outputs before `stop` are computed."""
+        """Count the samples that the anti-alias filter can compute once the outputs before `stop` are integrated."""
         if stop == self.n_outputs:
             return self.n_samples
         return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
 
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
-        """Simulate the groups of lanes groups[0] <= g < groups[1] in chunks, from standstill to the end.
+        """Simulate the groups groups[0] <= g < groups[1] of runs, chunk by chunk from standstill to the end.
 
-        The squared details of each chunk's readings are added to the sums.
+        The squared wavelet details of each chunk's readings are added to the sums.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -465,9 +492,10 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Sample the unscaled command [V], and the load [N] if any, at the nodes of the steps from output `start` on.
+        """Compute the command's shape [V], and the load [N] if any, at the nodes of the steps of a chunk.
 
-        Returns (steps, nodes), or (steps, 2 nodes) with the load in the last columns.
+        The chunk has the outputs start <= output < stop. Returns (steps, nodes), or (steps, 2 nodes) with the load in
+        the last columns.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load
@@ -477,7 +505,10 @@ class SetRun:
         )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the groups' instrument parameters (groups, 2, INSTRUMENT_ROWS, width) for samples first .. last."""
+        """Build the instruments' parameters of some groups of runs for the samples from `first` to `last`.
+
+        Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups groups[0] <= g < groups[1].
+        """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
         members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]
@@ -485,15 +516,19 @@ class SetRun:
 
     @cached_property
     def _constant_sensors(self) -> Array | None:
-        """The instrument parameters of all groups; None if any of them change within a run."""
+        """The instruments' parameters of all groups, or None if any of them change within a run.
+
+        Their shape is (groups, 2, INSTRUMENT_ROWS, width).
+        """
         if any(member.experiment.readings().effects for member in self.experiment_set.members):
             return None
         return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
 
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
-        """Raise SimulationFailed if a run of the groups diverged before output `stop`.
+        """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
 
-        Unless the run may be unresolved, also if it fell below vacuum or hit an end stop that its step cannot resolve.
+        Also raises it if a run fell below vacuum or hit an end stop that its step cannot resolve, unless the run may
+        be unresolved.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -528,15 +563,18 @@ class SetRun:
                 )
 
     def rms(self) -> Array:
-        """Compute the RMS of d1..d4 [Pa] and d3 d4 [Pa^2] of p_A and p_B in each segment, (runs, 2, segments, 5)."""
+        """Compute the RMS of the wavelet details of p_A and p_B in each segment, (runs, 2, segments, 5).
+
+        The details are d1, d2, d3, d4 [Pa] and the product d3 d4 [Pa^2].
+        """
         n_samples = np.diff(self.segments)[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute the mean |Q_L| (runs,) [m^3/s] of leaks with `flow_coefficients`, referred to full opening.
+        """Compute each leak's mean |Q_L| (runs,) [m^3/s] while open, referred to full opening.
 
-        0 for a leak that never opens.
+        The leaks have the coefficients `flow_coefficients`. The flow is 0 for a leak that never opens.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

@@ -1,6 +1,6 @@
 """Instruments and wavelet details of runs on lanes: from simulated pressures to sums of squared details.
 
-The laws are those of `instruments.record` and `signals.details`.
+The instruments and the wavelet transform are those of `instruments.record` and `signals.details`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ INSTRUMENT_ROWS = 18
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressure [Pa] as read back from the analog-digital converter (`instruments.digitize`).
+    """Compute the pressures [Pa] that are read back from the analog-digital converters of a group of runs.
 
-    The instrument's parameters are the rows of `sensor` from row `row` on (INSTRUMENT_ROWS).
+    The transducer saturates at its range, as in `instruments.digitize`. Its parameters are the rows of `sensor` from
+    row `row` on (`INSTRUMENT_ROWS` of them).
     """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
@@ -44,7 +45,11 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 
 @contracted
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
-    """Compute the mains hum [Pa] at a sample, by sin 2a = 2 sin a cos a; `row`: see `convert_lanes`."""
+    """Compute the mains hum [Pa] of a pressure channel at a sample, in each lane.
+
+    `sensor`, `row`: parameters of the channel's instrument, see `convert_lanes`. The sine is computed as 2 sin a cos
+    a.
+    """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
     sine = half_turn_sine(cycles)
@@ -63,10 +68,11 @@ def _read_pressure(
     sample: int,
     samples_since: float,
 ) -> Any:
-    """Compute the reading [Pa] of an instrument from the filtered `pressure` [Pa].
+    """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
-    `row`: see `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the
-    offset; `samples_since`: number of samples since the one for which `sensor` was built.
+    `sensor`, `row`: see `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]:
+    drift of the offset so far; `sample`: number of the sample; `samples_since`: number of samples since the one for
+    which `sensor` was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
@@ -80,10 +86,10 @@ def _read_pressure(
 
 @contracted
 def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, sums: np.ndarray, sums_row: int) -> None:
-    """Add the squares of the details of n samples, and of d3 d4, to the sums of their segments.
+    """Add the squared wavelet details of n samples, and the squares of d3 d4, to the sums of their segments.
 
-    `details` (LEVELS, CHUNK, WIDTH): of the samples from `first` on; `bounds` (segments + 1,): samples; segment k has
-    QUANTITIES rows of `sums` from `sums_row` + k QUANTITIES on.
+    `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at
+    which the segments begin, and the end. Segment k has QUANTITIES rows of `sums`, from `sums_row` + k QUANTITIES on.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES
@@ -112,14 +118,16 @@ def add_reading_squares(
     bounds: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute the readings of samples first <= s < last of the groups' runs, and add their squared details to `sums`.
+    """Compute the readings of p_A and p_B for some groups of runs, and add their squared wavelet details to `sums`.
 
-    `pressures`: (groups, outputs, CHANNELS, WIDTH), `factor` outputs a sample, the first filter tap of sample `first`
-    at output `first_output`; `taps` (groups, CHANNELS, taps, WIDTH): anti-alias filter; `sensors` (groups, CHANNELS,
+    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. `pressures` (groups, outputs, CHANNELS,
+    WIDTH): simulated pressures, `factor` outputs per sample; the anti-alias filter of sample `first` begins at output
+    `first_output`; `taps` (groups, CHANNELS, taps, WIDTH): coefficients of that filter; `sensors` (groups, CHANNELS,
     INSTRUMENT_ROWS, WIDTH): instruments at sample `first`; `keys` (groups, WIDTH): noise keys; `drifts` (groups,
-    CHANNELS, WIDTH): offset drift so far [Pa]; `wavelet`: taps (taps, WIDTH) of its low- and high-pass; `buffers`
-    (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels; `bounds` (segments + 1,):
-    samples; `sums`: (groups, CHANNELS, segments, QUANTITIES, WIDTH).
+    CHANNELS, WIDTH): offset drift so far [Pa], updated; `wavelet`: coefficients (taps, WIDTH) of its low-pass and
+    high-pass filters; `buffers` (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels,
+    updated; `bounds` (segments + 1,): samples at which the segments of the sums begin, and the end; `sums`: (groups,
+    CHANNELS, segments, QUANTITIES, WIDTH).
     """
     n_taps, stride, sum_rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
     low, high = wavelet
@@ -160,5 +168,8 @@ def add_reading_squares(
 
 @kernel
 def sense_lanes(*run: Any) -> None:
-    """Read the pressures of groups of runs and sum their squared details: `add_reading_squares`, compiled."""
+    """Add the squared wavelet details of the readings of some groups of runs to their sums, in compiled code.
+
+    The arguments are those of `add_reading_squares`.
+    """
     add_reading_squares(*run)

@@ -1,1 +1,1 @@
-"""Healthy machines drawn from a profile of nuisances."""
+"""Healthy machines drawn at random from a profile, which states how machines differ."""

@@ -30,11 +30,12 @@ _PATH_STEP = 0.05
 
 @dataclass(frozen=True)
 class BenchMachine:
-    """One healthy machine in one recording: the designed rig, the machine's deviations from it, drifts and duty.
+    """One healthy machine in one recording: how it deviates from the designed rig, its drifts and its duty.
 
-    `overrides`: the machine's parameters by dotted name, in SI; `duration` [s]: that of the recording, over which the
-    drifts have their sizes; `closed`: closed fraction of both throttles. A target is followed by the `controller` of
-    that name, built for the designed `rig` and not for the machine.
+    `overrides`: the machine's parameters by dotted name, in SI units; `duration` [s]: length of the recording, over
+    which the drifts have their sizes; `closed`: closed fraction of both throttles; `command`: voltage command or
+    position target of the duty. A position target is followed by the controller of the name `controller`, built for
+    the designed `rig` and not for the machine.
     """
 
     profile: str
@@ -49,10 +50,11 @@ class BenchMachine:
     controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
-        """Make the experiment of this machine on its duty, starting so that its strokes are centred.
+        """Make the experiment of this machine on its duty, with a start position from which its strokes are centred.
 
-        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts default
-        to the machine's.
+        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are
+        the machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of
+        its range.
         """
         machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         machine_values = {"seed": self.seed, "duration": self.duration, "command": self.command, "drifts": self.drifts}
@@ -66,13 +68,14 @@ class BenchMachine:
 
 
 def centred_start(rig: Rig, command: Command | Position | str, duration: float) -> float:
-    """Estimate the start position [m] from which a command's strokes are centred at mid-stroke.
+    """Estimate the start position [m] from which the strokes under a command are centred at mid-stroke.
 
-    For a position target it is the target's first value. Both are limited to the stroke.
+    For a position target it is the target's first value. The result is limited to the stroke. `duration` [s]: length
+    of the run.
 
-    The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is an unloaded one without inertia in
-    its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a servo valve
-    the piston moves with the valve's flow without load.
+    The piston moves with the pump's flow, A v = q_b omega/(2 pi), and the motor is taken as unloaded and without
+    inertia in its PI loop: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (eqs. 4.2-4.5). Behind a
+    servo valve the piston moves with the valve's flow without load.
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
@@ -96,14 +99,19 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
-    """Make the random generator of one nuisance, whose draws do not depend on the other nuisances of a profile."""
+    """Make the random generator of one nuisance, that is of one difference between machines.
+
+    It depends on `seed` and `name` only, so that the draws of a nuisance do not depend on the other nuisances of a
+    profile.
+    """
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
-    """Draw the path of a drift over `duration` [s]: linear with an end value of +-1, or a wander with a range of 1.
+    """Draw the course of a drift over `duration` [s]: linear with an end value of +-1, or a walk with a range of 1.
 
-    `warms`: a linear path rises instead of rising or falling at random.
+    `shapes`: names of the courses to choose from, "linear" and "wander" (a random walk); `warms`: a linear course
+    rises instead of rising or falling at random.
     """
     shape = shapes[int(random.integers(len(shapes)))]
     rises = random.random() < 0.5 or warms
@@ -114,9 +122,10 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 
 
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
-    """Draw the path of a drift: a mixture of the oil temperature's path and an independent one.
+    """Draw the course of a parameter's drift: a mixture of the oil temperature's course and an independent one.
 
-    `drift`: range of the size, and weight of the oil temperature's path `oil`.
+    `drift`: range of the size, and weight of the oil temperature in the mixture; `oil`: course of the oil
+    temperature.
     """
     path = _draw_path(random, drift.shapes, oil.duration)
     # weights whose squares sum to 1, so that the mixture varies as much as either path
@@ -125,9 +134,10 @@ def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> 
 
 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
-    """Draw the values of a nuisance by parameter (factors on the rig's values if it scales), and its drifts.
+    """Draw the values of a nuisance, that is of one difference between machines, and its drifts.
 
-    `oil`: path of the oil temperature, which drifts may follow.
+    Returns values by parameter, which are factors on the rig's values if the nuisance scales, and the list of drifts.
+    `oil`: course of the oil temperature, which drifts may follow.
     """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []
@@ -150,11 +160,11 @@ def draw(
     duration: float = 180.0,
     family: str = "",
 ) -> BenchMachine:
-    """Draw a healthy machine like `rig` from a profile (or its name or file); equal seeds give equal machines.
+    """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    `duration` [s]: that of the recording, over which the drifts have their sizes; `family`: one of the profile's
-    families, "" for none. Raises InputError for a seed below 0, an unknown family, or a drawn value out of its
-    parameter's range.
+    `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the drifts have
+    their sizes; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed below
+    0, a duration that is not positive and finite, or an unknown rig, profile or family.
     """
     from sealscope.parameters import load_rig
 
@@ -181,6 +191,7 @@ def draw(
     random, duty = _random_stream(seed, "duty"), distribution.duty
 
     def draw_one(options: Sequence[T]) -> T:
+        """Draw one of the options at random, each with the same probability."""
         return options[int(random.integers(len(options)))]
 
     command, closed = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)

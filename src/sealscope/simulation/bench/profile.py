@@ -26,7 +26,10 @@ _Entries = TypeVar("_Entries", bound=tuple[Any, ...])
 
 
 def _check_rising(pair: tuple[float, float]) -> tuple[float, float]:
-    """Check that a pair is [low, high] and return it (a pydantic validator); raise ValueError otherwise."""
+    """Check that a pair is [low, high] with low <= high, and return it (a pydantic validator).
+
+    Raises ValueError otherwise.
+    """
     if pair[0] > pair[1]:
         raise ValueError(f"must be [low, high] with low <= high, got {list(pair)}")
     return pair
@@ -63,10 +66,11 @@ class _NuisanceEntry(BaseModel):
 
 @dataclass(frozen=True)
 class DriftRange:
-    """The distribution of a parameter's drift.
+    """The distribution from which a parameter's drift is drawn.
 
-    `size`: (low, high) limits of the drift's range, in SI units if `absolute`, else relative; `shapes`: paths to choose
-    from; `oil`: weight of the oil temperature's path in the drift, 0 .. 1.
+    `size`: (low, high) limits of the drift's highest minus lowest value, in SI units if `absolute`, else relative to
+    the parameter; `shapes`: courses to choose from ("linear", "wander"); `oil`: weight of the oil temperature's
+    course in the drift, -1 .. 1, 0 for a drift that is independent of it.
     """
 
     size: tuple[float, float]
@@ -77,10 +81,11 @@ class DriftRange:
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A difference between machines, distributed uniformly between `low` and `high`.
+    """A difference between healthy machines, distributed uniformly between `low` and `high`.
 
-    `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: one draw for each parameter instead of
-    one for all; `drift`: None for none; `why`: the reason for the range.
+    `low`, `high`: SI values, or factors on the rig's values if `scales`; `each`: True to draw each parameter by
+    itself, False to draw one value for all; `drift`: distribution of their drift, None for none; `why`: the reason
+    for the range.
     """
 
     name: str
@@ -95,10 +100,10 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class NuisanceChoice:
-    """A difference between machines with a few possible values.
+    """A difference between healthy machines with a few possible values.
 
-    A machine has one of `values` for all `parameters`. `values`: SI numbers, or texts of a choice; `why`: the reason
-    for them.
+    A machine has one of `values` for all `parameters`. `values`: numbers in SI units, or texts for a parameter that
+    is a choice; `why`: the reason for them.
     """
 
     name: str
@@ -109,11 +114,11 @@ class NuisanceChoice:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Duty:
-    """The duties of a profile's machines, of which each machine has one.
+    """The duties of a profile's machines, of which each machine draws one.
 
-    A machine draws one of `commands`, a factor on its amplitude within `amplitude`, the closed fraction of both
-    throttles from `closed` (in the file: per cent), one of `loads` on the rod, and one of `controllers` for a position
-    target (default: PI).
+    A machine draws one of `commands`, a factor on its amplitude from the range `amplitude`, the closed fraction of
+    both throttles from `closed` (in the file: per cent), one of `loads` on the rod, and one of `controllers` that
+    follow a position target (default: PI). `why`: the reason for them.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -145,7 +150,7 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse a nuisance from an entry of a file; raise InputError with its name if it breaks a rule."""
+    """Parse a nuisance from an entry of a profile's file; raise InputError, which names it, if it breaks a rule."""
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)
@@ -154,7 +159,7 @@ def _parse_nuisance(table: Any) -> AnyNuisance:
 
 
 def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
-    """Convert an entry to a nuisance in SI units; raise InputError if its fields do not fit together."""
+    """Convert a file's entry to a nuisance in SI units; raise InputError if its fields do not fit together."""
     parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
@@ -185,7 +190,10 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 
 
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Convert the values of an entry to SI; raise InputError for a value that the parameter cannot have."""
+    """Convert the values of a file's entry to SI units; texts of a choice are returned as they are.
+
+    `choices`: texts that the parameter may have, () for a number. Raises InputError for a value that it cannot have.
+    """
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -198,7 +206,10 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert an entry's drift to SI or to fractions; raise InputError for a drift that its parameters cannot have."""
+    """Convert the drift in a file's entry to SI units, or to a fraction of the parameter for a relative drift.
+
+    Raises InputError for a drift that the parameters cannot have.
+    """
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)
@@ -213,7 +224,10 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
 
 
 def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Check that no two nuisances share a parameter or a name, and return them; raise InputError otherwise."""
+    """Check that no two nuisances share a parameter or a name, and return them.
+
+    Raises InputError otherwise.
+    """
     owner: dict[str, str] = {}
     for nuisance in nuisances:
         for parameter in nuisance.parameters:
@@ -223,7 +237,10 @@ def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ..
 
 
 def _check_distinct_names(entries: _Entries) -> _Entries:
-    """Check that no two entries have one name, and return them; raise InputError otherwise."""
+    """Check that all entries of a profile have different names, and return them.
+
+    Raises InputError otherwise.
+    """
     if len({entry.name for entry in entries}) < len(entries):
         raise InputError("they must have names of their own")
     return entries
@@ -239,7 +256,7 @@ class Family:
     """A family of machines, which differs from the other machines of a profile in one respect.
 
     `nuisances` replace those of the profile for the same parameters; `duty` replaces the profile's, None keeps it;
-    `warms`: the oil warms linearly in all of them.
+    `warms`: True if the oil warms linearly in all of them; `why`: the reason for the family.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -252,10 +269,10 @@ class Family:
 
 @dataclass(frozen=True)
 class Profile:
-    """The nuisances of a kind of machines, their duty, and `families` of machines that differ from the others.
+    """The differences between healthy machines of one kind (`nuisances`), and their duty.
 
-    `place`: the file, for messages; `seeds`: name from which seeds of cases are derived, "" for `name`. With it, a
-    renamed profile draws the same cases.
+    `families`: groups of machines that differ from the others; `place`: the file, for messages; `seeds`: name from
+    which the seeds of cases are derived, "" for `name`, so that a renamed profile can draw the same cases.
     """
 
     name: str
@@ -267,7 +284,7 @@ class Profile:
     seeds: str = field(default="", repr=False)
 
     def family(self, name: str) -> Family:
-        """Return the family of a name; raise InputError if there is none."""
+        """Return the profile's family of machines with this name; raise InputError if there is none."""
         for family in self.families:
             if family.name == name:
                 return family
@@ -275,7 +292,10 @@ class Profile:
         raise InputError(f"a family of {self.name} must be one of its own ({names}), got {name!r} ({self.place})")
 
     def of_family(self, name: str) -> Profile:
-        """Build the profile of one family's machines, with its nuisances and duty in place of this profile's."""
+        """Build the profile of one family's machines from this profile.
+
+        The family's nuisances and duty replace those of this profile.
+        """
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
         return replace(self, duty=family.duty or self.duty, nuisances=nuisances, families=())
@@ -284,7 +304,7 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Append the nuisances `replacing`, and remove their parameters from the others."""
+    """Return `nuisances` without the parameters that `replacing` draws, followed by `replacing`."""
     replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
@@ -294,7 +314,7 @@ def _replace_nuisances(
 
 
 def profile_names() -> tuple[str, ...]:
-    """List the names of the packaged profiles."""
+    """List the names of the profiles that come with the package."""
     return tuple(sorted(path.stem for path in _PACKAGED.glob("*.toml")))
 
 
@@ -328,7 +348,10 @@ class _File(BaseModel):
 
 
 def _read_profile(path: Path, place: str) -> Profile:
-    """Read a profile from its file, added to the profile that it extends; `place` names the file in messages."""
+    """Read a profile from its TOML file, merged with the profile that it extends if it names one.
+
+    `place` names the file in messages. Raises InputError if the file breaks a rule.
+    """
     tree = read_toml(path, "a profile", place)
     try:
         file = convert_type(_File, tree)

@@ -16,14 +16,14 @@ from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, UNITS, DataSheet, mean_l
 
 
 def _percent_change(pairs: Array) -> Array:
-    """Compute the change [%] from the first to the second of each pair (n, 2)."""
+    """Compute the relative change [%] from the first to the second value of each pair, (n, 2)."""
     return np.asarray(100.0 * (pairs[:, 1] - pairs[:, 0]) / pairs[:, 0])
 
 
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
-    """Tabulate one chamber in the thesis's form: RMS without leak, with leak, and change [%].
+    """Tabulate one chamber's simulated and measured RMS as the thesis does: without leak, with leak, change [%].
 
-    `sheet`: simulated; `measured`: None if not given.
+    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given.
     """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -45,10 +45,11 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 
 
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
-    """Compare the simulated sheet with the measured one; return a row for each chamber and detail.
+    """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    A row: chamber, detail, simulated and measured mean change [%], geometric mean and scatter of the ratio of the
-    leak-free RMS, number of tests with a change of the same sign, correlation of the changes. None if not measured.
+    A row contains chamber, detail, mean change of the RMS in simulation and in measurement [%], geometric mean and
+    scatter of the simulated over the measured RMS without a leak, number of tests with a change of the same sign, and
+    correlation of the changes. All but the first three are None without a measured sheet.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
@@ -66,7 +67,10 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
 
 def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the agreement of the simulated and the measured sheet, and both in the thesis's two tables."""
+    """Tabulate how well the simulated data sheet agrees with the measured one.
+
+    The first table compares the sheets, two more show both in the form of the thesis's tables.
+    """
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     summary = item.table(compare_sheets(sheet, context.sheet), notes, resolved=table.resolved)
@@ -74,7 +78,10 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the change of a detail's RMS over the mean leak: measured, simulated, and simulated without a leak."""
+    """Draw how much a leak changes the RMS of a wavelet detail, over the mean leak of each test.
+
+    The figure shows the change measured, simulated, and simulated without a leak; the item names chamber and detail.
+    """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()
     sources: tuple[tuple[DataSheet | None, str, Role], ...] = (

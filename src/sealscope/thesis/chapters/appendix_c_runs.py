@@ -1,7 +1,7 @@
 """Simulate the 41 tests of Appendix C and reduce each to the RMS of the wavelet details in its two halves.
 
-The tests are simulated with their leak, without any leak, and without a leak on a rig whose parameters drift. Only the
-RMS is stored, as the recordings would take gigabytes.
+The tests are simulated with their leak, without any leak, and without a leak on a rig whose parameters drift. Only
+the RMS is stored, because the recordings would take gigabytes.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw the steps of a test's parameters at half time: uniform relative size, random sign, all independent.
+    """Draw at random how the rig's parameters step at half time of a test that simulates drift.
 
-    `number`: number of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
+    The relative sizes are uniform in the ranges of `cases.toml`, the signs random, and all are independent. `number`:
+    number of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
     """
     rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
@@ -55,9 +56,10 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of a test on the identified rig, with its leak in the second half.
+    """Build the experiment of a test of Appendix C on the rig fitted to it, with the test's leak in the second half.
 
-    `half`: half the duration [s]; `leak`: False for no leak; `drifts`: steps of parameters; `seed`: seed of the noise.
+    `half`: half the duration [s]; `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of
+    parameters.
     """
     return Experiment.of(
         rig=BENCH_RIG,
@@ -71,7 +73,11 @@ def leak_test(
 
 
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
-    """Build the experiments of all tests of Appendix C; each test has two draws of the drift, or one if `quick`."""
+    """Build the experiments of all tests of Appendix C with what `kind` names: a leak, no change, or drift.
+
+    `half`: half the duration [s]. With drift each test is built twice, with two draws of the drift, or once if
+    `quick`.
+    """
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
         drifts = draw_drifts(condition.number, half, draw) if kind == "drift" else ()
@@ -81,7 +87,10 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe the change at half time: an opened leak, parameters with their factors, or nothing."""
+    """Describe what changes at half time of an experiment.
+
+    The text is "leak opened", the drifting parameters with their factors, or "nothing".
+    """
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -90,9 +99,10 @@ def _describe_change(experiment: Experiment) -> str:
 
 
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
-    """Compute the RMS of d1..d4 [psi] and d3d4 [psi^2] of both chambers within each part (from, to) [s].
+    """Compute the RMS of the wavelet details of both chamber pressures in each part (from, to) [s] of a recording.
 
-    A part is narrowed by the filters' reach: no coefficient depends on samples outside of it.
+    Returns those of d1..d4 [psi] and d3d4 [psi^2] by chamber and detail, one for each part. A part is narrowed by the
+    reach of the wavelet's filters, so that no detail depends on samples outside of it.
     """
     before, after = reach("db8", 4)[-1]
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -105,7 +115,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
 
 
 def pressure_range(values: Array) -> float:
-    """Compute the difference between the 95 % and the 5 % quantile of a pressure, in its unit."""
+    """Compute the range of a pressure as the difference between its 95 % and 5 % quantiles, in its unit."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
@@ -125,27 +135,31 @@ COLUMNS = (
 def make_row(
     condition: Condition, change: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: RmsPairs
 ) -> tuple[Cell, ...]:
-    """Build the row of a test with the columns `COLUMNS`; `change` describes what changed at half time."""
+    """Build the row of a test in a table with the columns `COLUMNS`.
+
+    `change`: description of what changes at half time; `ranges_MPa`: range of p_A and of p_B without a leak.
+    """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
 
 
 def column(table: ThesisTable, head: str) -> Array:
-    """Return the numbers of one column of a table, NaN for empty cells."""
+    """Return the numbers in one column of a table, given by its head; NaN for empty cells."""
     k = table.columns.index(head)
     return np.array([np.nan if row[k] is None else float(row[k]) for row in table.rows])  # type: ignore[arg-type]
 
 
 def parse_sheet(table: ThesisTable) -> DataSheet:
-    """Build the data sheet from the RMS columns of a table with the columns `COLUMNS`."""
+    """Build the data sheet from a table of simulated tests, which has the columns `COLUMNS`."""
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
 
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the 41 tests with their leak from half time on, without any change, or with drifting parameters.
+    """Simulate and tabulate the 41 tests of Appendix C; the item names what changes at half time.
 
-    The first test with a leak of each condition is checked by halving the step, except in a quick reproduction.
+    That is the opening of the leak, nothing, or a step of the rig's parameters (drift). With the leak, the first test
+    of each operating condition is checked by halving the solver's step, except in a quick reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows, proved = [], dict[tuple[str, float], bool | None]()  # condition -> whether its proved run is resolved
@@ -170,6 +184,9 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Return the table of the simulated tests (`leak`, `no-leak` or `drift`), and the sheet in it."""
+    """Read the simulated tests of Appendix C from another item, as a table and as a data sheet.
+
+    `runs`: what changes at half time of the tests, "leak", "no-leak" or "drift".
+    """
     table = first_table(context, f"appendix-c-{runs}")
     return table, parse_sheet(table)

@@ -31,7 +31,7 @@ _N_FACTORS = 24
 
 
 class WaveletFunctions(NamedTuple):
-    """Scaling function `phi` and mother wavelet `psi`, (n,), over the time `t` [samples]."""
+    """Scaling function `phi` (n,) and mother wavelet `psi` (n,) of a wavelet, over the time `t` (n,) [samples]."""
 
     phi: Array
     psi: Array
@@ -39,14 +39,18 @@ class WaveletFunctions(NamedTuple):
 
 
 class WaveletCentre(NamedTuple):
-    """Centre of a wavelet's energy in the wavelet's time, and its frequency of peak response [1 per unit of time]."""
+    """Centre of a wavelet in time and in frequency.
+
+    `time`: centre of its energy, in the wavelet's unit of time; `frequency`: frequency at which its spectrum is
+    largest [1 per unit of time].
+    """
 
     time: float
     frequency: float
 
 
 class AmplitudeSpectrum(NamedTuple):
-    """Cosines of a signal: frequencies [Hz], amplitudes and phases [degree], (n,)."""
+    """Amplitudes and phases [degree] of the cosines of which a signal consists, by frequency [Hz]; each (n,)."""
 
     frequency: Array
     amplitude: Array
@@ -54,7 +58,10 @@ class AmplitudeSpectrum(NamedTuple):
 
 
 class Spectrogram(NamedTuple):
-    """Amplitudes (frequencies, windows), over the middles of the windows [s] and the frequencies [Hz]."""
+    """Amplitudes (frequencies, windows) of the cosines in successive windows of a signal.
+
+    `t`: middles of the windows [s]; `frequency`: frequencies [Hz].
+    """
 
     t: Array
     frequency: Array
@@ -62,19 +69,21 @@ class Spectrogram(NamedTuple):
 
 
 def mother_wavelet() -> WaveletFunctions:
-    """Compute scaling function and mother wavelet of db8 by the cascade algorithm."""
+    """Compute the scaling function and the mother wavelet of db8 by the cascade algorithm."""
     return WaveletFunctions(*discrete_wavelet(WAVELET).wavefun(level=10))
 
 
 def wavelet_spectrum(omega: Array) -> np.ndarray:
-    """Compute the Fourier transform of the mother wavelet at `omega` [rad per unit of the wavelet's time].
+    """Compute the Fourier transform of the mother wavelet db8 at `omega` [rad per unit of the wavelet's time].
 
-    Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2), with H and G the synthesis filters' responses
-    sum_k taps_k exp(-j w k); unit l2 norm.
+    Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2), where H and G are the responses sum_k taps_k exp(-j w k) of
+    the synthesis filters, low-pass and high-pass. The wavelet has unit l2 norm.
+
     Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
 
     def response(taps: list[float], omega: Array) -> np.ndarray:
+        """Compute the frequency response of a filter at `omega` [rad per sample] from its coefficients."""
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * omega), np.array(taps, dtype=np.float64)))
 
     filters = discrete_wavelet(WAVELET)
@@ -85,7 +94,10 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
 
 
 def wavelet_centre() -> WaveletCentre:
-    """Compute the centre of the mother wavelet in time, by |psi|^2, and in frequency, by the peak of |Psi|."""
+    """Compute the centre of the mother wavelet db8 in time and in frequency.
+
+    The centre in time is weighted by |psi|^2; the centre in frequency is the peak of |Psi|.
+    """
     _, psi, t = mother_wavelet()
     omega = np.linspace(0.1, 12.0, 12000)
     peak = omega[np.abs(wavelet_spectrum(omega)).argmax()]
@@ -93,16 +105,16 @@ def wavelet_centre() -> WaveletCentre:
 
 
 def scales_for(frequencies: Array) -> Array:
-    """Compute the scales a [s] at which the wavelet's response peaks at `frequencies` [Hz]."""
+    """Compute the scales a [s] at which the wavelet db8 responds most to the given `frequencies` [Hz]."""
     return np.asarray(wavelet_centre().frequency / np.asarray(frequencies, dtype=np.float64))
 
 
 def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
+    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with a sum over samples in place of
+    the integral. Here b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
     Returns (scales, n) [unit of x times s^0.5].
-    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with the sum over samples as the
-    integral. b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
     """
     wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))  # db8 is 15 long at scale 1
     pad = min(x.size - 1, wavelet_reach)
@@ -118,12 +130,15 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
 
 
 def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
-    """Compute the gain of transform (3.4) followed by its inverse, at `frequencies` [Hz].
+    """Compute the gain, at `frequencies` [Hz], of the wavelet transform (3.4) followed by its inverse.
 
-    The inverse integrates with da db / |a|^weight:
-    gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da, over six decades of scales around the frequencies.
-    With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and dividing by it
-    recovers the signal. Eq. (3.5) is printed with weight 0, for which the gain falls as 1/w^2.
+    The inverse integrates with da db / |a|^weight, which gives
+
+    gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da,
+
+    here over six decades of scales around the frequencies. With weight 2 the gain is the same at all frequencies (the
+    wavelet's admissibility constant), and dividing by it recovers the signal. Eq. (3.5) is printed with weight 0, for
+    which the gain falls as 1/w^2.
     """
     omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
     geometric_mean = float(np.exp(np.mean(np.log(omega))))
@@ -133,12 +148,15 @@ def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
 
 
 def two_tone_signal(t: Array) -> Array:
-    """Compute x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3)."""
+    """Compute the sum of two tones x(t) = cos(2 pi 100 t) + 0.5 sin(2 pi 30 t), eq. (3.3), at times t [s]."""
     return np.asarray(np.cos(2.0 * np.pi * 100.0 * t) + 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
 
 
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute amplitudes and phases of the cosines in `x` (n,) at `rate` [Hz] by the DFT of eq. (3.2)."""
+    """Compute the amplitudes and phases of the cosines of which `x` (n,), sampled at `rate` [Hz], consists.
+
+    They follow from the discrete Fourier transform of eq. (3.2).
+    """
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     spectrum[0] /= 2.0  # the mean and the Nyquist frequency have no negative counterpart
     if x.size % 2 == 0:
@@ -150,7 +168,7 @@ def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
 def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectrogram:
     """Compute the amplitudes of the cosines in successive Hann windows of `x` (n,), sampled at `rate` [Hz].
 
-    `window`: length of a window [samples]; `step`: distance between the starts of windows [samples].
+    `window`: length of a window [samples]; `step`: distance from the start of one window to the next [samples].
     """
     starts = np.arange(0, x.size - window + 1, step)
     hann = np.hanning(window + 1)[:-1]
@@ -162,7 +180,7 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectr
 
 
 def nearest_index(values: Array, target: float) -> int:
-    """Return the index of the value nearest to `target`."""
+    """Return the index of the element of `values` that is nearest to `target`."""
     return int(np.abs(values - target).argmin())
 
 
@@ -209,7 +227,10 @@ def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def vanishing_moments(psi: Array, t: Array) -> int:
-    """Count the vanishing moments of `psi`: the integrals of t^k psi(t), k = 0, 1, ..., up to the first nonzero one."""
+    """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,).
+
+    These are the integrals of t^k psi(t), k = 0, 1, ..., before the first one that is not 0; at most 20 are counted.
+    """
     k = 0
     centred = t - t.mean()  # smaller powers, the same number of vanishing moments
     while k < 20 and abs(np.sum(centred**k * psi)) < 1e-6 * np.sum(np.abs(centred**k * psi)):
@@ -218,7 +239,7 @@ def vanishing_moments(psi: Array, t: Array) -> int:
 
 
 def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 3.4: a signal in time, its spectrum, its short-time Fourier and its wavelet transform.
+    """Draw Fig. 3.4: a signal in time, its spectrum, its short-time Fourier transform and its wavelet transform.
 
     The signal is the tone of 100 Hz of eq. (3.3) before 0.5 s, that of 30 Hz after, and a pulse of one sample and
     height 8 at 0.75 s.
@@ -254,7 +275,10 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _width(t: Array, values: Array) -> float:
-    """Compute the standard deviation [s] of the energy of `values` around its centre, within 0.1 s of the maximum."""
+    """Compute the width [s] of the largest peak of a series `values` over `t` [s].
+
+    It is the standard deviation of the energy around its centre, within 0.1 s of the maximum.
+    """
     near_peak = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
     centre = np.sum(t[near_peak] * weight)
@@ -262,7 +286,10 @@ def _width(t: Array, values: Array) -> float:
 
 
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the wavelet transform, eqs. (3.4)-(3.6), of the ringing of a simulated p_A before and with a leak."""
+    """Draw the wavelet transform of a simulated chamber pressure p_A, which rings, before and with a leak.
+
+    The transform is that of eqs. (3.4)-(3.6), of p_A as recorded and without the instruments' noise.
+    """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
@@ -293,19 +320,23 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Compute the rms of each row in blocks of `size` samples; return the blocks' middles [s], rms (rows, blocks)."""
+    """Compute the rms of each row of `rows` in successive blocks of `size` samples.
+
+    Returns the middles of the blocks [s], and the rms (rows, blocks). Samples after the last whole block are left
+    out.
+    """
     n_used = t.size // size * size
     block_rms = np.sqrt(np.mean(rows[:, :n_used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
     return t[:n_used].reshape(-1, size).mean(axis=1), block_rms
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 3.1 to 3.6."""
+    """Judge claims 3.1 to 3.6 on transforms, the wavelet, and the effect of a leak on the pressures."""
     return (*_fourier_claims(), *_wavelet_claims(), _leak_claim(context))
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2 on the amplitudes and phases of the two tones."""
+    """Judge claims 3.1 and 3.2: the spectrum shows the amplitudes and the phases of the two tones of eq. (3.3)."""
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]
@@ -318,7 +349,10 @@ def _fourier_claims() -> Iterator[Claim]:
 
 
 def _wavelet_claims() -> Iterator[Claim]:
-    """Judge claims 3.3 to 3.5: mean and energy of the wavelet, energy at other scales, and the inverse transform."""
+    """Judge claims 3.3 to 3.5 on the wavelet.
+
+    They concern its mean and energy, its energy at other scales, and the inverse transform.
+    """
     _, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
     mean, energy = float(psi.sum() * step), float((psi**2).sum() * step)

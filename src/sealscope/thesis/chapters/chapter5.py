@@ -36,9 +36,9 @@ NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0
 class PrintedTest:
     """One of the ten leakage tests whose figures chapter 5 prints.
 
-    `section` of the thesis; `command`; `level` of the leak; `first_figure`: number of its first figure;
-    `n_input_figures`: number of figures with command, speed and displacement (2: whole test and close-up); `half`: time
-    [s] when the leak opened, half the duration.
+    `section` of the thesis; `command`; `level` of the leak, such as "large"; `first_figure`: number of its first
+    figure; `n_input_figures`: number of figures with command, speed and displacement (2: whole test and close-up);
+    `half`: time [s] at which the leak opened, half the duration.
     """
 
     section: str
@@ -50,25 +50,25 @@ class PrintedTest:
 
     @property
     def parts(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(begin, end) [s] of the settled part without the leak, and of the part with the leak."""
+        """Begin and end [s] of the part without the leak, after the start-up, and of the part with the leak."""
         return (SETTLING, self.half), (self.half, 2 * self.half)
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The rows of Appendix C with this command and level."""
+        """The tests of Appendix C with this command and level of the leak, of which this test must be one."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
     def condition(self) -> Condition:
-        """The candidate row whose mean leak is nearest to the level's nominal leak (section 5.1).
+        """The test of Appendix C that this test is taken to be, which the thesis does not say.
 
-        The thesis does not say which row of Appendix C each test is.
+        It is the candidate whose mean leak is nearest to the level's nominal leak (section 5.1).
         """
         return min(self.candidates, key=lambda row: abs(row.mean_leak_lpm - NOMINAL_LPM[self.level]))
 
     @property
     def omega(self) -> float:
-        """Angular frequency [rad/s] of the command, such as 4 for `3 sin(4t)`."""
+        """Angular frequency [rad/s] of the test's command, such as 4 for `3 sin(4t)`."""
         return float(self.command.split("(")[1].rstrip(")").removesuffix("t").strip() or 1.0)
 
 
@@ -77,15 +77,15 @@ TESTS: dict[str, PrintedTest] = {row[0]: PrintedTest(*row) for row in load_texts
 
 
 def make_test_experiment(test: PrintedTest) -> Experiment:
-    """Build the experiment of a test: its command and throttles on the identified rig, its leak from half time on."""
+    """Build the experiment of a test on the rig fitted to Appendix C, with the leak from half time on."""
     return leak_test(test.condition, test.half, test.condition.number)
 
 
 @dataclass(frozen=True, eq=False)
 class FigureView:
-    """The views of a simulated test over the interval `span` [s].
+    """A simulated test over the interval `span` [s], from which the panels of a figure are drawn.
 
-    `chamber`: pressure that the views of wavelet details show.
+    `chamber`: the pressure, p_A or p_B, whose wavelet details are drawn; "" if none are.
     """
 
     run: SimulatedRun
@@ -95,11 +95,11 @@ class FigureView:
 
     @property
     def recording(self) -> Recording:
-        """The run's recording."""
+        """The recording of the simulated test."""
         return self.run.recorded
 
     def notes(self) -> str:
-        """Format the note that names the simulated row of Appendix C and the reason for its choice."""
+        """Format the note that names the simulated test of Appendix C and the reason for its choice."""
         row = self.test.condition
         other_rows = ", ".join(str(candidate.number) for candidate in self.test.candidates if candidate is not row)
         choice = format_note("chosen-row", row=row.number, others=other_rows) if other_rows else ""
@@ -108,34 +108,37 @@ class FigureView:
         return format_note("shown-test", chosen=choice, **values)
 
     def _panel(self, label: str, *curves: FigureCurve) -> Panel:
-        """Build a panel over time with the onset of the leak marked."""
+        """Build a panel over time [s] with a mark where the leak opens; `label`: label of the y axis."""
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
     def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
-        """Build the curve of `y` over `t` [s] within the span, from `start` [s] on.
+        """Build the curve of `y` over `t` [s] within the figure's interval, from `start` [s] on.
 
-        `t`: None for the time of the recording.
+        If `t` is None, `y` is over the times of the recording.
         """
         t = self.recording.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
-        """Build two curves of the series `y` over `t` [s], one without and one with the leak.
+        """Build two curves of `y` over `t` [s], one before and one after the leak opens.
 
-        `t`: None for the time of the recording.
+        If `t` is None, `y` is over the times of the recording.
         """
         half, (start, stop) = self.test.half, self.span
         before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the settled part without the leak, and of the part with the leak."""
+        """Return (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
 
     def draw_inputs(self) -> PanelsAndNumbers:
-        """Draw command, motor speed and displacement."""
+        """Draw command, motor speed and displacement of the test as three panels.
+
+        Also returns the RMS of the speed and the drift of the displacement, without and with the leak.
+        """
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
         panels = [
@@ -151,7 +154,10 @@ class FigureView:
         return panels, numbers
 
     def draw_leak(self) -> PanelsAndNumbers:
-        """Draw leak flow and chamber pressures."""
+        """Draw the leak flow and both chamber pressures of the test as three panels.
+
+        Also returns the mean leak, and the 5 to 95 % range of each pressure without and with the leak.
+        """
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
         roles: dict[str, Role] = {"p_A": "A", "p_B": "B"}
@@ -168,15 +174,19 @@ class FigureView:
         return panels, numbers
 
     def draw_details(self) -> PanelsAndNumbers:
-        """Draw the wavelet details d1 to d4 and d3d4 of the pressure of `chamber`."""
+        """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure as five panels.
+
+        Also returns the RMS of each detail without and with the leak, and its change.
+        """
         series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
         return panels, self._rms_changes(QUANTITIES)
 
     def draw_windowed_rms(self) -> PanelsAndNumbers:
-        """Draw the windowed RMS of the wavelet details d3 and d4 and their product d3d4, of the pressure of `chamber`.
+        """Draw the windowed RMS of the wavelet details d3, d4 and d3d4 of one chamber's pressure as three panels.
 
-        Horizontal lines mark the RMS over the settled part of the test without the leak, and over the part with it.
+        Horizontal lines mark the RMS over the part of the test without the leak, after the start-up, and over the
+        part with it. Also returns these RMS and their changes.
         """
         t, curves = windowed_detail_rms(self.recording, self.chamber)
         rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
@@ -187,7 +197,7 @@ class FigureView:
         return panels, self._rms_changes(_WINDOWED)
 
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
-        """Compute the RMS of the details `names` of `chamber` without and with the leak, and its change [%]."""
+        """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each."""
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:
@@ -207,7 +217,10 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: all views of each test, whole and as close-ups."""
+    """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
+
+    A view is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
+    """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -224,7 +237,7 @@ def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
 
 
 def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one of Figs. 5.1 to 5.89: the item's view of a test over an interval of time."""
+    """Draw one of Figs. 5.1 to 5.89: a view of a test over an interval of time, which the item's inputs name."""
     test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
     view = FigureView(context.run(make_test_experiment(test)), test, span, item.inputs["chamber"])
     _, draw = _VIEWS[item.inputs["view"]]
@@ -233,9 +246,9 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Compute the RMS of d1..d4 [psi] and d3d4 [psi^2] of a chamber's pressure in windows of `WINDOW_SIZE` samples.
+    """Compute the RMS of a chamber pressure's wavelet details in successive windows of `WINDOW_SIZE` samples.
 
-    Returns the centres of the windows [s], and the RMS by the detail's name.
+    Returns the centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)
     inside = transformed.inside()
@@ -246,11 +259,12 @@ def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict
 
 @dataclass(frozen=True)
 class LeakTestMeasures:
-    """Measures of one simulated test; each pair is (without leak, with leak).
+    """Measures of one simulated test of chapter 5; each pair is (without leak, with leak).
 
-    `rms`: RMS of the details as in Appendix C; `speed`: RMS of the motor's speed [rad/s]; `drift`: drift of the mean
-    position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s]; `range_MPa`: 5 to 95 % range of each chamber's
-    true pressure; `step_s`: time [s] of the best-fitting single step in the windowed RMS of d3 of each chamber.
+    `rms`: RMS of the wavelet details, as in Appendix C; `speed`: RMS of the motor's speed [rad/s]; `drift`: drift of
+    the piston's mean position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s]; `range_MPa`: 5 to 95 % range
+    of each chamber's noise-free pressure; `step_s`: time [s], by chamber, at which a single step fits the windowed
+    RMS of d3 best.
     """
 
     test: PrintedTest
@@ -263,9 +277,9 @@ class LeakTestMeasures:
 
 
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
-    """Estimate the time [s] of a single step in a series `y` (n,) over `t` (n,) [s] by least squares.
+    """Estimate the time [s] at which a series `y` (n,) over `t` (n,) [s] changes its mean, by least squares.
 
-    The estimate is halfway between two points. At least `min_points` points are on each side of the step.
+    The estimate is halfway between two points, with at least `min_points` points before and after it.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)
@@ -278,7 +292,10 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate one of the ten tests and compute its measures; `leak`: False for the same test without its leak."""
+    """Simulate one of the ten tests of chapter 5 and compute its measures.
+
+    `leak`: False for the same test without its leak.
+    """
     experiment = make_test_experiment(test)
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
     recording = run.recorded
@@ -288,7 +305,7 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
     masks = [(t >= start) & (t < stop) for start, (_, stop) in zip(starts, test.parts, strict=True)]
 
     def compute_pair(values: Array, statistic: Callable[[Array], float] = rms) -> tuple[float, float]:
-        """Compute a statistic without and with the leak."""
+        """Compute a statistic of `values` over whole periods of the command, without and with the leak."""
         return statistic(values[masks[0]]), statistic(values[masks[1]])
 
     steps = {}

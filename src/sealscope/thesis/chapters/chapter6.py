@@ -1,4 +1,4 @@
-"""Section 6.2, the thesis's future work: position control of the piston with leaks and loads, by pump and by valve."""
+"""Section 6.2, the thesis's future work: position control with leaks and loads, by the pump and by a servo valve."""
 
 from __future__ import annotations
 
@@ -67,32 +67,36 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Compute the conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under `LOAD`."""
+    """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under the load `LOAD`."""
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
 @cache
 def _rig(name: str = RIG) -> Rig:
-    """Load a rig by name; later calls return the same object."""
+    """Load a rig by its name; later calls return the same object."""
     return load_rig(name)
 
 
 def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
-    """Compute the piston's amplitude [m] at `f` [Hz] over the samples of a mask."""
+    """Compute the amplitude [m] of the piston's motion at the frequency `f` [Hz], over the samples of a mask."""
     return float(np.abs(sine_fit(run.t[mask], run["x"][mask], 2 * math.pi * f).amplitudes[0]))
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the supply flow [m^3/s] of a servo valve without overlap, the flow through its open edge."""
+    """Compute the flow [m^3/s] from the supply into a servo valve without overlap, over time.
+
+    It is the flow through the open edge between supply and chamber A or B.
+    """
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
 @dataclass(frozen=True)
 class ControlledRig:
-    """A rig with `PLANT_MISMATCH`, a controller and a leak of `lpm` [L/min] under `LOAD`.
+    """A rig whose piston a controller positions, with a leak that passes `lpm` [L/min] under the load `LOAD`.
 
-    `controller`: name of the controller, "" for an open loop, `ideal` for a fault-tolerant one that knows the leak;
-    `rig`: name of the rig; `values`: further parameters.
+    The rig's parameters differ from those that the controller assumes (`PLANT_MISMATCH`). `controller`: name of the
+    controller, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `rig`: name of the rig;
+    `values`: further parameters.
     """
 
     controller: str
@@ -101,7 +105,10 @@ class ControlledRig:
     values: tuple[tuple[str, float], ...] = ()
 
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
-        """Simulate a command for `duration` [s] under `LOAD` plus `load`."""
+        """Simulate the rig for `duration` [s] under the load `LOAD` plus `load`.
+
+        `command`: text of a position target or, in an open loop, of a voltage command.
+        """
         rig = _rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
         if self.controller == "ideal":
@@ -120,21 +127,28 @@ class ControlledRig:
         return integrate_run(experiment, experiment.leaks)
 
     def run_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Simulate five cycles of the duty; return the run and the mask of its last two cycles."""
+        """Simulate five cycles of the duty, a sine of the position; return the run and a mask of its last two.
+
+        `load`: load in addition to `LOAD`; the mask is over the samples of the run.
+        """
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
     def stiffness(self) -> float:
-        """Compute the dynamic stiffness |F/x| [N/mm] at `STIFFNESS_FREQUENCY` with a constant target."""
+        """Compute the dynamic stiffness |F/x| [N/mm] of the controlled piston at `STIFFNESS_FREQUENCY`.
+
+        The target is constant while the load varies as a sine of amplitude `STIFFNESS_FORCE`.
+        """
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
         run = self.run("position 0 mm sin(t)", 16.0, force)
         is_settled = run.t >= 8.0
         return STIFFNESS_FORCE / (1e3 * _amplitude_at(run, is_settled, STIFFNESS_FREQUENCY))
 
     def bandwidth(self) -> float:
-        """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB.
+        """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
-        The error is relative to the target; inf if no tested frequency exceeds the limit.
+        It is interpolated between the tested frequencies `BANDWIDTH_FREQUENCIES`. Returns the lowest of these if the
+        error exceeds the limit there already, and inf if it exceeds it at none of them.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -155,8 +169,9 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency on the duty with a damper as the only load.
 
-        They are the damper's work over the electrical energy of the motor, and over the hydraulic energy delivered: by
-        a lossless supply to the valve at its pressure, or by the pump at its ports.
+        They are the damper's work over the electrical energy of the motor, and over the hydraulic energy delivered.
+        The latter is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the
+        supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -167,7 +182,11 @@ class ControlledRig:
 
 
 class Tracking(NamedTuple):
-    """Rms error of the position, electrical energy of the motor in a cycle, and mean compensated leak flow."""
+    """Result of a run on the duty: rms error of the position, energy, and compensated leakage.
+
+    `energy_J`: electrical energy of the motor in a cycle; `compensated_lpm`: mean leakage flow that the controller
+    compensates.
+    """
 
     error_mm: float
     energy_J: float
@@ -175,7 +194,10 @@ class Tracking(NamedTuple):
 
 
 def tracking(run: Trajectory, mask: Array) -> Tracking:
-    """Compute error, energy and compensated flow of a run on the duty, over the samples of a mask (whole cycles)."""
+    """Compute error, energy and compensated leakage of a run on the duty, over the whole cycles that a mask selects.
+
+    The compensated flow is 0 if the controller reports none.
+    """
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
     energy = float(np.mean(run["V"][mask] * run["i"][mask])) * CYCLE
@@ -183,7 +205,10 @@ def tracking(run: Trajectory, mask: Array) -> Tracking:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate and draw error, bandwidth, energy and stiffness of each controller over the size of the leak."""
+    """Tabulate tracking error, bandwidth, energy and stiffness of each controller over the size of the leak.
+
+    Error and stiffness are also drawn as a figure.
+    """
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
         loop = ControlledRig(name, lpm)
@@ -195,16 +220,17 @@ def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figur
 
 
 def _leak_flows(context: Context) -> tuple[float, ...]:
-    """Return the leaks [L/min] to simulate, fewer in a quick reproduction."""
+    """Return the leaks [L/min] to simulate, fewer of them in a quick reproduction."""
     return (0.0, 0.5) if context.quick else LEAKS
 
 
 def _figure_over_leak(
     table: ThesisTable, title: str, roles: Mapping[tuple[str, ...], Role], columns: Sequence[str], log_y: bool = False
 ) -> Figure:
-    """Draw columns of a table over the leak.
+    """Draw some columns of a table over the leak, one panel each.
 
-    `roles`: leading cells -> style; each curve shows the rows that begin with these cells.
+    `roles`: line style of each curve, by the cells with which the curve's rows begin; the next cell of these rows is
+    the leak [L/min]. `columns`: heads of the columns to draw.
     """
     panels = []
     for head in columns:
@@ -221,12 +247,12 @@ def _figure_over_leak(
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the drift of the piston's mean position with leaks, in an open loop and in two closed loops."""
+    """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers."""
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
 
     def drift(run: Trajectory, first: int) -> float:
-        """Compute the drift of the mean position [mm/min] from cycle `first` to the next."""
+        """Compute the drift of the piston's mean position [mm/min] from cycle `first` of a run to the next cycle."""
         means = [float(np.mean(run["x"][_cycle_mask(run.t, k)])) for k in (first, first + 1)]
         return 60e3 * (means[1] - means[0]) / CYCLE
 
@@ -241,17 +267,17 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def _cycle_mask(t: Array, k: int) -> Array:
-    """Return the mask of the samples in cycle `k` of the duty, counted from 0."""
+    """Return the mask of the samples at times `t` [s] in cycle `k` of the duty, counted from 0."""
     return np.asarray((t >= k * CYCLE) & (t < (k + 1) * CYCLE))
 
 
 def load_head(controller: str, lpm: float, quantity: str) -> str:
-    """Build the head of a column of `load_table`."""
+    """Build the head of a column of `load_table`, which states controller, leak [L/min] and quantity."""
     return f"{controller}, {lpm:g} L/min: {quantity}"
 
 
 def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate error and energy on the duty over the load, for a leak of 0 and 0.05 L/min."""
+    """Tabulate tracking error and energy on the duty over the load, for three controllers without and with a leak."""
     loops = [ControlledRig(name, lpm) for name in LOAD_CONTROLLERS for lpm in (0.0, 0.05)]
     heads = ["load [N]"]
     for loop in loops:
@@ -264,7 +290,10 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate tracking and stiffness with an external leak past the rod seal of either side."""
+    """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
+
+    The last column is the change of the lower chamber pressure from the third to the fifth cycle.
+    """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
     # "ideal" is left out, as it knows only internal leaks
@@ -282,7 +311,10 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate and draw tracking, stiffness and energy of the pump-controlled and the valve-controlled rig."""
+    """Tabulate tracking, stiffness and energy of the pump-controlled and the valve-controlled rig over the leak.
+
+    Energy and stiffness are also drawn as a figure.
+    """
     rigs = {"pump": RIG, "valve": VALVE_RIG}
     rows: list[tuple[Cell, ...]] = []
     for (source, rig), name, lpm in itertools.product(rigs.items(), VALVE_CONTROLLERS, _leak_flows(context)):
@@ -298,18 +330,21 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Read column `head` of the rows that begin with `names`, by the leak [L/min] in the column after the names."""
+    """Read a column of a table, given by its head, as values by the leak [L/min].
+
+    Only rows that begin with the cells `names` are read; the leak is in the next column. Empty cells are read as 0.
+    """
     n, k = len(names), table.columns.index(head)
     return {float(row[n] or 0.0): float(row[k] or 0.0) for row in table.rows if row[:n] == names}
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 6.2.1 to 6.2.4."""
+    """Judge claims 6.2.1 to 6.2.4 on position control."""
     return _disturbance_claim(context), _tolerance_claim(context), _load_claim(context), _valve_claim(context)
 
 
 def _disturbance_claim(context: Context) -> Claim:
-    """Judge claim 6.2.1: with feedback of the position, a leak causes no drift."""
+    """Judge claim 6.2.1: if the position is fed back, a leak causes no drift."""
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
     rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]
@@ -319,7 +354,10 @@ def _disturbance_claim(context: Context) -> Claim:
 
 
 def _tolerance_claim(context: Context) -> Claim:
-    """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness, and costs nothing if healthy."""
+    """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness with a leak.
+
+    Without a leak it must have the tracking error of the PI controller, and compensate nothing.
+    """
     table = first_table(context, "sec-6.2-controllers")
     error, tolerant_error = (_column_by_leak(table, (name,), _ERROR) for name in ("pi", "fault-tolerant"))
     stiffness, tolerant_stiffness = (_column_by_leak(table, (name,), _STIFF) for name in ("pi", "fault-tolerant"))
@@ -336,7 +374,7 @@ def _tolerance_claim(context: Context) -> Claim:
 
 
 def _load_claim(context: Context) -> Claim:
-    """Judge claim 6.2.3: the controllers' largest errors over the loads differ."""
+    """Judge claim 6.2.3: the largest tracking error over the loads differs between controllers."""
     table, error_ranges = first_table(context, "sec-6.2-load"), {}
     for name in LOAD_CONTROLLERS:
         errors = column(table, load_head(name, 0.0, _ERROR))

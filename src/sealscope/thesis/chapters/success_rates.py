@@ -1,4 +1,4 @@
-"""Recount Table 5.1 on the data sheet and in simulation, with the false alarms of its rules."""
+"""Count the success rates of Table 5.1 again, on the data sheet and in simulation, with the rules' false alarms."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _Row = tuple[Cell, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of Table 5.1: it fires if every one of its details moves in its chamber's direction.
+    """A rule of Table 5.1: it fires in a test if the RMS of all its wavelet details moves as a leak should move it.
 
-    `details`: (chamber, detail) pairs; `printed`: rates [%] in the thesis, empty for a rule it does not claim.
+    That is down for p_A and up for p_B (`DIRECTION`). `details`: (chamber, detail) pairs; `printed`: rates [%] in the
+    thesis, empty for a rule that it does not claim.
     """
 
     name: str
@@ -37,13 +38,13 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Return the mask (n,) of the tests in which the rule fires."""
+        """Find the tests of a data sheet in which the rule fires; return a mask (tests,)."""
         moves = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
         return np.asarray(np.all(moves, axis=0))
 
 
 def _load_rules(name: str) -> tuple[Rule, ...]:
-    """Load the rules of an entry of `cases.toml`."""
+    """Load the rules in the entry `name` of `cases.toml`."""
     return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
 
 
@@ -54,9 +55,9 @@ CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format the number of tests in which a rule fires as cells: "k/n", rate and its 95 % interval [%].
+    """Format how often a rule fires as four cells of a table: "k/n", rate [%], and its 95 % interval [%].
 
-    `fires`: mask (n,) of the tests, None if there are no tests: the cells are then empty.
+    `fires`: mask (tests,), or None if there are no tests, for which the cells are empty.
     """
     if fires is None:
         return None, None, None, None
@@ -66,7 +67,10 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of the columns of `_format_count`; `source`: name of the sheet; `count`: first head."""
+    """Build the heads of the four columns of `_format_count`.
+
+    `source`: name of the sheet, with which each head begins; `count`: name of the first column.
+    """
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
@@ -88,8 +92,8 @@ THRESHOLDS = (
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
     """Count how often each rule of Table 5.1 fires, as rows with the columns `RATES`.
 
-    The sheets: measured (None if not given), and simulated with leak, without, and without leak but with drift. The
-    last two rows are rules that always and never fire.
+    The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
+    leak but with drifting parameters. The last two rows are rules that always and never fire.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -106,11 +110,10 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 
 
 def column_tests(sheet: DataSheet) -> list[_Row]:
-    """Test each column of a sheet for a change with the leak.
+    """Test each column of a data sheet for a change with the leak, by a sign test.
 
-    Returns rows with the columns `TESTS`, without the first one, the source.
-
-    Holm's correction covers all ten columns, since Table 5.1 chose among them.
+    Returns rows with the columns `TESTS` except the first, the source. Holm's correction covers all ten columns,
+    since Table 5.1 chose among them.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -123,26 +126,31 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 
 
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
-    """Compute the log change that noise alone exceeds with probability `FALSE_ALARMS`.
+    """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    `either_side`: True to count changes of either sign. The threshold is ``1.645 rms(log change of d1)``, or 1.960
-    times this rms for either side. d1 is noise and does not depend on the leak, so its changes between the halves are
-    those of a leak-free rig. The other details scatter at least as much.
+    `either_side`: True to count changes of either sign, False for one sign. The threshold is ``1.645 rms(log change
+    of d1)``, or 1.960 times this rms for either sign. d1 is noise and does not depend on the leak, so its changes
+    between the halves of a test are those of a rig without a leak. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
-    """Compute the log change that drift alone exceeds with probability `FALSE_ALARMS`.
+    """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    The change counts in the direction in which a leak moves the chamber (`DIRECTION`).
+    `drift`: the sheet of tests simulated with drifting parameters and no leak. Only changes in the direction in which
+    a leak moves the chamber (`DIRECTION`) count as positive.
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks found by each rule of one detail with a threshold, as rows with the columns `THRESHOLDS`."""
+    """Count the leaks that each rule on a single wavelet detail finds if a change must exceed a threshold.
+
+    Returns rows with the columns `THRESHOLDS`. The threshold is `d1_threshold` on the measured sheet (None if not
+    given), and `drift_threshold` on the simulated sheet `leak`.
+    """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
         ((chamber, detail),) = rule.details
@@ -159,7 +167,11 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
 
 
 def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Build three tables: Table 5.1 recounted, sign tests of all columns, and Table 5.1's rules with thresholds."""
+    """Build three tables on the success rates of Table 5.1.
+
+    They are the table counted again, sign tests of all columns of Appendix C, and the rules of the table with
+    thresholds.
+    """
     leak_runs, leak = simulated_sheet(context, "leak")
     no_leak, drift = (simulated_sheet(context, runs)[1] for runs in ("no-leak", "drift"))
     measured, resolved = context.sheet, leak_runs.resolved

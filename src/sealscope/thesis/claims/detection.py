@@ -1,4 +1,4 @@
-"""Judge the thesis's claims on detection, and tabulate all claims of all chapters with their verdicts."""
+"""Judge the thesis's claims on the detection of leaks, and tabulate all claims of all chapters with verdicts."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 
 
 def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge the claims of the abstract and of chapters 1, 5 and 6, in the thesis's order."""
+    """Judge the claims on detection in the abstract and in chapters 1, 5 and 6; return them in the thesis's order."""
     evidence = gather_evidence(context)
     claims = (*sheet.leak_level_claims(), *sheet.claims(evidence), *sheet.curve_claims(evidence), *rig.claims(evidence))
     return tuple(sorted(claims, key=_claim_order))
 
 
 def _claim_order(claim: Claim) -> tuple[int, ...]:
-    """Return the sorting key of a claim: the abstract first, then by the numbers of its id."""
+    """Return the numbers by which claims are sorted: those of the claim's id, the abstract's claims being first."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
 def claims_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate all claims of all chapters, and count the verdicts."""
+    """Tabulate the claims of all chapters with their verdicts, and the number of claims with each verdict."""
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_claim_order)
     verdicts = Counter(claim.verdict for claim in claims)

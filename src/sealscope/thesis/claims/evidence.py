@@ -33,11 +33,12 @@ SENSITIVE = ("d3", "d4", "d3d4")
 
 @dataclass(frozen=True, eq=False)
 class ClaimEvidence:
-    """The data by which the claims are judged.
+    """The data by which the claims on detection are judged.
 
-    `measured_sheet`: None if not given; `leak_sheet`, `no_leak_sheet`, `drift_sheet`: simulated sheets with leak,
-    without leak, and without leak but with drift; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of
-    the ten tests that chapter 5 prints, by section; `no_leak_measures`: those of test 5.2a without its leak.
+    `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
+    `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting
+    parameters; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of the ten tests whose figures
+    chapter 5 prints, by section; `no_leak_measures`: those of test 5.2a without its leak.
     """
 
     measured_sheet: DataSheet | None
@@ -50,7 +51,11 @@ class ClaimEvidence:
 
 
 def gather_evidence(context: Context) -> ClaimEvidence:
-    """Simulate the sheet with a leak, without, and with drift, and simulate and measure each test of chapter 5."""
+    """Gather the data by which the claims on detection are judged.
+
+    The simulated sheets of Appendix C are read from other items; the ten tests of chapter 5 are simulated and
+    measured.
+    """
     leak_table, leak_sheet = simulated_sheet(context, "leak")
     return ClaimEvidence(
         measured_sheet=context.sheet,
@@ -71,10 +76,10 @@ SheetTest = Callable[[DataSheet], Iterable[Finding]]
 
 @dataclass(frozen=True)
 class SheetClaim:
-    """A claim that is tested on a sheet.
+    """A claim that is tested on a data sheet, measured or simulated.
 
-    `test` yields the findings; their texts follow `head`, joined by `separator`; `values`: computes the values of
-    placeholders in the claim's other texts.
+    `test`: yields the findings on a sheet; `head`, `separator`: text before and between the texts of the findings;
+    `values`: computes the values of placeholders in the claim's other texts.
     """
 
     test: SheetTest
@@ -83,10 +88,13 @@ class SheetClaim:
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
 
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge the claim by the measured sheet, and state the findings on both sheets; `kind`: as in `judge_claim`."""
+        """Judge the claim by the measured sheet, and state the findings on the measured and on the simulated sheet.
+
+        Without a measured sheet the claim cannot be tested. `id`: the claim's id; `kind`: as in `judge_claim`.
+        """
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
-            """Return the text of all findings on a sheet, and the results of all parts."""
+            """Return the text of all findings on a sheet, and which parts of the claim are true."""
             texts, parts = zip(*self.test(sheet), strict=True)
             return self.head + self.separator.join(texts), list(itertools.chain.from_iterable(parts))
 
@@ -98,60 +106,74 @@ class SheetClaim:
 
 
 def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
-    """Format the rate at which a rule fires on a sheet (`format_rate`)."""
+    """Format the rate at which a rule fires on a data sheet, such as "35/41 = 85.4 % (71 to 94 %)"."""
     return format_rate(rule.fires(sheet))
 
 
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format `k/n = rate % (low to high %)` of the true values, with the exact 95 % interval."""
+    """Format how many of the tests are true, as `k/n = rate % (low to high %)` with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def log_change_to_percent(change: Array | float) -> float:
-    """Convert a log change to percent; several log changes are averaged first."""
+    """Convert a change of a logarithm to a relative change [%]; several changes are averaged first."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the p-value of each column's sign test with Holm's correction for all ten columns."""
+    """Compute the p-value of the sign test on each column of a data sheet, corrected by Holm for all ten columns.
+
+    Returns the p-values by (chamber, wavelet detail).
+    """
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
-    """Return True if a detail moves in its chamber's direction with a corrected p-value below 5 %."""
+    """Return True if the RMS of a wavelet detail moves significantly in the direction that the thesis states.
+
+    The direction is down for p_A and up for p_B (`DIRECTION`). The detail must move so in most tests of the sheet,
+    with a corrected p-value below 5 % (`holm_p_values`).
+    """
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
 
 
 def is_correlated(r: float, n: int, controls: int = 0) -> bool:
-    """Return True if a correlation `r` of n points, partial to `controls` columns, differs from 0 at the 5 % level.
+    """Return True if a correlation coefficient `r` of n points differs from 0 at the 5 % level.
 
-    Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
+    `controls`: number of columns on which both variables were regressed before, 0 for a plain correlation. Fisher's
+    z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """
     z = np.arctanh(np.clip(r, -0.999999, 0.999999))  # clipped, as artanh(1) is infinite
     return bool(abs(z) * np.sqrt(n - 3 - controls) > WITHIN_95)
 
 
 def condition_design() -> Array:
-    """Build the design matrix (n, commands + 1) of the operating condition: indicators of the commands, and closing."""
+    """Build the design matrix (tests, commands + 1) of the operating conditions of Appendix C for a regression.
+
+    Its columns are an indicator of each command, and the closed fraction of the throttles.
+    """
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the correlation of the residuals of `x` and `y`, (n,), after least squares on `controls`, (n, k)."""
+    """Compute the correlation of `x` and `y` (n,) at equal `controls` (n, k).
+
+    It is the correlation of their residuals after least squares on `controls`.
+    """
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
 
 def leave_one_out_r2(columns: Array, y: Array) -> float:
-    """Compute the leave-one-out R^2 of least squares of `y` (n,) on `columns` (n, k).
+    """Compute the leave-one-out R^2 of a least-squares fit of `y` (n,) by `columns` (n, k).
 
-    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen, Technometrics
-    16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
+    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
+    Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
     hat = columns @ np.linalg.pinv(columns)
     residuals = (y - hat @ y) / (1.0 - np.diag(hat))
@@ -159,17 +181,20 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
 
 
 def change_design(sheet: DataSheet) -> Array:
-    """Build the design matrix (n, 7) of a constant and the six log changes of Table 5.1."""
+    """Build the design matrix (tests, 7) of a data sheet's changes for a regression.
+
+    Its columns are a constant and the log changes of the six wavelet details of Table 5.1.
+    """
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
     return np.column_stack([np.ones_like(changes[0]), *changes])
 
 
 def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
-    """Classify halves of tests as leaking or not by the log RMS of d1..d4 of both chambers, without a baseline.
+    """Classify the halves of the tests as leaking or not by their RMS alone, without a baseline.
 
-    A logistic regression with an L2 penalty of 1 on standardised columns is cross-validated with one test, or one
-    operating condition, left out. Returns the accuracy and the area under the ROC. Raises MissingExtra if scikit-learn
-    is not installed.
+    Returns the accuracy and the area under the ROC. The inputs are the log RMS of d1..d4 of both chambers. A logistic
+    regression with an L2 penalty of 1 on standardised columns is cross-validated: each time one test, or all tests of
+    one operating condition, are left out (`leave_out`). Raises MissingExtra if scikit-learn is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression

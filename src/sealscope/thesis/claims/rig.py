@@ -47,7 +47,7 @@ def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
 
 
 def _wavelet_claims() -> Iterator[Claim]:
-    """Judge the claims on the wavelet: separation of the frequency bands, and computing cost."""
+    """Judge claims 5.7.5 and a.3 on the wavelet: it separates the frequency bands, and its computation is cheap."""
     overlaps = {}  # order -> fraction of the high-pass filter's energy below its band
     for order in (1, 2, 4, 8):
         _, high_pass = decomposition_filters(f"db{order}")
@@ -72,19 +72,23 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _percent_change(pair: tuple[float, float]) -> float:
-    """Compute the change [%] from the first value, without leak, to the second, with leak."""
+    """Compute the relative change [%] from the first value, without a leak, to the second, with it."""
     before, after = pair
     return 100.0 * (after / before - 1.0)
 
 
 def _format_range(values: Iterable[float]) -> str:
-    """Format minimum and maximum of some percentages."""
+    """Format the smallest and the largest of some percentages, such as "-1.25 to +3.00 %"."""
     values = list(values)
     return f"{min(values):+.2f} to {max(values):+.2f} %"
 
 
 def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims on the ten tests of chapter 5: speed, drift, severity, pressure ranges, time of the onset."""
+    """Judge the claims on the ten tests of chapter 5, by their simulated measures.
+
+    They concern the speed, the drift, the severity of the leak's effects, the pressure ranges, and the time of the
+    onset.
+    """
     tests = evidence.test_measures
     speed_changes = {name: abs(_percent_change(test.speed)) for name, test in tests.items()}
     worst = max(speed_changes, key=lambda name: speed_changes[name])
@@ -113,9 +117,9 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 
 
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
-    """Judge the claim that a fall of d3 of p_A indicates a leak.
+    """Judge claim 5.7.6: a fall of the RMS of d3 of p_A indicates a leak.
 
-    The rule must fire rarely without a leak, and with drift alone.
+    The rule must fire rarely without a leak, and rarely if parameters drift without a leak.
     """
     d3_rule = CLAIMED[0]
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
@@ -125,7 +129,7 @@ def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
 
 
 def _throttle_claim(evidence: ClaimEvidence) -> Claim:
-    """Judge claim 6.1.3: throttles raise the leak-free pressure range, and more so at larger commands."""
+    """Judge claim 6.1.3: closed throttles raise the leak-free pressure ranges, and more so at larger commands."""
     ranges = np.stack([column(evidence.leak_table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
     closed_pct = np.array([row.closed_pct for row in APPENDIX_C])
     texts, is_raised, amplitude_rises = [], [], []
@@ -145,7 +149,10 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
 
 
 def _agreement_claim(evidence: ClaimEvidence) -> Claim:
-    """Judge claim 6.1.4: simulation and measurement agree in leak-free RMS and in the sign of d3's change."""
+    """Judge claim 6.1.4: simulation and measurement agree.
+
+    They must agree in the RMS without a leak, and in the sign of the change of d3 of p_A.
+    """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:
         return judge_claim("6.1.4", [], compared="compared with the sheet only", sheet=NO_SHEET)

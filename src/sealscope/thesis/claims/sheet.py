@@ -1,6 +1,7 @@
 """Judge the claims of the abstract, chapter 5 and the conclusions on leaks, details and success rates by the sheet.
 
-A function `_test_...` yields the findings on a sheet: a text, and which parts of the claim are true.
+A function `_test_...` yields the findings on a data sheet: a text, and which parts of the claim are true. "Beyond the
+noise" means that a change is larger than noise alone causes in 95 % of the tests (`d1_threshold`).
 """
 
 from __future__ import annotations
@@ -54,12 +55,15 @@ _CELLS = CLAIMED[:6]  # without the last, which has two details
 
 
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
-    """Return the mask of the tests whose change in the chamber's direction exceeds the noise (`d1_threshold`)."""
+    """Find the tests in which the RMS of a wavelet detail changes by more than the noise (`d1_threshold`).
+
+    Only changes in the chamber's direction count, down for p_A and up for p_B. Returns a mask (tests,).
+    """
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
-    """Format a rule's rates in simulations without a leak, without and with drift."""
+    """Format how often a rule fires in simulations without a leak, with constant and with drifting parameters."""
     return (
         f"In simulation the rule fires in {format_rule_rate(evidence.no_leak_sheet, rule)} with no leak and in "
         f"{format_rule_rate(evidence.drift_sheet, rule)} with drift alone"
@@ -67,12 +71,12 @@ def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
 
 
 def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim on a rule's success rate as printed; `where`: its place in the thesis."""
+    """Build the claim that a rule of Table 5.1 has its printed success rate; `where`: its place in the thesis."""
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that the rate is within one percentage point of a printed rate, and beyond chance."""
+        """Test that a rule's rate is within one percentage point of a printed rate, and higher than by chance."""
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
         as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
@@ -80,7 +84,7 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
     def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        """Format the rule, its printed rates and its false alarms for the claim's texts."""
+        """Format the rule, its printed rates and its false alarms in simulation for the claim's texts."""
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (
             f"; the printed 65 is near the product of the two printed rates, 0.85 x 0.76 = {0.85 * 0.76:.3f} "
@@ -98,7 +102,10 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 
 
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.7: each detail moves opposite to its chamber's direction (`DIRECTION`) in most tests."""
+    """Test claim 5.5.7: in most tests each wavelet detail moves opposite to the direction that section 5.6 states.
+
+    These directions are down for p_A and up for p_B (`DIRECTION`).
+    """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
@@ -113,7 +120,7 @@ def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.2: at each level of leak d3 of p_A falls beyond the noise in at least 80 % of the tests."""
+    """Test claim 5.6.2: at each level of the leak, d3 of p_A falls beyond the noise in at least 80 % of the tests."""
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
         level_exceeds = exceeds[[row.level == level for row in APPENDIX_C]]
@@ -121,10 +128,10 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
-    """Build the function that tests each rule in the row with the smallest mean leak."""
+    """Build the function that tests whether each of `rules` fires in the test with the smallest mean leak."""
 
     def test_smallest(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that each rule fires in the row with the smallest mean leak."""
+        """Test that each rule fires in the test with the smallest mean leak."""
         row = int(np.argmin(mean_leaks()))
         for rule in rules:
             changes = (log_change_to_percent(sheet.log_change(c, name)[row]) for c, name in rule.details)
@@ -135,7 +142,10 @@ def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
 
 
 def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim a.2: d3d4 of p_A falls at the smallest leak, and in at least 85 % of leaks up to 0.0050 L/min."""
+    """Test claim a.2: even small leaks lower the RMS of the product d3d4 of p_A.
+
+    It must fall at the smallest leak, and in at least 85 % of the tests with leaks up to 0.0050 L/min.
+    """
     yield from _smallest_leak_test((_A_D3D4,))(sheet)
     fires = _A_D3D4.fires(sheet)
     fires_small = fires[mean_leaks() <= 0.0050]
@@ -144,7 +154,10 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 6.1.1: d3d4 moves in both chambers from 0.0048 L/min on, and in more than 80 % of the tests."""
+    """Test claim 6.1.1: the product d3d4 moves in both chambers for leaks from 0.0048 L/min on.
+
+    The smallest leak with this result must be 0.0048 L/min, and more than 80 % of all tests must have it.
+    """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
     min_leak = float(leak[fires].min()) if fires.any() else math.nan
     yield f"{min_leak:.4f} L/min", [abs(min_leak - 0.0048) < _ROUNDING_LPM]
@@ -152,7 +165,7 @@ def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim a.1: in each chamber the best detail exceeds the noise in at least 80 % of the tests."""
+    """Test claim a.1: in each chamber the best detail changes beyond the noise in at least 80 % of the tests."""
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
         exceeds = _exceeds_noise(sheet, chamber, best)
@@ -160,7 +173,11 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Build the texts of claim a.1: accuracy and AUC of `classify_without_baseline` for both ways of leaving out."""
+    """Format the success of detecting leaks without a baseline, for the texts of claim a.1.
+
+    The texts state accuracy and AUC of `classify_without_baseline`, with single tests and with whole operating
+    conditions left out. They say so if scikit-learn is not installed.
+    """
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
     for name in groups:
@@ -172,17 +189,23 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 
 
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Build the texts of claim 5.6.1: false alarms of the sign rule on d3 of p_A, and its rate beyond the noise."""
+    """Format results on the fall of d3 of p_A for the texts of claim 5.6.1.
+
+    They are the false alarms of the rule in simulation, and how often d3 falls beyond the noise on the sheet.
+    """
     rate_beyond_noise = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
     return {"controls": _format_controls(evidence, _A_D3), "finds": rate_beyond_noise}
 
 
 def _trend_test(chamber: str) -> SheetTest:
-    """Build the function that tests the correlation of a chamber's changes with the mean leak."""
+    """Build the function that tests whether the changes of a chamber's wavelet details grow with the mean leak."""
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
 
     def test_correlations(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that raw and partial correlation of each detail have the claimed sign and are significant."""
+        """Test that each detail's change is significantly correlated with the mean leak, with the claimed sign.
+
+        This is tested without and with correction for the operating condition (`partial_correlation`).
+        """
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
             raw, partial = float(np.corrcoef(change, leak)[0, 1]), partial_correlation(change, leak, conditions)
@@ -195,13 +218,17 @@ def _trend_test(chamber: str) -> SheetTest:
 
 
 def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Compute the values of claims 5.5.3 and 5.5.4: cross-validated R^2 of the leak from condition and from changes."""
+    """Compute how well the mean leak can be predicted, for the texts of claims 5.5.3 and 5.5.4.
+
+    The values are the cross-validated R^2 of predictions from the operating condition and from the changes of the
+    RMS.
+    """
     columns = {"condition": condition_design(), "changes": change_design(sheet)}
     return {name: leave_one_out_r2(design, mean_leaks()) for name, design in columns.items()}
 
 
 def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.1: the details of Table 5.1 move significantly, and those it leaves out do not."""
+    """Test claim 5.5.1: the wavelet details of Table 5.1 change significantly, and those it leaves out do not."""
     p = holm_p_values(sheet)
     for rule in (*_CELLS, *UNCLAIMED):
         ((chamber, name),) = rule.details
@@ -212,7 +239,7 @@ def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.2: the change of d3d4 is larger relative to its scatter than those of d3 and d4."""
+    """Test claim 5.5.2: the mean change of d3d4, relative to its scatter, is larger than those of d3 and of d4."""
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
         effect_sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
@@ -231,7 +258,7 @@ def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.5: the details of p_B rise significantly."""
+    """Test claim 5.5.5: the RMS of the wavelet details of p_B rises significantly."""
     p = holm_p_values(sheet)
     for name in SENSITIVE:
         n_up = int(np.sum(sheet.log_change("p_B", name) > 0))
@@ -239,7 +266,7 @@ def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.3.1: in all tests of chapter 5 the details of p_A fall and those of p_B rise."""
+    """Test claim 5.3.1: in all tests that chapter 5 shows, the details of p_A fall and those of p_B rise."""
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
             moves = sheet.log_change(chamber, name)[_PRINTED_ROWS] * DIRECTION[chamber] > 0
@@ -271,7 +298,7 @@ _CLAIMS: dict[str, SheetClaim] = {
 
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims of the abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6 on detection."""
+    """Judge the claims that the data sheet decides: abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6."""
     for number, rule in enumerate(CLAIMED, start=1):
         where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"
         yield _rate_claim(rule, where).judge(evidence, f"5.4.{number}", "5.4")
@@ -284,7 +311,11 @@ Statement = Literal["fall", "change"]
 
 
 def leak_level_claims() -> Iterator[Claim]:
-    """Judge claims 5.1.1 to 5.1.3: nominal leaks of the levels, their ratios, and one leak in particular."""
+    """Judge claims 5.1.1 to 5.1.3 on the levels of the leak ("large" to "extra-small").
+
+    They concern the nominal leak of each level, the ratios of these, and the leak that section 5.2 states for one
+    test.
+    """
     leaks = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
     texts = [f"{level} {min(lpm):.4f} to {max(lpm):.4f}, mean {np.mean(lpm):.4f}" for level, lpm in leaks.items()]
     contains_nominal = [min(values) <= NOMINAL_LPM[level] <= max(values) for level, values in leaks.items()]
@@ -309,10 +340,10 @@ def leak_level_claims() -> Iterator[Claim]:
 def _test_rows(
     sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test the details `names` for a change beyond noise in the test's row.
+    """Test in the data sheet's row of a printed test whether wavelet details change by more than the noise.
 
-    Returns a text, and a result for each detail. If several rows can be the test, the text also counts those with a
-    change beyond noise.
+    `names`: the details; `statement`: "fall" or "change", as the thesis says. Returns a text, and a result for each
+    detail. If several rows can be the printed test, the text also counts those with a change beyond the noise.
     """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
@@ -332,10 +363,10 @@ def _test_rows(
 
 
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge for each test of chapter 5 the claim that details of a chamber's pressure fall, or change.
+    """Judge for each test of chapter 5 the claim that wavelet details of a chamber's pressure fall, or change.
 
-    They must change by more than the noise on the sheet of measurements. The simulated changes and the limits of drift
-    alone are stated for comparison.
+    On the measured sheet they must change by more than the noise. The simulated changes, and the changes that
+    drifting parameters alone can cause, are stated for comparison.
     """
     for number, (section, chamber, names, statement) in enumerate(load_texts("cases.toml")["curves"], start=1):
         test = TESTS[section]
@@ -372,5 +403,5 @@ def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 
 
 def _join_words(names: Sequence[str]) -> str:
-    """Join words with commas and a final "and"."""
+    """Join words with commas and a final "and", such as "d3, d4 and d3d4"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,4 +1,4 @@
-"""Reproduce items of the thesis into a folder, in parallel, without repeating stored results that are up to date."""
+"""Reproduce items of the thesis into a folder, in parallel; results stored earlier are reused if up to date."""
 
 from __future__ import annotations
 
@@ -40,10 +40,11 @@ _WHAT = "a reproduction"
 
 @dataclass(frozen=True)
 class ItemStatus:
-    """The state of an item in a results folder.
+    """The state of an item, that is of a figure, table or claim, in the folder of a reproduction.
 
-    `state`: made now, kept from an earlier call, left out or failed (with a `reason`), or not made (not selected, or
-    stored by another version); `products` without the curves of figures; `files`: its files, relative to the folder.
+    `state`: "made" by this call, "kept" from an earlier one, "left out" or "failed" (for the `reason` given), or "not
+    made" (not selected, or stored by another version); `products`: without the curves of figures; `files`: paths
+    relative to the folder.
     """
 
     item: Item
@@ -55,7 +56,10 @@ class ItemStatus:
 
 @dataclass(frozen=True)
 class ItemRow:
-    """The stored result of an item, or its `error` with traceback; `key`: digest of its inputs."""
+    """The stored result of an item, or the `error` that it raised, with its traceback `trace`.
+
+    `key`: digest of the item's inputs, by which an outdated result is recognised.
+    """
 
     id: str
     key: str
@@ -65,7 +69,7 @@ class ItemRow:
     trace: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the row to plain JSON values."""
+        """Convert the row to plain values that JSON can store."""
         return asdict(self)
 
 
@@ -84,11 +88,13 @@ def reproduce(
     publish: Publish | None = None,
     progress: Progress = lambda ended, total, in_work: None,
 ) -> dict[str, ItemStatus]:
-    """Make the selected items (`items.select_items`) and the items they need; return the status of all items.
+    """Make the selected items of the thesis and the items they need; return the status of all items by id.
 
-    `jobs`: number of processes, by default one per core, 1 for this process only; `sheet`: folder of the data sheet
-    (`sheet.find_sheet`); `publish`: writes the products. Results that an earlier call stored from the same inputs are
-    reused. A failed item does not stop the others, and KeyboardInterrupt leaves all finished items stored.
+    `patterns`: selection (`items.select_items`); `folder`: folder of the results; `quick`: True to simulate less;
+    `jobs`: number of processes, by default one per core, 1 for this process only; `sheet`: folder of the measured
+    data sheet (`sheet.find_sheet`); `items`: the list to select from, by default that of `items.toml`; `publish`:
+    writes the products as files. Results that an earlier call stored from the same inputs are reused. A failed item
+    does not stop the others, and KeyboardInterrupt leaves all finished items stored.
 
     Raises InputError for an unknown item, a bad sheet, or a folder that is damaged, in use or cannot be written.
     """
@@ -110,7 +116,7 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the jobs of the `ready` items, and report each as in work when it is taken."""
+            """Yield the jobs of items whose needs are made, and report each item as in work when its job is taken."""
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
@@ -135,7 +141,10 @@ def reproduce(
 
 
 def _empty_runs_folder(store: Path) -> Path:
-    """Empty the folder of simulated runs: unpickling files that this call did not write would be unsafe."""
+    """Empty the folder for the simulated runs of this call, below the results folder `store`; return its path.
+
+    Unpickling files that this call did not write would be unsafe. Raises InputError if the folder cannot be emptied.
+    """
     runs = make_inner_folder(store, "runs")
     try:
         shutil.rmtree(runs)
@@ -146,7 +155,11 @@ def _empty_runs_folder(store: Path) -> Path:
 
 
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
-    """Compute for each item a digest of all inputs of its products and files, including the items it needs."""
+    """Compute for each item a digest of all inputs of its products and files, by id.
+
+    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes
+    those of the items it needs.
+    """
     by_id, sources = {item.id: item for item in items}, sources_key()
 
     @cache
@@ -161,14 +174,20 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 
 
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Build an item's row from JSON values; return None if it was made from other inputs."""
+    """Build the stored row of an item from JSON values; return None if it was made from other inputs.
+
+    `keys`: present digest of each item's inputs. Raises ValueError if the values are no row.
+    """
     if not isinstance(tree, dict):
         raise ValueError("no row")
     return convert_type(ItemRow, tree) if keys.get(str(tree.get("id"))) == tree.get("key") else None
 
 
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
-    """Determine the status of an item before it is made: kept from an earlier call, left out, or not made."""
+    """Determine the status of an item before anything is made: "kept", "left out" or "not made".
+
+    `row`: its stored result, None if there is none. An item is left out if it needs the data sheet and there is none.
+    """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
     if row is None or row.error or not all(is_file_path(folder / name) for name in row.files):
@@ -177,7 +196,10 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
 
 
 def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
-    """Yield the row of each item; an item whose process died gets a row with that error."""
+    """Yield the result of each item from pairs of a job and its result.
+
+    An item whose process died has the result None; it gets a row with that error.
+    """
     with closing(results):
         for (item, key, _), row in results:
             yield row or ItemRow(item.id, key, error="the process that made it died")
@@ -186,7 +208,7 @@ def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> G
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make an item, publish it and return its row; an exception is stored in the row."""
+    """Make one item and write its files; return its row, with the error if an exception was raised."""
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)
     try:
@@ -200,7 +222,7 @@ def _make_item(
 
 
 def _thin_product(product: Product | Claim) -> Product | Claim:
-    """Thin the long lines of a figure (`thin_curve`); return other products unchanged."""
+    """Thin the long lines of a figure to fewer points (`thin_curve`); return any other product unchanged."""
     if not isinstance(product, Figure):
         return product
     panels = []
@@ -214,13 +236,13 @@ def _thin_product(product: Product | Claim) -> Product | Claim:
 
 
 def drop_curves(product: Product | Claim) -> Product | Claim:
-    """Remove the panels of a figure, which are not stored; return other products unchanged."""
+    """Remove the panels of a figure, which are not stored; return any other product unchanged."""
     return replace(product, panels=()) if isinstance(product, Figure) else product
 
 
 @cache
 def sources_key() -> str:
-    """Compute a digest of this package's sources and of the versions of `_LIBRARIES`."""
+    """Compute a digest of this package's sources and of the versions of the libraries on which results depend."""
     package = Path(__file__).parents[2]
     suffixes = (".py", ".toml", ".csv", ".j2", ".css", ".js")
     sources = files_digest(path for path in sorted(package.rglob("*")) if path.suffix in suffixes)

@@ -1,4 +1,4 @@
-"""The context in which an item is made: simulated runs, the measured sheet, and products of other items."""
+"""The context in which an item of the reproduction is made: simulated runs, data sheet, other items' products."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ Products = tuple[Product | Claim, ...]
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """The result of a simulated run.
+    """The result of one simulated run, which may have failed.
 
-    `recording`: None if the run failed; `t` [s], `outputs`: true outputs at its samples (`TRUE_OUTPUTS` in
-    `simulation.simulate`); `resolved`: True if all channels changed little when the step was halved, None if not
-    tested; `step_changes`: these changes by channel; `diverged`: one-line reason of a failed run, "" for none.
+    `recording`: None if the run failed; `t` [s], `outputs`: noise-free outputs at the samples (`TRUE_OUTPUTS` in
+    `simulation.simulate`); `mean_leak_lpm`: mean leak while open [L/min]; `resolved`: True if the run changed little
+    when the solver's step was halved, None if this was not tested; `step_changes`: the changes by name of the
+    quantity; `diverged`: one-line reason of a failed run, "" for none.
     """
 
     recording: Recording | None
@@ -40,16 +41,16 @@ class SimulatedRun:
 
     @property
     def recorded(self) -> Recording:
-        """The recording; raises SimulationFailed if the run diverged."""
+        """The recording of the run; raises SimulationFailed if the run diverged."""
         if self.recording is None:
             raise SimulationFailed(self.diverged)
         return self.recording
 
 
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
-    """Simulate an experiment; a run that diverges or depends on the step raises no error.
+    """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    `prove`: True to test the run with half the step.
+    `prove`: True to test the run with half the solver's step.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -63,11 +64,11 @@ def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
 
 @dataclass(frozen=True)
 class Context:
-    """The inputs of an item's maker.
+    """The inputs of the function that makes an item: simulated runs, the data sheet, products of other items.
 
-    `name`: id of the item; `needs`: ids of the items it needs, whose `products` are given by id, without failed items;
-    `quick`: True to simulate less; `sheet`: measured sheet, None if not given or not used by the item; `runs`: folder
-    of simulated runs, shared by the processes of this call.
+    `name`: id of the item; `needs`: ids of the items it needs; `products`: products of these items by id, without
+    failed items; `quick`: True to simulate less; `sheet`: measured data sheet, None if not given or not used by the
+    item; `runs`: folder of simulated runs, shared by the processes of one reproduction.
     """
 
     name: str
@@ -78,9 +79,10 @@ class Context:
     runs: Path
 
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
-        """Simulate an experiment, or load its run if any process of this call has simulated it.
+        """Simulate an experiment, or load its run if another item of this reproduction has simulated it.
 
-        `prove`: True to test the run with half the step. Other processes that ask for the run wait for it.
+        `prove`: True to test the run with half the solver's step. Other processes that ask for the same run wait for
+        it.
         """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with lock_file(path.with_suffix(".lock"), None):
@@ -91,7 +93,10 @@ class Context:
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of a needed item; () if it was left out. Raises InputError if it failed."""
+        """Return the products of a needed item; () if that item was left out.
+
+        Raises InputError if the item failed, or if it is not among this item's needs.
+        """
         if name not in self.needs:
             raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
         if name not in self.products:
@@ -100,5 +105,8 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among a needed item's products."""
+    """Return the first table among the products of a needed item, given by its id.
+
+    Raises InputError if the item failed.
+    """
     return next(product for product in context.product(item) if isinstance(product, ThesisTable))

@@ -1,4 +1,4 @@
-"""The list of cases, figures, tables and claims by the thesis's numbers (`items.toml`), with their makers."""
+"""The list of cases, figures, tables and claims that can be reproduced (`items.toml`), and the selection from it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sealscope.thesis.engine.texts import load_texts
 
 @dataclass(frozen=True)
 class Item:
-    """One case, figure, table or claim that can be reproduced.
+    """One case, figure, table or group of claims of the thesis that can be reproduced.
 
-    `id`: the thesis's number, such as "fig-4.22"; `make`: function that makes its products; `inputs`: name -> input of
-    the maker; `uses_sheet`: it shows the thesis's data sheet if that is given; `needs_sheet`: it cannot be made without
-    the sheet; `needs`: ids of items whose products the maker uses; `claims`: ids of claims that it supports or refutes;
-    `columns`: columns of its table.
+    `id`: kind and the thesis's number, such as "fig-4.22"; `make`: function that makes its products; `inputs`: inputs
+    of that function by name; `uses_sheet`: True if it shows the measured data sheet when that is given;
+    `needs_sheet`: True if it cannot be made without the sheet; `needs`: ids of items whose products `make` uses;
+    `claims`: ids of claims that it supports or refutes; `columns`: heads of its table.
     """
 
     id: str
@@ -41,13 +41,16 @@ class Item:
 
     @property
     def reads_sheet(self) -> bool:
-        """True if the item uses or needs the data sheet."""
+        """True if the item uses or needs the measured data sheet."""
         return self.uses_sheet or self.needs_sheet
 
     def figure(
         self, panels: Iterable[Panel], numbers: Iterable[Number] = (), resolved: bool | None = None, notes: str = ""
     ) -> Figure:
-        """Build the item's figure."""
+        """Build the figure of this item, with its id, title and claims.
+
+        `numbers`: numbers reported with the figure; `resolved`: see `Figure`.
+        """
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
     def table(
@@ -60,7 +63,11 @@ class Item:
         title: str = "",
         resolved: bool | None = None,
     ) -> ThesisTable:
-        """Build a table of the item; `tail` is appended to its id, `title` and `columns` replace the item's."""
+        """Build a table of this item, with its claims.
+
+        `tail` is appended to the item's id; `title` and `columns` replace the item's if stated; `resolved`: see
+        `ThesisTable`.
+        """
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title
         return ThesisTable(id, title, heads, tuple(rows), self.claims, resolved=resolved, notes=notes)
@@ -71,7 +78,7 @@ _FIELDS = {declared.name for declared in fields(Item)}
 
 @cache
 def load_items() -> tuple[Item, ...]:
-    """Read the items of `items.toml`, in its order."""
+    """Read the list of all items from `items.toml`, in its order."""
     return tuple(
         item for chapter, rows in load_texts("items.toml").items() for name, row in rows.items()
         for item in _iter_row_items(name, int(chapter), row)
@@ -79,7 +86,10 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the items of a row of `items.toml`: one, or those listed by the function in its entry `each`."""
+    """Yield the items that a row of `items.toml` describes.
+
+    It is one item, or several if the row's entry `each` names a function that lists them. `name`: the row's key.
+    """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
     row_fields["make"] = _import_function(row_fields["make"])
@@ -93,15 +103,16 @@ def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator
 
 
 def _import_function(name: str) -> Any:
-    """Import a function by its dotted name below `sealscope.thesis`."""
+    """Import a function by its dotted name below `sealscope.thesis`, such as "chapters.chapter3.wavelet_figure"."""
     module, _, function = name.rpartition(".")
     return getattr(importlib.import_module(f"sealscope.thesis.{module}"), function)
 
 
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
-    """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`), in the order of the list.
+    """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
 
-    Raises InputError, with the closest ids, if a pattern matches nothing.
+    The selected items keep the order of the list `items`. Raises InputError, with the closest ids, if a pattern
+    matches nothing.
     """
     ids = [item.id for item in items]
     selected: set[str] = set()
@@ -125,7 +136,7 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def add_needed_items(items: Sequence[Item], selected: Iterable[Item]) -> tuple[Item, ...]:
-    """Add all items that the selected ones need, directly or indirectly, in the order of the list."""
+    """Return the selected items and all items that they need, directly or indirectly, in the order of the list."""
     by_id, ids = {item.id: item for item in items}, {item.id for item in selected}
     while missing := {needed for name in ids for needed in by_id[name].needs} - ids:
         ids |= missing

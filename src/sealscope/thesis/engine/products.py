@@ -23,7 +23,10 @@ Values = Annotated[Array, PlainValidator(np.asarray)]
 
 @dataclass(frozen=True, eq=False)
 class FigureCurve:
-    """One series of points (x, y), in the panel's units."""
+    """One series of points (x, y) in a panel of a figure, in the panel's units.
+
+    `role`: meaning of the curve, which determines its line style; `kind`: how it is drawn.
+    """
 
     x: Values
     y: Values
@@ -34,7 +37,10 @@ class FigureCurve:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """Values (rows over y, columns over x) drawn as greys, such as a spectrogram."""
+    """Values over x and y that a panel shows in greys, for example a spectrogram.
+
+    `values`: a row for each y, a column for each x; `label`: meaning of the values, with their unit.
+    """
 
     x: Values
     y: Values
@@ -44,7 +50,11 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One set of axes; labels carry the unit in brackets, such as "p_A [MPa]"; `marks`: (x, text) of vertical lines."""
+    """One set of axes of a figure, with curves, or an image, or both.
+
+    Labels have the unit in brackets, such as "p_A [MPa]". `marks`: (x, text) of vertical lines; `x_range`: limits of
+    the x axis, None for those of the curves.
+    """
 
     x_label: str
     y_label: str
@@ -59,7 +69,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Number:
-    """One number behind a figure."""
+    """One number that a figure reports in addition to its curves."""
 
     name: str
     value: float | str
@@ -68,10 +78,10 @@ class Number:
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A figure under the thesis's own number.
+    """A figure that reproduces one of the thesis; `id` contains the thesis's number.
 
-    `claims`: ids of claims that it supports or refutes; `resolved`: True if all its runs passed the test with half the
-    step, None if nothing was simulated; an unresolved figure is marked.
+    `claims`: ids of claims that it supports or refutes; `resolved`: True if all its simulated runs passed the test
+    with half the solver's step, False if one did not, None if nothing was tested. An unresolved figure is marked.
     """
 
     id: str
@@ -85,7 +95,11 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class ThesisTable:
-    """A table: `columns` with units in brackets, `rows` of text and numbers."""
+    """A table that reproduces one of the thesis, or summarises results.
+
+    `columns`: heads, with units in brackets; `rows`: texts and numbers, None for an empty cell; `claims`, `resolved`:
+    as of a `Figure`.
+    """
 
     id: str
     title: str
@@ -102,10 +116,10 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 
 @dataclass(frozen=True)
 class Claim:
-    """One testable sentence of the thesis, in our words, and its verdict.
+    """One testable sentence of the thesis, in our words, and the verdict on it.
 
-    `where`: place in the thesis; `sheet`, `simulation`: findings on the data sheet and in simulation; `why`: reason of
-    the verdict.
+    `where`: place in the thesis; `sheet`, `simulation`: findings on the data sheet of Appendix C and in simulation;
+    `why`: reason for the verdict.
     """
 
     id: str
@@ -118,10 +132,10 @@ class Claim:
 
 
 def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
-    """Judge a claim by the tests of its parts.
+    """Judge a claim by the results of tests of its parts.
 
-    It `holds` if all tests pass, `does not hold` if none does, and `holds in part` otherwise. None stands for a test
-    that cannot be made and is ignored; without any other test the claim `cannot be tested`.
+    It `holds` if all tests pass, `does not hold` if none does, and `holds in part` otherwise. A result of None is a
+    test that cannot be made; it is ignored. Without any other result the claim `cannot be tested`.
     """
     results = {bool(test) for test in tests if test is not None}
     if len(results) == 1:
@@ -130,7 +144,11 @@ def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
 
 
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve to about `max_points` points: minimum and maximum of each block, so that peaks are preserved."""
+    """Thin a curve (x, y) to about `max_points` points that preserve its peaks.
+
+    They are the minimum and the maximum of each block of successive points. A curve with at most `max_points` points
+    is returned unchanged.
+    """
     if x.size <= max_points:
         return x, y
     block_size = int(np.ceil(2 * x.size / max_points))  # two points of each block

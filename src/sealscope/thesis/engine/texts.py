@@ -16,19 +16,19 @@ NOT_TESTED: tuple[None, ...] = (None,)
 
 @cache
 def load_texts(name: str) -> dict[str, Any]:
-    """Load a TOML file of the package `sealscope.thesis`."""
+    """Load a TOML file of the package `sealscope.thesis`, such as "notes.toml"."""
     return tomllib.loads(files("sealscope.thesis").joinpath(name).read_text(encoding="utf-8"))
 
 
 def format_note(name: str, **values: Any) -> str:
-    """Format a note of `notes.toml` with `values` in its placeholders."""
+    """Format the text `name` of `notes.toml`, with `values` in place of its placeholders."""
     return str(load_texts("notes.toml")[name]).format(**values)
 
 
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
-    """Judge the claim `id` by the tests of its parts, and fill `values` into its texts.
+    """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    The texts are those of `id` in `claims.toml`, or of `kind` for claims that share them; values named `sheet`,
+    The texts are those of `id` in `claims.toml`, or of `kind` for claims that share texts. Values named `sheet`,
     `simulation` and `why` replace the text of that name.
     """
     claims = load_texts("claims.toml")

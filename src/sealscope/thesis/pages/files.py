@@ -19,23 +19,24 @@ _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 
 
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
-    """Write an item's products into `folder`; return the paths of the files, relative to it.
+    """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
-    Files are `figures/ID.svg`, `figures/ID.png` and `tables/ID.csv`; claims go to `tables/ID.csv` of their item, or to
-    `tables/ID-claims.csv` if the item has a table. Raises ValueError for an id that is no file name.
+    The files are `figures/ID.svg`, `figures/ID.png` and `tables/ID.csv` for each figure or table. Claims go to
+    `tables/ID.csv` of their item, or to `tables/ID-claims.csv` if the item has a table. Raises ValueError for an id
+    that cannot be a file name.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
     files: list[str] = []
 
     def write_bytes(name: str, content: bytes) -> None:
-        """Write a file and list it."""
+        """Write a file below the folder, and add it to the list of files."""
         with atomic_write(folder / name) as temporary:
             temporary.write_bytes(content)
         files.append(name)
 
     def write_rows(name: str, rows: Iterable[Sequence[object]]) -> None:
-        """Write rows as a CSV file and list it."""
+        """Write rows as a CSV file below the folder, and add it to the list of files."""
         with atomic_write(folder / name) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
         files.append(name)
@@ -59,7 +60,10 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
-    """Yield the header and the rows of a figure's drawn points: x, y of each curve, and x, y, value of each image."""
+    """Yield the heads of the columns, then the rows, of a table of all points that a figure shows.
+
+    The columns are x and y of each curve, and x, y and value of each image.
+    """
     heads: list[str] = []
     columns: list[list[str]] = []
     for number, panel in enumerate(figure.panels, 1):

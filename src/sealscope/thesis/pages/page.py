@@ -29,7 +29,11 @@ _MAX_OPEN_ROWS = 45
 
 
 class PageProduct(NamedTuple):
-    """Entry of a figure or table on the page; `picture`: data URI or ""; `links`: (format, path) of its files."""
+    """Entry of a figure or table on the page of the reproduction.
+
+    `picture`: the figure as a data URI, "" for a table; `links`: (format, path) of its files; `claims`: claims that
+    it supports or refutes; `search_text`: text in which the page's search looks.
+    """
 
     id: str
     heading: str
@@ -43,10 +47,10 @@ class PageProduct(NamedTuple):
 def write_thesis_page(
     folder: Path, statuses: Sequence[ItemStatus], *, quick: bool = False, sheet: bool = False
 ) -> Path:
-    """Write `index.html` into `folder` from the statuses of all items; return its path.
+    """Write the page of a reproduction, `index.html` in `folder`, from the statuses of all items; return its path.
 
-    The page links to nothing but the files in the folder. `quick`: True if shorter runs were made; `sheet`: True if the
-    measured sheet was given. Raises InputError if the page cannot be written.
+    The page links to nothing but the files in the folder. `quick`: True if shorter runs were made; `sheet`: True if
+    the measured data sheet was given. Raises InputError if the page cannot be written.
     """
     claims: dict[str, Claim] = {}
     products = [(status, product) for status in statuses for product in status.products]
@@ -99,7 +103,10 @@ def write_thesis_page(
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
 ) -> PageProduct:
-    """Build the entry of a figure or table from its files in `folder` and the claims it supports or refutes."""
+    """Build the page's entry of a figure or table from its files in `folder`.
+
+    `claims`: all claims by id, from which those that the product supports or refutes are taken.
+    """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
@@ -111,7 +118,7 @@ def _page_product(
 
 
 def _encode_picture(folder: Path, name: str) -> str:
-    """Encode a figure's SVG or PNG, whichever is smaller, as a data URI; return "" if neither exists."""
+    """Encode a figure's SVG or PNG file, whichever is smaller, as a data URI; return "" if neither exists."""
     paths = {"svg+xml": folder / "figures" / f"{name}.svg", "png": folder / "figures" / f"{name}.png"}
     pictures = {kind: path.read_bytes() for kind, path in paths.items() if path.is_file()}
     if not pictures:
@@ -121,7 +128,7 @@ def _encode_picture(folder: Path, name: str) -> str:
 
 
 def format_cell(value: Any) -> str:
-    """Format a table's value: numbers with five significant digits, a dash for None and nan."""
+    """Format a table's value for the page: numbers with five significant digits, None and nan as a dash."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "–"
     if isinstance(value, float):

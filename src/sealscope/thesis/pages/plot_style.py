@@ -11,7 +11,7 @@ from sealscope.thesis.engine.products import Role
 
 
 class Style(NamedTuple):
-    """Line style of a role: colour, dashes, width [pt], marker."""
+    """Line style of the curves with one role: colour, dashes, width [pt], and marker, which may be filled."""
 
     colour: str
     dashes: tuple[float, ...] = ()
@@ -30,7 +30,10 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 
 def caption(figure_id: str, title: str) -> str:
-    """Format the thesis's number and the title, such as "Fig. 4.22. Pressures in the chambers"."""
+    """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
+
+    An id without the number of a figure, table or equation of the thesis gives the title alone.
+    """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
     title = title.rstrip(".")
@@ -42,7 +45,7 @@ def caption(figure_id: str, title: str) -> str:
 
 
 def typeset(label: str) -> str:
-    """Convert the symbols in a label, such as p_A, d3, omega and m^3/s, to mathematical notation."""
+    """Convert the symbols in a label, such as p_A, d3, omega and m^3/s, to matplotlib's mathematical notation."""
     text = label.replace("$", r"\$")
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)

@@ -46,7 +46,7 @@ _Range = tuple[float, float]
 
 
 def require_drawing() -> None:
-    """Raise MissingExtra if the drawing library is not installed."""
+    """Raise MissingExtra if matplotlib, which draws the figures, is not installed."""
     try:
         import matplotlib  # noqa: F401
     except ImportError:
@@ -54,9 +54,10 @@ def require_drawing() -> None:
 
 
 def draw(figure: Figure) -> tuple[bytes, bytes]:
-    """Draw a figure; return it as an SVG with searchable text, and as a PNG with a palette and `DPI`.
+    """Draw a figure; return it as an SVG file with searchable text, and as a PNG file of `DPI` dots per inch.
 
-    Raises MissingExtra if matplotlib is not installed.
+    Long curves are rasterised in an SVG that would be too large otherwise. Raises MissingExtra if matplotlib is not
+    installed.
     """
     require_drawing()
     import matplotlib
@@ -77,7 +78,7 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
 
 
 def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
-    """Render a figure as an SVG without a date, so that equal figures give equal bytes."""
+    """Render a drawn figure as an SVG file without a date, so that equal figures give equal bytes."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     out = io.StringIO()
@@ -88,7 +89,10 @@ def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
 
 
 def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
-    """Render a figure as a PNG with a palette of 256 colours, for a small file."""
+    """Render a drawn figure as a PNG file with a palette of 256 colours, which makes it small.
+
+    `has_image`: True if a panel has an image of greys, for which another palette is chosen.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Picture
 
@@ -105,15 +109,18 @@ def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
 
 
 def choose_grid(n_panels: int) -> tuple[int, int]:
-    """Choose rows and columns of a figure's panels: one column up to five panels, two up to twelve, then three."""
+    """Choose the numbers of rows and columns in which a figure's panels are arranged.
+
+    One column for up to five panels, two for up to twelve, else three.
+    """
     columns = 1 if n_panels <= 5 else 2 if n_panels <= 12 else 3
     return -(-n_panels // columns), columns  # rows rounded up
 
 
 def _draw_figure(figure: Figure) -> MplFigure:
-    """Lay out and draw a figure.
+    """Lay out and draw a figure with matplotlib.
 
-    From the top: warning of an unresolved run, legend if all panels share it, panels, caption.
+    From the top: a warning if a run is not resolved, the legend if all panels share it, the panels, and the caption.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure
@@ -159,7 +166,7 @@ def _draw_figure(figure: Figure) -> MplFigure:
 
 
 def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: bool) -> None:
-    """Draw a panel's image, curves, marks and axes; `label_marks`: True to write the texts of the marks."""
+    """Draw a panel's image, curves, marks and axes into `ax`; `label_marks`: True to write the texts of the marks."""
     if panel.image is not None:
         image = panel.image
         mesh = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
@@ -196,7 +203,10 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
 
 
 def _use_plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis with numbers such as 0.2, 1, 50, or with powers of ten over four decades and more."""
+    """Label a logarithmic axis with plain numbers such as 0.2, 1 and 50.
+
+    An axis over four decades or more keeps powers of ten.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -207,9 +217,10 @@ def _use_plain_numbers(axis: Axis) -> None:
 
 
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
-    """Select the drawn points (x, y) of a curve: those in `x_range`, and one on each side.
+    """Select the points (x, y) of a curve that are drawn.
 
-    `x_range`: None for all points. A long line is thinned.
+    Of a long curve these are the points in `x_range` and one on each side, all if `x_range` is None; a line is then
+    thinned to about `_MAX_POINTS` points.
     """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
@@ -220,9 +231,10 @@ def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray
 
 
 def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
-    """Draw a curve in the style of its role; `n_before`: number of earlier curves with this role in the panel.
+    """Draw a curve into `ax` in the line style of its role.
 
-    `is_only`: True for the panel's only curve, which is drawn in colour even if it is a reference.
+    `n_before`: number of earlier curves with this role in the panel, which chooses other dashes; `is_only`: True for
+    the panel's only curve, which is drawn in colour even if its role is that of a reference.
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)
@@ -246,7 +258,10 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
 
 
 def _has_shared_legend(panels: Sequence[Panel]) -> bool:
-    """Return True if all panels have the same curves and a common legend fits on one line."""
+    """Return True if a figure has one legend for all panels.
+
+    That is if there are several panels with the same curves, several of them, whose labels fit on one line.
+    """
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []
     is_short = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) <= _MAX_SHARED_CHARACTERS
@@ -254,7 +269,10 @@ def _has_shared_legend(panels: Sequence[Panel]) -> bool:
 
 
 def _add_legend(ax: Axes, panel: Panel) -> None:
-    """Place the legend above the axes if it fits on one line, else on their right; omit it for one named curve."""
+    """Add the legend of a panel, above the axes if it fits on one line, else on their right.
+
+    A panel with a single curve needs none if it has no title or if its y axis names the curve.
+    """
     labels = [curve.label for curve in panel.curves if curve.label]
     if not labels or (len(panel.curves) == 1 and (not panel.title or labels[0] in panel.y_label)):
         return
@@ -267,13 +285,16 @@ def _add_legend(ax: Axes, panel: Panel) -> None:
 
 
 def _thicken_lines(legend: Legend) -> None:
-    """Set a minimum width for the lines in a legend, as dense curves are thin."""
+    """Set a minimum width for the lines in a legend, because curves of many points are drawn thin."""
     for line in legend.get_lines():
         line.set_linewidth(max(1.3, line.get_linewidth()))
 
 
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
-    """Remove the labels of the x axis except in the lowest panel of each column, if all panels share the axis."""
+    """Remove the x labels of all panels but the lowest of each column, if all panels have the same x axis.
+
+    Nothing changes if a panel has an image.
+    """
     visible_axes = [ax for ax in axes.flat if ax.axison]
     x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}
     if len(x_axes) != 1 or any(panel.image is not None for panel in panels):

@@ -1,1 +1,1 @@
-"""Balances that a circuit allows where the cylinder alone does not: over cycles and holds, and of the accumulator."""
+"""Further volume balances that a hydraulic circuit allows: over whole cycles and holds, and of the accumulator."""

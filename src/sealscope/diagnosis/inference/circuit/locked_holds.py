@@ -1,17 +1,17 @@
-"""Leakage while valves shut a cylinder from its pump, from the balances of both chambers.
+"""Leakage while valves cut a cylinder off from its pump and hold the load, from the balances of both chambers.
 
-With the pump cut off, each chamber is a closed volume with leaks. From the beginning of a hold on,
+Such a hold leaves each chamber a closed volume with leaks. From the beginning of the hold on,
 
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
-with the piston's areas m_A and m_B in the unit of the pump's flow, the volumes V of oil, their bulk modulus K and free
-air alpha. I is the time integral of a power of p_A - p_B - z, I_A and I_B those of the pressures. A leaking piston
-moves oil from A to B; a leaking rod seal drains one side only, and the piston gives way while a check valve may fill
-the other side. All holds form one linear regression, each side of a hold about its mean, with the priors of the oil
-(`priors.toml`, `held_oil`) as additional readings. The onset of the leak and the offset z of p_A - p_B are those of
-the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with
-its probability.
+with the piston's areas m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk
+modulus K and free air alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are those of the
+pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way,
+while a check valve may fill the other side. All holds form one linear regression, each side of a hold about its mean,
+with the priors of the oil (`held_oil` in `priors.toml`) as additional readings. The onset of the leak and the sensor
+offset z of p_A - p_B are those of the highest posterior; a leak that has equalised the pressures determines z. The
+three leaks are hypotheses, each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -46,14 +46,18 @@ N_REFINED = 17
 N_ONSETS = 4
 #: Standard deviation of a leak without information.
 UNKNOWN = 1e30
-#: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a diagonal.
+#: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a matrix.
 MAX_ITERATIONS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
 #: Probability outside of the interval of an onset.
 TAIL = 0.05
 
 
 class CylinderSides(NamedTuple):
-    """Piston areas by the assumed displacement [m^2], negative if x is reversed, and the ends of the stroke [m]."""
+    """Piston areas of both sides, and ends `low` and `high` of the recorded stroke [m].
+
+    The areas [m^2] are measured with the pump's assumed displacement; they are negative if the position x is
+    reversed.
+    """
 
     area_A: float
     area_B: float
@@ -62,8 +66,9 @@ class CylinderSides(NamedTuple):
 
 
 class LockedHold(NamedTuple):
-    """Samples of one hold: time [s], absolute pressures [Pa] and position [m], (n,) each.
+    """Samples of one hold, in which shut valves hold the load.
 
+    `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each.
     `edges` (k + 1,): indices between which the samples are averaged to k readings.
     """
 
@@ -74,14 +79,15 @@ class LockedHold(NamedTuple):
     edges: NDArray[np.intp]
 
     def mean(self, values: Array) -> Array:
-        """Average samples (..., n) over the readings, (..., k)."""
+        """Average samples (..., n) of the hold to its k readings, shape (..., k)."""
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
     def steepest_time(self) -> float:
-        """Find the time [s] after which p_A - p_B changes most.
+        """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
 
-        The change is taken over the time in which a large leak equalises the pressures.
+        Changes are taken over `held_oil.equalises` of `priors.toml`, the time in which a large leak equalises the
+        pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.p_A - self.p_B
@@ -89,10 +95,12 @@ class LockedHold(NamedTuple):
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
-    """Find the holds of a recording: rests of the pump, less the time in which valves shut or open.
+    """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
-    `channels`: time, absolute pressures of A and B, and position, (n,) each; `rests` (n - 1,): flags of the intervals
-    at rest. Holds too short for `MIN_READINGS`, or with missing samples, are omitted.
+    The times in which the valves shut or open are left out.
+    `channels`: time [s], absolute pressures of A and B [Pa], and position [m], (n,) each; `rests` (n - 1,): flags of
+    the sampling intervals in which the pump rests; `rate`: sampling rate [Hz], which is reduced to about `MAX_RATE`.
+    Holds that are too short, or have missing samples, are omitted.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # samples that are averaged to one
@@ -114,7 +122,10 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 
 
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
-    """Return the indices (k + 1,) between k readings that lengthen geometrically from `width` samples."""
+    """Divide `n_samples` into k readings that lengthen geometrically, and return their bounds, shape (k + 1,).
+
+    The first reading has `width` samples, each later one `GROWTH` times as many as the one before.
+    """
     edges = [0]
     while edges[-1] + max(round(width), 1) < n_samples:
         edges.append(edges[-1] + max(round(width), 1))
@@ -123,9 +134,10 @@ def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
 
 
 class UnitLeak(NamedTuple):
-    """A leak of unit coefficient: its `flows` in the samples (n,) of each hold, and their signs in the balances.
+    """Flow of a leak of unit coefficient during holds.
 
-    `signs`: of sides A and B; `is_refilled`: at the charge pressure check valves replace the displaced oil.
+    `flows`: flow at the samples (n,) of each hold; `signs`: sign of this flow in the balances of sides A and B, or 0;
+    `is_refilled`: true if check valves replace displaced oil once a chamber is at the charge pressure.
     """
 
     flows: Sequence[Array]
@@ -134,12 +146,13 @@ class UnitLeak(NamedTuple):
 
 
 class _OilRegression(NamedTuple):
-    """Regression of displaced volumes on the oil's coefficients over r readings.
+    """Linear regression of displaced volumes on the properties of the oil, over r readings of all holds.
 
-    `left` (r,): volume displaced by the piston, less the compression expected from the priors; `oil` (r, 4): columns of
-    compressibility, dead volumes of A and B, and free air, for deviations from the priors; `deviations` (4,): standard
-    deviations of the priors; `inflation`: number of readings over that of independent ones; `min_variance`: of a
-    reading, since the model describes the compressed volume to within a fraction only.
+    `left` (r,): volume displaced by the piston, minus the compression expected from the priors; `oil` (r, 4): columns
+    of compressibility, dead volumes of A and B, and free air, whose coefficients are deviations from the priors;
+    `deviations` (4,): standard deviations of the priors; `inflation`: number of readings over the number of
+    independent ones; `min_variance`: minimum variance of a reading, since the model describes the compressed volume
+    only to within a fraction.
     """
 
     left: Array
@@ -150,7 +163,10 @@ class _OilRegression(NamedTuple):
 
 
 class _LeakRegression(NamedTuple):
-    """Coefficients (c,) of leaks, their covariances (c, c) by noise and by the oil, and the variance of a reading."""
+    """Fit of c leaks to the holds: `coefficients` (c,), their covariances (c, c), and `variance` of a reading.
+
+    The covariance is split into two parts: `by_noise` of the readings, and `by_oil`, whose properties are uncertain.
+    """
 
     coefficients: Array
     by_noise: Array
@@ -159,9 +175,10 @@ class _LeakRegression(NamedTuple):
 
 
 class HeldLeaks(NamedTuple):
-    """Mean leaks in a recording with holds, each with its standard deviation [m^3/(s Pa)].
+    """Mean conductances of three leaks over a recording with holds, each with its standard deviation [m^3/(s Pa)].
 
-    They lead past the `piston`, and from A and B to the outside; flows are those by the assumed displacement.
+    The leaks are past the `piston`, and to the outside from A and from B. They are measured with the pump's assumed
+    displacement.
     """
 
     piston: float
@@ -173,14 +190,18 @@ class HeldLeaks(NamedTuple):
 
 
 class PistonFit(NamedTuple):
-    """Likeliest `onset` of a leak past the piston [s] and `offset` of p_A - p_B [Pa]."""
+    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa]."""
 
     onset: float
     offset: float
 
 
 class LeakFit(NamedTuple):
-    """Coefficient of a leak: value, standard deviations by noise and by the oil's priors, and log likelihood."""
+    """Fitted coefficient of a leak: `value`, and log `likelihood` of the fit.
+
+    The coefficient has two standard deviations: `deviation` due to noise, and `by_oil` due to the uncertain
+    properties of the oil.
+    """
 
     value: float
     deviation: float
@@ -189,7 +210,7 @@ class LeakFit(NamedTuple):
 
 
 class LeakHypothesis(NamedTuple):
-    """A possible leak: its `probability`, the fraction of the recording after its onset, and its fit."""
+    """A possible leak: its `probability`, the fraction of the recording's time after its onset, and its `fit`."""
 
     probability: float
     fraction_after: float
@@ -198,10 +219,10 @@ class LeakHypothesis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeldChambers:
-    """The chambers of a cylinder in the holds of a recording.
+    """Estimator of the leaks of a cylinder's chambers from holds, i.e. times in which shut valves hold the load.
 
-    `begin`, `end`: times of the first and the last sample of the recording [s]; `charge`: absolute pressure that check
-    valves maintain [Pa].
+    `holds`: samples of each hold; `sides`: areas and stroke of the cylinder; `begin`, `end`: times of the first and
+    the last sample of the recording [s]; `charge`: absolute pressure that check valves maintain [Pa].
     """
 
     holds: Sequence[LockedHold]
@@ -212,21 +233,21 @@ class HeldChambers:
 
     @property
     def n_readings(self) -> float:
-        """Effective number of independent readings."""
+        """Effective number of independent readings in all holds."""
         independent: float = INFERENCE.held_oil.independent
         return independent * 2.0 * len(self.holds)  # on both sides of each hold
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions without check valves, and with check valves that refill a chamber at the charge pressure."""
+        """Regressions of the displaced volumes: without check valves, and with check valves that refill a chamber."""
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
-        """Build the regression of displaced volumes on the oil's coefficients (`_OilRegression`).
+        """Build the linear regression of displaced volumes on the properties of the oil.
 
-        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold; a reading is
-        a mean of samples (`LockedHold.edges`). `is_refilled`: check valves keep a chamber at the charge pressure, so
-        that displacement counts only while the chamber's pressure is higher.
+        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold. A reading
+        is a mean of several samples (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the
+        charge pressure, so displacement counts only while the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
         volumes, columns = [], []
@@ -258,20 +279,25 @@ class HeldChambers:
         return np.asarray(p > self.charge * (1.0 + INFERENCE.held_oil.charge))
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute a unit leak past the piston, whose flow is a power of p_A - p_B minus its offset [Pa]."""
+        """Compute the flow of a leak past the piston, sign(dp) |dp|^`exponent` of dp = p_A - p_B - `offset` [Pa]."""
         differences = [hold.p_A - hold.p_B - offset for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
-        """Compute a unit leak from A (`is_A`), else from B, to the outside; none while a check valve refills it."""
+        """Compute the flow of a laminar leak of unit conductance to the outside, from A (`is_A`) or else from B.
+
+        It is the gauge pressure of the side, or 0 while a check valve refills the chamber.
+        """
         pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(p) for p in pressures]
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
-        """Fit the coefficients of leak columns (r, c) together with those of the oil; `is_refilled`: see `UnitLeak`.
+        """Fit the coefficients of c leaks together with the properties of the oil.
 
-        The variance of a reading, which weights the oil's priors against the readings, is found by iteration.
+        `columns` (r, c): volumes leaked with unit coefficients, at each reading; `is_refilled`: true if check valves
+        replace displaced oil. The variance of a reading, which weights the priors of the oil against the readings, is
+        found by iteration.
         """
         left, oil, deviations, inflation, min_variance = self._regressions[is_refilled]
         design, n_leaks = np.column_stack([columns, oil]), columns.shape[1]
@@ -292,29 +318,31 @@ class HeldChambers:
             if abs(variance - previous) <= TOLERANCE * previous:
                 break
         covariance = variance * inflation * inverse
-        # part of the leaks' covariance that known coefficients of the oil would remove
+        # part of the covariance that would vanish if the properties of the oil were known
         gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
         by_oil = gain @ covariance[n_leaks:, :n_leaks]
         return _LeakRegression(solution[:n_leaks], covariance[:n_leaks, :n_leaks] - by_oil, by_oil, variance)
 
     @cached_property
     def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
-        """Fits of the oil alone, to each of `_regressions`."""
+        """Fits of the oil's properties without any leak: without check valves, and with check valves."""
         without, refilled = (np.empty((len(regression.left), 0)) for regression in self._regressions)
         return self._fit(without, False), self._fit(refilled, True)
 
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
-        """Fit a leak past the piston from `onset` [s] on.
+        """Fit a leak past the piston that begins at `onset` [s] to the times in which shut valves hold the load.
 
-        Its flow is a power of p_A - p_B minus the `offset` [Pa], of the given `exponent`.
+        Its flow is its coefficient times sign(dp) |dp|^`exponent` of dp = p_A - p_B - `offset` [Pa]. The likelihood
+        includes the prior on the offset.
         """
         fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
         return fit._replace(likelihood=fit.likelihood - 0.5 * offset_cost(offset))
 
     def leaks_since(self, onset: float) -> Array | None:
-        """Return `leaks` (6,) with the piston's leak since `onset` [s] instead of its mean.
+        """Estimate the leaks of the recording as `HeldLeaks` (6,), with the leak past the piston since `onset` [s].
 
-        Return None if no hold shows a flow after the onset.
+        The leaks to the outside are means over the whole recording. Return None if no hold shows a flow past the
+        piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -323,15 +351,19 @@ class HeldChambers:
         return np.array(self.leaks._replace(piston=leak.value, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
-        """Fit a leak past the piston since `onset` [s] for each offset of a grid; omit fits in which nothing flows.
+        """Fit a leak past the piston since `onset` [s] for each sensor offset of a grid; omit fits without any flow.
 
-        Under a small pressure difference, or where a leak has equalised the pressures, the offset is undetermined.
+        The offset must be varied since it is uncertain at a small pressure difference, or once a leak has equalised
+        the pressures.
         """
         fits = [self.fit_piston_leak(onset, float(offset)) for offset in (*self._offset_grid, self.piston_fit.offset)]
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
-        """Fit a leak from `onset` [s] on, with a coefficient >= 0; its deviation is `UNKNOWN` if nothing would flow."""
+        """Fit the coefficient, at least 0, of a leak that begins at `onset` [s] to all holds of the recording.
+
+        Its standard deviation is `UNKNOWN` if no oil would flow in the holds after the onset.
+        """
         column = self._leak_columns(leak, np.array([onset]))
         has_flow = column.any()
         fit = self._fit(column, leak.is_refilled) if has_flow else self._fits_without_leak[leak.is_refilled]
@@ -347,8 +379,8 @@ class HeldChambers:
     def onsets(self) -> Array:
         """Possible onsets of a leak [s], in order of time.
 
-        They are the beginning of the recording, and times between the holds and within each. As a large leak equalises
-        the pressures at once, each hold has an onset where p_A - p_B changes most.
+        They are the beginning of the recording, and times between the holds and within each. A large leak equalises
+        the pressures at once; therefore one of the onsets in each hold is the time at which p_A - p_B changes most.
         """
         onsets = [self.begin]
         for k, hold in enumerate(self.holds):
@@ -359,12 +391,15 @@ class HeldChambers:
 
     @cached_property
     def _onset_log_priors(self) -> Array:
-        """Log prior of each of `onsets`, as half of all leaks are there from the start."""
+        """Log prior probability of each of `onsets`: half of all leaks are assumed to exist from the start."""
         n_later = len(self.onsets) - 1
         return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Build the regression's columns (r, o), with the readings of the volume leaked since each onset (o,)."""
+        """Compute the volume that a leak of unit coefficient loses since each of o onsets, at all r readings, (r, o).
+
+        The volumes have the sign of the flow in each side's balance, and are relative to their mean over the hold.
+        """
         columns = []
         for hold, flow in zip(self.holds, leak.flows, strict=True):
             increments = 0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t)
@@ -376,9 +411,10 @@ class HeldChambers:
         return np.vstack(columns)
 
     def _onset_posteriors(self, leak: UnitLeak) -> Array:
-        """Compute the log posterior of each of `onsets` (o,) of a leak >= 0, with the oil's coefficients eliminated.
+        """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
-        It is log prior - N/2 log residual sum of squares, for N independent readings.
+        It is log prior - N/2 log(residual sum of squares), for N independent readings and a coefficient >= 0, with
+        the properties of the oil eliminated.
         """
         left, oil, deviations, inflation, min_variance = self._regressions[leak.is_refilled]
         design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
@@ -386,7 +422,7 @@ class HeldChambers:
         precision = oil.T @ oil + np.diag(variance * inflation / deviations**2)
         scale = np.sqrt(np.diag(precision))
         coupling = (oil / scale).T @ design
-        # of the left side (first) and the leak for each onset, without the oil (Schur complement)
+        # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
         gram = design.T @ design - coupling.T @ np.linalg.solve(precision / np.outer(scale, scale), coupling)
         total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
         is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
@@ -396,17 +432,17 @@ class HeldChambers:
 
     @cached_property
     def _offset_grid(self) -> Array:
-        """Candidates of the offset of p_A - p_B [Pa], in ascending order.
+        """Candidates of the sensor offset of p_A - p_B [Pa], in ascending order.
 
-        They are a fixed grid and the last difference of each hold, since a leak equalises the pressures down to the
-        offset.
+        They are a fixed grid, and the recorded difference at the end of each hold: if a leak has equalised the
+        pressures, that difference is the offset.
         """
         ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
     def piston_fit(self) -> PistonFit:
-        """Onset of a leak past the piston and offset of p_A - p_B, by a grid search that is refined once."""
+        """Most probable onset of a leak past the piston and sensor offset, by a grid search that is refined once."""
         grid = self._offset_grid
         best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
         refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
@@ -415,14 +451,17 @@ class HeldChambers:
         return PistonFit(float(self.onsets[onset]), offset)
 
     def _find_onset(self, offset: float) -> tuple[int, float]:
-        """Return the index of the likeliest onset of a leak past the piston for an offset, and the log posterior."""
+        """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
+
+        Return its index in `onsets`, and the log posterior of onset and offset.
+        """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset))
         onset = int(posteriors.argmax())
         return onset, float(posteriors[onset]) - 0.5 * offset_cost(offset)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
-        """Leaks past the piston, and to the outside from A and from B, each with its probability."""
+        """The possible leaks, each with its probability: past the piston, to the outside from A, and from B."""
         piston_onset, offset = self.piston_fit
         # each fit with the index of its onset
         fits = [(self.fit_piston_leak(piston_onset, offset), int(np.abs(self.onsets - piston_onset).argmin()))]
@@ -440,15 +479,15 @@ class HeldChambers:
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Mean leaks over the recording, past the piston and to the outside, weighted by their probabilities.
+        """Mean leaks over the recording: past the piston, and to the outside from A and from B.
 
-        The standard deviations are not weighted.
+        Each is its estimate times the probability of that leak; the standard deviations are not weighted in this way.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
             mean = leak.fraction_after * leak.fit.value
             values_and_deviations += [leak.probability * mean, leak.fraction_after * leak.fit.deviation]
-        # the piston's standard deviation includes that by the offset of p_A - p_B
+        # the standard deviation of the piston's leak includes the uncertainty of the offset of p_A - p_B
         fits = [fit._replace(by_oil=0.0) for fit in self._fits_over_offsets(self.piston_fit.onset)]
         deviation = _average_fits(fits).deviation if fits else UNKNOWN
         return HeldLeaks(*values_and_deviations)._replace(deviation=self.piston_leak.fraction_after * deviation)
@@ -460,16 +499,16 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last hold."""
+        """Prior probability that a leak begins after the last hold of the load, so that no hold shows it."""
         time_after = self.end - float(self.holds[-1].t[-1])
         # half of all leaks begin within the recording
         return 0.5 * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
     @cached_property
     def piston_onset(self) -> Interval | None:
-        """Onset of the leak past the piston [s], with its 95 % interval; None if it may have begun before the holds.
+        """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
 
-        The interval extends to the neighbouring possible onsets.
+        The interval is widened to the neighbouring onsets of the grid `onsets`.
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(self.piston_fit.offset))
         weights = np.exp(posteriors - posteriors.max())
@@ -481,6 +520,6 @@ class HeldChambers:
 
 
 def _average_fits(fits: Sequence[LeakFit]) -> Flow:
-    """Average the coefficients of fits by their likelihoods."""
+    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods."""
     values, deviations, by_oil, likelihoods = np.array(fits).T
     return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))

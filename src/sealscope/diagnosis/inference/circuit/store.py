@@ -1,12 +1,13 @@
-"""External leakage from the accumulator that replaces the lost oil, in blocks of whole cycles.
+"""External leakage, from the volume of an accumulator that replaces the lost oil, in blocks of whole cycles.
 
-The gas expands, V dp/(n p) at its charge, as oil is lost, as the rod extends, and as it warms. With p the pressure of
-the unloaded side, the volume delivered by the middle of block k is
+The gas of the accumulator expands, by V dp/(n p) at its charge, when oil is lost, when the rod extends, and when it
+warms. With the pressure p of the unloaded side, the volume delivered by the middle of block k is
 
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
-with the conductance g_j to the outside, P_j the pressure that drives it, and w and v for the gas temperature, with
-priors (`priors.toml`). The mean volume of a block is far more precise than a mean rate.
+where g_j is the conductance to the outside in block j, P_j the pressure that drives the leak, and tau the length of a
+block (1/2 applies to block k itself). w and v describe the gas temperature and have priors (`priors.toml`). The mean
+volume of a block is far more precise than a mean flow.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ if TYPE_CHECKING:
 
 
 def cycle_length(speed: Array, rate: float) -> float | None:
-    """Estimate the period of the strokes [s], else of the strongest line in the speed's spectrum.
+    """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    `speed` (n,) at the sampling `rate` [Hz]. None if there are neither regular strokes nor `MIN_BLOCKS` periods of the
-    line.
+    `speed` (n,): speed or flow at the sampling `rate` [Hz]. Without regular strokes the period is that of the
+    strongest spectral line. Return None if the recording has fewer than `MIN_BLOCKS` of those periods.
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
@@ -44,9 +45,10 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 
 
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
-    """Test a recording with a position for external leaks (`oil_loss_tests`); `offset`: of p_A - p_B [Pa].
+    """Test a recording with a position for an external leak of either side that begins within it.
 
-    Empty for a double rod, in whose circuit check valves let either side keep its pressure.
+    `offset`: sensor offset of p_A - p_B [Pa]. The tests are returned by the name of the term (`oil_loss_tests`).
+    There are none for a double rod, in whose circuit check valves let either side keep its pressure.
     """
     if not rig.cylinder.single_rod:
         return {}
@@ -57,10 +59,11 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 
 
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
-    """Test for a step of the external leak of either side; results by term name, empty without an accumulator.
+    """Test for an external leak of either side that begins within a recording, by the volume of the accumulator.
 
-    `signals`: of both pressures and, if recorded, of the position; `cycle`: duration of a cycle of the duty [s], if
-    there is one; `begin`: time of the first sample [s].
+    `signals`: both pressures and, if recorded, the position; `cycle`: duration of a cycle of the machine [s], None if
+    there is none; `begin`: time of the first sample [s]. The result maps "external leak A" and "external leak B" to
+    their tests. It lacks sides that cannot be tested, and is empty without an accumulator.
     """
     if rig.makeup.check_valves == "absent":
         return {}
@@ -84,7 +87,10 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
 
 
 def _block_means(values: Array, edges: Array) -> Array:
-    """Average the known samples of each block between the indices `edges` (K + 1,); NaN for a block without any."""
+    """Average the samples of each of K blocks, without missing ones; NaN for a block without any sample.
+
+    `edges` (K + 1,): indices in `values` (n,) between which the blocks lie.
+    """
     is_known = np.isfinite(values)
     sums, counts = (
         np.concatenate([[0.0], np.cumsum(series)])[edges] for series in (np.where(is_known, values, 0.0), is_known)
@@ -94,14 +100,15 @@ def _block_means(values: Array, edges: Array) -> Array:
 
 
 def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin: float) -> Information:
-    """Compute the likelihood of the conductance to the outside in blocks of `block_s` [s].
+    """Compute the likelihood of an external leak's conductance [m^3/(s Pa)] in K blocks of `block_s` [s].
 
-    `begin` [s]: of the first block; `volume` (K,): delivered by the accumulator [m^3]; `pressure` (K,): drives the leak
-    [Pa]. The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated.
+    `volume` (K,): mean volume that the accumulator has delivered, in each block [m^3]; `pressure` (K,): mean pressure
+    that drives the leak [Pa]; `begin`: start of the first block [s]. The initial volume and the effect of the gas
+    temperature, linear and quadratic in time, are eliminated.
     """
     count = len(volume)
     time = (np.arange(count, dtype=float) + 0.5) * block_s
-    # lost by the middle of each block (rows) with unit conductance in each (columns): half in the block itself
+    # volume lost by the middle of each block (rows) with unit conductance in each (columns): half within the block
     losses = (np.tril(np.ones((count, count)), -1) + 0.5 * np.eye(count)) * pressure * block_s
     noise = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # second differences have 6 times white noise's variance
     temperature = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])

@@ -1,17 +1,18 @@
-"""Balances without position or without flow: over whole cycles of the duty, or while the piston is held.
+"""Balances of recordings without position or without flow: over whole cycles, or while the piston is held.
 
-Test functions that are orthogonal to whatever repeats remove the displacement from the balance. A box of one cycle,
-convolved with itself, has a double zero at every harmonic of the duty: over it a piston that a control loop returns
-displaces nothing,
+A suitable test function removes the piston's displacement from the balance. A box of one cycle, convolved with
+itself, has a double zero at every harmonic of the cycle. Over it a piston that a control loop returns displaces
+nothing,
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 
-so that the pump delivers the leakage, unless it delivers less than any pump leaks: then no loop replaces it, and the
-balance contains no information. While a loop holds the piston at standstill any test function will do. Rows with
-a missing sample have no weight, nor have rows of a single rod in which the loaded side changes: the circuit exchanges
-oil there. Of the mean pressure difference d only the part that sensor offsets up to z cannot cause counts, d - z^2/d
-beyond z (Breiman's garrote). If no channel gives a flow, shut valves hold the piston, and the leakage of the loaded
-side moves it slowly; while a command moves the valve may replace the lost oil, and nothing counts.
+so the pump delivers just the leakage. If it delivers less than any pump leaks, no loop replaces the leakage, and the
+balance contains no information. While a loop holds the piston at standstill, any test function will do. Rows with a
+missing sample have no weight. Neither have rows of a single rod in which the loaded side changes, since the circuit
+then exchanges oil. Of the mean pressure difference d only the part counts that sensor offsets up to z cannot cause: d
+- z^2/d above z (Breiman's garrote). If no channel gives a flow, shut valves hold the piston, and the leakage of the
+loaded side moves it slowly. While the command moves, the valve may replace the lost oil, and the samples do not
+count.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -44,9 +45,10 @@ _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
 
 class CycleBalance(NamedTuple):
-    """Balance over whole cycles or over holds, of a recording without a position or without the flow.
+    """Volume balance of a recording without a position or without the flow, over whole cycles or over holds.
 
-    `oil_loss`: step tests of the external leak of either side by the accumulator, by term name.
+    `blocks`: sums of the balance; `equation`, `columns`: the balance and the roles of its columns; `oil_loss`: tests
+    for an external leak of either side by the volume that the accumulator loses, by the name of the term.
     """
 
     blocks: Blocks
@@ -56,9 +58,9 @@ class CycleBalance(NamedTuple):
 
 
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
-    """Build the balances of a recording over whole cycles and over holds.
+    """Compute the volume balances of a recording without position: over whole cycles, and over holds.
 
-    A recording with a position needs shut valves, and gives the balance over holds alone. The list is empty if no
+    A recording with a position but without flow gives one over holds behind shut valves only. The list is empty if no
     balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
@@ -69,7 +71,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     if not is_locked:
         samples = derive_drive_signals(samples, rig, recording.rate, loaded=True)
     signals = Signals(samples, recording.rate)
-    # rate of the left side: of the pump's volume, or of that which a locked piston displaces [m^3/s]
+    # left side as a flow [m^3/s]: delivered by the pump, or displaced by a piston behind shut valves
     flow, dp = equation.left(signals) * recording.rate, signals.pressure_difference
     # friction dissipates: a negative power means reversed wiring
     if not is_locked and float(np.nansum((dp - np.nanmean(dp)) * flow)) < 0.0:
@@ -96,10 +98,10 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
 
 
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
-    """Flag the samples (n,) in which the piston is held and has settled, by a `flow` (n,) [m^3/s] near zero.
+    """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    The averaged flow must be below a fraction of its largest value, or below `min_limit`. A sample with an infinite
-    flow is not held.
+    `flow` (n,) [m^3/s] at the sampling `rate` [Hz]; an infinite value means that the piston is not held. The averaged
+    flow must be at most a fraction of its largest value, or at most `min_limit` [m^3/s] if that is larger.
     """
     window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
@@ -113,10 +115,11 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
 def _build_blocks(
     signals: Signals, equation: Equation, half_width: float, is_used: NDArray[np.bool_], begin: float, one_sided: bool
 ) -> Blocks | None:
-    """Build the blocks of triangular test functions of a `half_width` [s]; None for fewer than `MIN_BLOCKS`.
+    """Compute the blocks of a balance with triangular test functions of a `half_width` [s].
 
-    `is_used` (n,): samples that may be part of a row; `begin`: time of the first sample [s]; `one_sided`: use only rows
-    in which the same side has the higher pressure throughout.
+    `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
+    `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None if fewer than
+    `MIN_BLOCKS` blocks have rows.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
@@ -124,7 +127,7 @@ def _build_blocks(
     if one_sided:
         by_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
         rows = rows._replace(whole=rows.whole & (np.minimum(by_A, 1.0 - by_A) < _PRIORS.elsewhere))
-    # rows of a block: those of one cycle, or of `MAX_BLOCK_TIME`
+    # a block has the rows of one cycle, or of `MAX_BLOCK_TIME`
     group = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
     n_blocks = len(rows.time) // group
     is_whole = rows.whole[: n_blocks * group]
@@ -133,7 +136,7 @@ def _build_blocks(
         return None
     whole_rows = rows.values[: n_blocks * group][is_whole]
     gram = Weighting((ColumnRoles(equation),)).compute_gram_matrices([whole_rows], np.cumsum(n_rows))
-    # windows are half a width apart: each stands for a quarter of it on either side of its middle
+    # windows are half a half-width apart: each stands for a quarter of it on either side of its middle
     ends = rows.time[: n_blocks * group].reshape(n_blocks, group)[:, [0, -1]] + np.array([-0.25, 0.25]) * half_width
     samples = [slice(*pair) for pair in np.round(ends * rate).astype(int)]
     flow = np.array([_mean_flow(left[block], rate) for block in samples])
@@ -143,11 +146,11 @@ def _build_blocks(
 
 
 def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_width: float, rate: float) -> Rows:
-    """Average the increments of c columns, (n,) each, over triangular windows, as mean rates.
+    """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
-    The windows have a `half_width` [s], and neighbours are half of that apart; a row with samples that are not
-    `is_used` is flagged as not whole. The integral over a triangle is the second difference of the twice integrated
-    increments.
+    `increments`: arrays (n,) of each column; `is_used` (n,): a row that contains other intervals is flagged as not
+    whole. The windows have a `half_width` [s]; neighbouring ones are half of that apart. The integral over a triangle
+    is computed as the second difference of the twice integrated increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -169,9 +172,10 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 
 
 def _shrink_offset(values: Array, names: list[str]) -> None:
-    """Shrink the leak columns of rows (r, c) in place by the part that sensor offsets may cause (Breiman's garrote).
+    """Reduce the leak's columns in rows (r, c) by the part that sensor offsets may cause, in place.
 
-    `names` of the columns. The mean pressure difference d of a row becomes d - z^2/d, or 0 below the largest offset z.
+    `names`: names of the columns. The mean pressure difference d of a row becomes d - z^2/d, or 0 if it is smaller
+    than the largest usual offset z (Breiman's garrote). The column of an orifice is scaled by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]
@@ -181,6 +185,6 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
 
 
 def _mean_flow(increments: Array, rate: float) -> float:
-    """Compute the mean absolute flow [m^3/s] from the known increments of a volume; 0 if all are missing."""
+    """Compute the mean magnitude of a flow [m^3/s] from increments of a volume [m^3]; 0 if all are missing (NaN)."""
     known = increments[np.isfinite(increments)]
     return float(np.abs(known).mean()) * rate if known.size else 0.0

@@ -1,1 +1,1 @@
-"""Evidence from pressures and command alone: two hypotheses of the machine, the response and the ring."""
+"""Evidence on leakage from pressures and command alone, by the response of the pressures to the command."""

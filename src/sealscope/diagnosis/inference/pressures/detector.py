@@ -1,4 +1,4 @@
-"""Leakage from both chamber pressures and the command: the parameters of the response, as observables."""
+"""Leak detector that needs only both chamber pressures and the command, by the response of the pressures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RESPONSE = "response"
 
 
 class PressureResponse:
-    """Leak detector without a position, by the response of p_A - p_B to the command."""
+    """Leak detector for recordings without a position: it fits the response of p_A - p_B to the command u."""
 
     name = PRESSURE_RESPONSE
 
@@ -33,20 +33,26 @@ class PressureResponse:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return the reason why the recording does not suffice for the response; None if it does."""
+        """Return the reason why a recording cannot be used by this detector; None if it can."""
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
-        """Estimate the leakage of a recording; None if the model of the response does not describe it."""
+        """Measure the leakage of a recording; None if the model of the response does not describe it."""
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Compute the mean conductance of a healthy recording, "level"; None if the model does not describe it."""
+        """Summarise a healthy recording by the mean conductance past the piston [m^3/(s Pa)], with the key "level".
+
+        Return None if the model of the response does not describe the recording.
+        """
         leak = self.reading(recording)
         return None if leak is None else {"level": leak.level[0]}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the response's parameters for steps, and compare the leak with healthy recordings."""
+        """Report on a recording: tests of the response's parameters for a step, and the leakage.
+
+        The leakage is compared with that of the healthy recordings in `baseline`.
+        """
         leak = self.reading(recording)
         if leak is None:
             return Observed(self.name, lack="no response to the command that a pump-driven piston would give")
@@ -60,9 +66,11 @@ class PressureResponse:
 
 
 def score_response_steps(information: Mapping[str, Information]) -> tuple[Observable, ...]:
-    """Test the response's parameters, by name, for a step up or down; the highest score comes first.
+    """Test each parameter of the pressure response for a step, a sudden lasting change, up or down.
 
-    A step of the conductance G is tested upwards only, as leaks do not heal.
+    `information`: likelihood of each parameter, by its name. The conductance "G" is tested for a step up only, since
+    leaks do not heal. The observables are sorted by score, the highest first; parameters that cannot be tested are
+    left out.
     """
     observables = []
     for name, likelihood in information.items():

@@ -1,11 +1,13 @@
-"""Fit of parameters that wander from block to block: all blocks of a recording together.
+"""Joint fit of all blocks of a recording to a model whose parameters vary from block to block.
 
-With y(theta) the output of a model and theta_k the parameters of block k, each block is linear about its theta_k^0,
+With the output y(theta) of a model and the parameters theta_k of block k, the model of each block is linearised about
+some theta_k^0,
 
     y_k(theta_k) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
-and stores sums only. Their likelihood is Gaussian in all theta_k together (`Joint`), so that the covariance of one
-parameter in all blocks, all others eliminated, is a block of its inverse. Units are fractions of the priors' widths.
+and the block stores sums only. The likelihood is Gaussian in all theta_k together (`Joint`). The covariance of one
+parameter over all blocks, with all others eliminated, is therefore a part of the inverse of the joint precision.
+Parameters are counted in units that are fractions of the widths of their priors.
 """
 
 from __future__ import annotations
@@ -26,19 +28,23 @@ _DIFFERENCE = 0.05
 
 
 class Normal(NamedTuple):
-    """Normal prior on the parameters: `mean` (p,), and `precision` (p, p) in units of `unit` (p,)."""
+    """Normal prior on p parameters: `mean` (p,), and `precision` (p, p) of the parameters divided by `unit` (p,)."""
 
     mean: Array
     precision: Array
     unit: Array
 
     def deviations(self, theta: Array) -> Array:
-        """Compute the differences of parameters (..., p) from the prior mean, in multiples of `unit`."""
+        """Compute the differences of parameters `theta` (..., p) from the prior mean, in multiples of `unit`."""
         return (theta - self.mean) / self.unit
 
 
 class Priors(NamedTuple):
-    """Prior on parameters (p,): `centre` and `width` of their mean, deviation `wander` of a random walk in 90 s."""
+    """Prior on p parameters that vary during a recording, (p,) each.
+
+    `centre`, `width`: prior mean and standard deviation of each parameter's average; `wander`: standard deviation
+    that its random walk reaches within `blocks.wander` of `priors.toml`, 90 s.
+    """
 
     centre: Array
     width: Array
@@ -46,7 +52,7 @@ class Priors(NamedTuple):
 
     @property
     def unit(self) -> Array:
-        """Units of the parameters (p,), small enough for finite differences."""
+        """Units of the parameters (p,): fractions of their prior widths, small enough for finite differences."""
         return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
@@ -60,16 +66,16 @@ class Priors(NamedTuple):
         return np.asarray((self.width / self.unit) ** 2)
 
     def wander_variance(self, seconds: float) -> Array:
-        """Return the variances (p,) that random walks add in a time [s], in squares of `unit`."""
+        """Compute the variances (p,) that the random walks add within a time `seconds` [s], in squares of `unit`."""
         return np.asarray((self.wander / self.unit) ** 2 * (seconds / PRESSURE.blocks.wander))
 
 
 class Linearisation(NamedTuple):
-    """Linearisation of the model about parameters `theta` (p,).
+    """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
-    `rows` (1 + p, n): residual [Pa] and Jacobian [Pa per unit], and `gram` (1 + p, 1 + p) of these; `ends`: states
-    at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter sets, that of `theta`
-    first.
+    `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram`
+    (1 + p, 1 + p): products of these rows; `ends`: simulated states at the last sample; `squares`: residual sums of
+    squares [Pa^2] of all simulated parameter sets, that of `theta` first.
     """
 
     theta: Array
@@ -79,16 +85,17 @@ class Linearisation(NamedTuple):
     squares: Array
 
     def cost(self, variance: float, prior: Normal) -> float:
-        """Compute -2 log posterior, for a noise variance [Pa^2]."""
+        """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise variance [Pa^2]."""
         deviations = prior.deviations(self.theta)
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
 
 
 class Block(NamedTuple):
-    """Sums of a block about its parameters `theta` (p,).
+    """Sums of a block of samples, from the linearisation about its parameters `theta` (p,).
 
-    `gram` (1 + p, 1 + p) of residual and Jacobian over `samples`; `scores` (s, 1 + p): products of these with the
-    tested parameter's column in each of s pieces, whose scatter shows the autocorrelation of the residual.
+    `gram` (1 + p, 1 + p): products of the residual and the derivatives by each parameter; `samples`: number of known
+    samples; `scores` (s, 1 + p): products of these rows with the derivative by the tested parameter, in each of s
+    pieces of the block. Their scatter shows the autocorrelation of the residual.
     """
 
     theta: Array
@@ -99,10 +106,11 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Joint fit of all K blocks of a recording.
+    """Joint fit of the parameters in all K blocks of a recording.
 
-    Deviations from `theta` (K, p), in units, block after block: `mean` (K p,), `covariance` and `prior_precision` (K p,
-    K p); `variance` of the residual [Pa^2].
+    `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p):
+    fitted deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): that of
+    the same deviations; `variance`: variance of the residual [Pa^2].
     """
 
     priors: Priors
@@ -114,7 +122,11 @@ class Joint:
 
     @staticmethod
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
-        """Fit blocks of `block_s` [s] jointly; the scores of `parameter` give the long-run variance of the noise."""
+        """Fit the parameters of all blocks, each `block_s` [s] long, together.
+
+        `parameter`: index of the tested parameter, whose scores show how much the correlation of the noise inflates
+        the variance of the estimates.
+        """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
         prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
@@ -129,10 +141,11 @@ class Joint:
         return Joint(priors, theta, mean, covariance, prior_precision, variance)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
-        """Compute the likelihood of a parameter in the blocks at `time` (K,) [s], with all others eliminated.
+        """Compute the likelihood of one parameter in each block, with all other parameters eliminated.
 
-        The fit's prior on this parameter is removed. In its place the result has the prior standard deviation `wander`
-        of a slope and of a random walk, each over all blocks.
+        `parameter`: its index; `time` (K,): middles of the blocks [s]. The prior that the fit used for this parameter
+        is removed. Instead the result has a prior on a slope and on a random walk, with the scale `wander` over all
+        blocks.
         """
         indices = slice(parameter, None, self.theta.shape[1])
         # precision with the prior, of deviations from theta
@@ -147,9 +160,10 @@ class Joint:
 
 
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
-    """Compute the prior precision (K p, K p), in units, of the parameters of K blocks of `block_s` [s].
+    """Compute the joint prior precision of the parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
-    Each parameter is a random walk from block to block, and its mean over the blocks has the prior of the machine.
+    The parameters are in units of `priors.unit`. Each is a random walk from block to block, and its mean over the
+    blocks has the prior of the machine.
     """
     steps = np.diff(np.eye(n_blocks), axis=0)
     walks = np.kron(steps.T @ steps, np.diag(1.0 / priors.wander_variance(block_s)))
@@ -158,10 +172,10 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and its inflation by the correlation of the noise.
+    """Compute the variance of the residual [Pa^2], and a factor by which correlation of the noise inflates it.
 
-    `deviations` (K p,): of the parameters from those of the blocks, in units. The inflation is the variance of the
-    scores of one `parameter`, relative to that under white noise, at least 1.
+    `deviations` (K p,): deviations of the parameters from `theta` of each block, in units. The factor is the variance
+    of the scores of one `parameter` (an index), relative to that under white noise, at least 1.
     """
     # (1, -deviation) times residual and Jacobian is the residual at these deviations
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

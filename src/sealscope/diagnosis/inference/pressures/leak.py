@@ -1,4 +1,4 @@
-"""Leakage measured by the response of the pressures: changes of the conductance, whose level gives no flow."""
+"""Leakage measured by the response of the pressures: changes of the conductance; its level is too uncertain."""
 
 from __future__ import annotations
 
@@ -26,26 +26,28 @@ ORIFICE_RATIO: float = PRESSURE.conductance.orifice
 
 
 def conductance_scale_error() -> float:
-    """Compute the relative standard deviation of the scale of all conductances.
+    """Compute the relative standard deviation of the common scale of all conductances.
 
-    The response determines G M/A^2, so that errors of the stated mass M and piston area A scale G.
+    The response of the pressures determines G M/A^2, so errors of the stated mass M and piston area A scale the
+    conductance G.
     """
     return math.hypot(PRESSURE.scale.mass, 2.0 * PRESSURE.scale.area)
 
 
 def states_flow(rig: Rig) -> bool:
-    """Test whether a rig states the sizes to convert a conductance into L/min."""
+    """Return True if the rig's file states the sizes that are needed to convert a conductance to L/min."""
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseLeak:
-    """The leakage of a recording by the response of its pressures (`observable.LeakMeasure`).
+    """The leakage of a recording as measured by the response of its pressures (`observable.LeakMeasure`).
 
-    `parameters`: likelihood of each parameter of the response in K blocks, all others eliminated, "G" the conductance
-    past the piston [m^3/(s Pa)]; `pressure` (K,): mean of abs(p_A - p_B) [Pa]; `pump_flow`: mean absolute flow of the
-    pump [m^3/s] over the recording and while it delivers, here equal; `stated`: the rig states the sizes that convert a
-    conductance to L/min; `healthy`: conductance of healthy recordings of the machine [m^3/(s Pa)].
+    `parameters`: likelihood in K blocks of each parameter of the response by its name, with all others eliminated;
+    "G" is the conductance past the piston [m^3/(s Pa)]. `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa];
+    `pump_flow`: mean flow of the pump [m^3/s], over the recording and while it delivers, here equal; `stated`: true
+    if the rig's file states the sizes that convert a conductance to L/min; `healthy`: mean conductance of each
+    healthy recording of the machine [m^3/(s Pa)].
     """
 
     parameters: Mapping[str, Information]
@@ -62,7 +64,7 @@ class ResponseLeak:
     ratio: Interval | None = None
     remarks: Sequence[Remark] = ()
     excess: float | None = None
-    #: The level of the conductance depends on the assumed friction, so that it gives no flow.
+    #: None, since the level of the conductance depends on the assumed friction.
     rise_flow: Flow | None = None
     rise_onset: Interval | None = None
 
@@ -79,12 +81,16 @@ class ResponseLeak:
 
     @cached_property
     def step(self) -> StepTest | None:
-        """Test of a step of the conductance; None if too few blocks have information."""
+        """Test for a step of the conductance within the recording; None if too few blocks have information."""
         return step_test(self.information)
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the step after its onset, midway between the laws of a worn seal and of an orifice."""
+        """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
+
+        It is midway between a laminar leak and an orifice; the two are the ends of a 95 % interval. Without a step
+        test it is 0 with an infinite standard error.
+        """
         if self.step is None:
             return Flow(0.0, np.inf)
         size, deviation = self.step.fitted
@@ -95,25 +101,25 @@ class ResponseLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a leak of 1 m^3/(s Pa) at the recording's pressures."""
+        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
         return float(self.pressure.mean())
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the mean conductance over that of the healthy recordings; None without healthy recordings."""
+        """Amount by which the mean conductance exceeds that of the healthy recordings; None if there are none."""
         healthy, count = self.healthy, len(self.healthy)
         if not count:
             return None
         total = sum(healthy)
-        # of each healthy recording from the mean of the others: their scatter is that of a new recording
+        # each healthy recording minus the mean of the others, as the judged one is compared with all of them
         differences = [level - (total - level) / (count - 1) for level in healthy] if count > 1 else [0.0]
         return student_rise(self.level[0] - total / count, differences, PRESSURE.conductance.level)
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the mean flow [m^3/s] of a leak through an orifice.
+        """95 % upper bound of the mean flow [m^3/s] of a leak, if it is an orifice; infinite if nothing was tested.
 
-        With healthy recordings it bounds the rise over them, otherwise a step; infinite if nothing was tested.
+        With healthy recordings it bounds the leakage above theirs, otherwise a leak that begins within the recording.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
@@ -123,10 +129,10 @@ class ResponseLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Rise over the healthy recordings, and the evidence that the fitted step caused it.
+        """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        `step_log_ratio` compares the rise of the mean that the step would cause with no rise. None without healthy
-        recordings.
+        The evidence (`step_log_ratio`) compares the rise of the mean that the step would cause with no rise. None
+        without healthy recordings.
         """
         if self.rise is None:
             return None
@@ -135,22 +141,26 @@ class ResponseLeak:
         return LeakRise(self.rise, self.rise.log_ratio(mean_step))
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean conductance that lies after a step's onset."""
+        """Compute the fraction of the information on the mean conductance that comes from after a step's onset."""
         weights = self.information.precision.sum(axis=0)
         is_after = self.information.time >= step.onset().value
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """L/min of a flow of 1 m^3/s; None if the machine's size is not stated."""
+        """Factor from a flow [m^3/s] to L/min; None if the machine's size is not stated."""
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return None: the pump's flow is not measured."""
+        """Return None, since the pump's flow is not measured."""
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return the smallest step that would be detected; the total leakage is unknown from pressures."""
+        """Return a record of the total leakage, which pressures alone do not show, with the smallest detectable leak.
+
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
+        None if that was not tested.
+        """
         pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
@@ -161,9 +171,9 @@ class ResponseLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the growth of the leakage since an onset [s], in L/min with its 95 % interval.
+        """Return the growth of the leakage over time since an onset `onset_s` [s], in L/min with its 95 % interval.
 
-        Return None without an onset or a step test, or if the rig does not state the sizes.
+        Return None without an onset or a step test, or if the rig's file does not state the machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None

@@ -1,9 +1,10 @@
-"""The rig reduced to the difference p_A - p_B of its chamber pressures, simulated in lanes.
+"""Model of the rig reduced to the difference p_A - p_B of its chamber pressures, for many parameter sets at once.
 
 Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed, its current
-and the integral of its speed loop, under the laws of `sealscope.physics`. Friction has two hypotheses, Stribeck's law
-and LuGre's. A leak damps the ringing after each reversal by G/C, and reduces the ramp, the breakaway and the fall of
-the pressure while sliding. `response` fits its parameters to recorded pressures.
+and the integral of its speed loop. They follow the laws of `sealscope.physics`. Friction has two alternative laws,
+Stribeck's and LuGre's. A leak of conductance G damps the ringing of a compliance C after each reversal by G/C. It
+also reduces the ramp, the breakaway and the fall of the pressure while sliding. `response` fits the parameters to
+recorded pressures. Parameter sets are simulated in parallel lanes of the processor (`physics.lanes`).
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 #: Parameters of a block: speed per volt [rad/(s V)], constant speed [rad/s], stiffness of the oil [Pa], Coulomb
 #: friction [N], viscous friction [N s/m], breakaway over Coulomb friction [1], its decay [s/m], relative increase of
 #: friction on the way out [1], conductance past the piston [m^3/(s Pa)], compliance of the contact before it slides
-#: [m/N], stiffness of the load [N/m]; then, with slopes that need no simulation: lead of the command [s], lag of the
-#: transducers [s], scale of p_A - p_B [1] and its offset [Pa].
+#: [m/N], stiffness of the load [N/m]; then those with derivatives that need no simulation: lead of the command [s],
+#: lag of the transducers [s], scale of p_A - p_B [1] and its offset [Pa].
 PARAMETERS = (
     *("gain", "bias", "K", "F_C", "F_v", "K_brk", "C_c", "side", "G", "give", "spring"),
     *("lead", "lag", "scale", "offset"),
@@ -46,27 +47,31 @@ State = tuple[float, float, float, float, float, float]
 Parameters = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
 #: Numbers of the reduced rig, A_A the mean of both areas.
 Reduced = namedtuple("Reduced", "A_A V M_eq v_th q_b k_p K_i V_max C_m B_M J_M R_c L_c C_e i_max")
-#: Hypotheses of the friction: Stribeck's law of the rig, and LuGre's, whose contact does not creep.
+#: Laws of friction: Stribeck's, as in the rig, and LuGre's, whose contact does not creep.
 LAWS = STRIBECK, BRISTLES = "stribeck", "bristles"
 _FRICTION = {STRIBECK: PRESSURE.stribeck, BRISTLES: PRESSURE.bristles}
 _CENTRING_RATE = 1.0 / PRESSURE.follow.centring
-#: Maximum step of the solver [s]: RK4 is within 100 Pa there, far below the noise of transducers; length of spectra
-#: [samples].
+#: Maximum step of the solver [s], with which RK4 is within 100 Pa, far below the noise of transducers; length of
+#: spectra [samples].
 _MAX_STEP, _SEGMENT = 1.01e-3, 256
 
 
 @contracted
 def _direction_factor(v: float, theta: Parameters) -> float:
-    """Compute the factor by which friction depends on the direction of motion.
+    """Compute the factor on the friction for the direction of the piston's speed v [m/s].
 
-    It is 1 + theta[SIDE] for motion out, 1 - theta[SIDE] for motion in.
+    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in.
     """
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
 
 @contracted
 def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, float, float]:
-    """Compute the friction of steady sliding [N], its magnitude at full slip [N], and the slip speed [m/s]."""
+    """Compute the friction of steady sliding at a speed v [m/s] by Stribeck's law.
+
+    Returns the friction force [N], which falls linearly to zero below the creep speed `m.v_th`; its magnitude without
+    this reduction [N]; and the magnitude of the speed, at least the creep speed [m/s].
+    """
     speed = max(abs(v), m.v_th)
     magnitude = stribeck_force(speed, theta[F_C], theta[K_BRK], theta[C_C]) * _direction_factor(v, theta)
     return magnitude * min(max(v / m.v_th, -1.0), 1.0), magnitude, speed
@@ -76,11 +81,16 @@ def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, fl
 def _advance_friction(
     friction_0: float, steady_0: float, v: float, h: float, theta: Parameters, m: Reduced
 ) -> tuple[float, float]:
-    """Advance LuGre's friction force [N] by h [s]; return it and the friction of steady sliding at v.
+    """Advance the friction force by LuGre's law over a time step h [s].
 
-    Without the damping of its contact, which vanishes as it slides, the law is compliance dF/dt = v - |v| F/magnitude.
-    L-stable step of order 2: with a = h |v|/(compliance magnitude) and the steady friction F_s, F_s0 at its start,
-    F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2); both are multiplied by (compliance magnitude)^2.
+    Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
+    `friction_0`, `steady_0`: the same two forces before the step.
+
+    Without the damping of the contact, which vanishes when it slides, the law is
+    compliance dF/dt = v - |v| F/magnitude. The step is L-stable and of order 2: with a = h |v|/(compliance magnitude)
+    and the steady friction F_s, or F_s0 before the step,
+    F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2). Numerator and denominator are both multiplied by
+    (compliance magnitude)^2.
     """
     steady, magnitude, speed = _steady_friction(v, theta, m)
     slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: path in h, deflection at full friction
@@ -90,7 +100,11 @@ def _advance_friction(
 
 @contracted
 def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
-    """Compute dy/dt of y = (p, v, omega, i, I, x) under the commanded speed `omega_ref` [rad/s]."""
+    """Compute the time derivative of the state y = (p, v, omega, i, I, x).
+
+    The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the
+    integral of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s].
+    """
     p, v, omega, i, integral, x = y
     outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)
     error = omega_ref - omega
@@ -107,13 +121,13 @@ def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Re
 
 @contracted
 def _advance(y: State, h: float, k: State) -> State:
-    """Compute the state y + h k."""
+    """Compute the state y + h k, i.e. the state y after a step h [s] with the derivative k."""
     return y[0] + h * k[0], y[1] + h * k[1], y[2] + h * k[2], y[3] + h * k[3], y[4] + h * k[4], y[5] + h * k[5]
 
 
 @contracted
 def _load_six(rows: Array, k: int) -> State:
-    """Load the six consecutive rows from row k on as lanes."""
+    """Load the six consecutive rows k to k + 5 of an array, each as one vector of lanes."""
     return load(rows, k), load(rows, k + 1), load(rows, k + 2), load(rows, k + 3), load(rows, k + 4), load(rows, k + 5)
 
 
@@ -121,11 +135,26 @@ def _load_six(rows: Array, k: int) -> State:
 def simulate_response(
     command: np.ndarray, rate: float, n_substeps: int, sets: np.ndarray, states: np.ndarray, m: Reduced, out: np.ndarray
 ) -> None:
-    """Simulate p_A - p_B [Pa] of all lanes at each sample, `out` (n, lanes), by RK4 with substeps of a sample.
+    """Simulate p_A - p_B as read by the transducers, for several parameter sets at once, one in each lane.
 
-    `command` (n + 1,) [V]: at the previous sample, then at each, with ramps between; `sets` (p, lanes): a row for each
-    parameter; `states` (8, lanes): p, v, omega, i, I, x, friction and reading at the previous sample, on return at the
-    last. Friction advances by its own implicit step from the speed at each stage.
+    The states are integrated by RK4; friction advances by an implicit step from the speed at each stage.
+
+    Parameters
+    ----------
+    command : array of float, shape (n + 1,)
+        Command [V] at the previous sample and at each of n samples; it is linear in between.
+    rate : float
+        Sampling rate [Hz].
+    n_substeps : int
+        Number of integration steps from sample to sample.
+    sets : array of float, shape (p, lanes)
+        Parameters, a row for each.
+    states : array of float, shape (8, lanes)
+        p, v, omega, i, I, x, friction and reading at the previous sample; on return those at the last sample.
+    m : Reduced
+        Sizes of the reduced rig.
+    out : array of float, shape (n, lanes)
+        Receives the readings of p_A - p_B at each sample [Pa].
     """
     y, friction, reading = _load_six(states, 0), load(states, 6), load(states, 7)
     theta = (*_load_six(sets, 0), *_load_six(sets, 6), load(sets, LAG))
@@ -156,7 +185,10 @@ def simulate_response(
 
 
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
-    """Compute the priors on `PARAMETERS` from a rig at its charge pressure and a `law` of friction."""
+    """Compute the priors on the parameters `PARAMETERS` of the pressure response from the rig's file.
+
+    `law`: law of friction, one of `LAWS`. The Coulomb friction is that at the charge pressure.
+    """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"
     coulomb = coulomb_friction(rig.fluid.p_charge, rig.fluid.p_charge, friction.F_pr, friction.F_cfr, of_difference)
@@ -168,7 +200,11 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
 
 
 class Machine(NamedTuple):
-    """The reduced rig of the simulation, at a rate [Hz] in `n_substeps` steps a sample."""
+    """Simulator of the reduced rig.
+
+    `numbers`: sizes of the rig; `rate`: sampling rate [Hz]; `n_substeps`: number of integration steps from sample to
+    sample; `law`: law of friction, one of `LAWS`.
+    """
 
     numbers: Reduced
     rate: float
@@ -177,16 +213,17 @@ class Machine(NamedTuple):
 
     @staticmethod
     def from_rig(rig: Rig, rate: float, law: str = STRIBECK) -> Machine:
-        """Reduce a rig to the simulated states, with the creep speed of the law of friction."""
+        """Make the simulator of a rig for samples at a `rate` [Hz] and a `law` of friction, one of `LAWS`."""
         numbers = rig_numbers(rig)
         numbers = numbers._replace(A_A=0.5 * (numbers.A_A + numbers.A_B), v_th=_FRICTION[law].creep or numbers.v_th)
         reduced = Reduced(*(getattr(numbers, name) for name in Reduced._fields))
         return Machine(reduced, rate, math.ceil(1.0 / rate / _MAX_STEP), law)
 
     def simulate(self, command: Array, sets: Array, states: Array) -> tuple[Array, Array]:
-        """Simulate p_A - p_B (m, n) [Pa] of up to 16 parameter sets (m, p); return it and the last states (8, m).
+        """Simulate p_A - p_B [Pa] at n samples for each of up to 16 parameter sets (m, p).
 
-        `command` (n + 1,) [V] and `states` (8, m): from the previous sample on (`simulate_response`).
+        `command` (n + 1,): command [V] at the previous sample and at each sample; `states` (8, m): states at the
+        previous sample (`simulate_response`). Returns p_A - p_B (m, n), and the states at the last sample (8, m).
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)
@@ -196,20 +233,21 @@ class Machine(NamedTuple):
         return out[:, : len(sets)].T.astype(np.float64, order="C"), ends[:, : len(sets)].astype(np.float64)
 
     def centred_start(self, speed: Array) -> float:
-        """Compute the initial position [m] that centres the stroke under the motor's speed (n,) [rad/s]."""
+        """Compute the initial position [m] that centres the stroke about 0, for motor speeds (n,) [rad/s]."""
         position = np.cumsum(speed) * self.numbers.q_b / (2.0 * math.pi * self.rate * self.numbers.A_A)
         return float(-0.5 * (position.max() + position.min()))
 
     def ringing_period(self, stiffness: float) -> float:
-        """Compute the period of the ringing [samples] at a stiffness of the oil [Pa]."""
+        """Compute the period of the pressures' ringing [samples] for a stiffness (bulk modulus) of the oil [Pa]."""
         m = self.numbers
         return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
 
     def ringing_stiffnesses(self, dp: Array, total: Array, priors: Priors) -> Array:
-        """Find the two stiffnesses of the oil [Pa] at which p_A - p_B rings most.
+        """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
 
-        The spectrum of p_A + p_B, `total` (n,), which has the same noise and hum but does not ring, is subtracted from
-        that of p_A - p_B, `dp` (n,). If no resolved frequency is within the prior, both are the rig's stiffness.
+        The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus the spectrum of `total` (n,), i.e.
+        p_A + p_B [Pa], which has the same noise and hum but does not ring. If no resolved frequency is within the
+        prior, both are the stiffness of the rig's file.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         # bins of the zero-padded spectra: of the ringing at the centre of the prior, and around it

@@ -1,12 +1,12 @@
-"""Response of p_A - p_B to the command, linearised block by block, without a position.
+"""Fit of the response of p_A - p_B to the command in a recording without a position, block by block.
 
-All lanes of a call of the kernel of `reduced_rig` are one Jacobian: the parameters, and the parameters with each
-increased in turn; their states continue from block to block. An iterated Kalman filter leads from block to block
-(`Follower`), live and over a recording alike; over a recording all blocks are then fitted together (`fit.Joint`). The
-law of friction is the likelier one at the beginning.
+One call of the simulation (`reduced_rig`) gives a whole Jacobian: its lanes simulate the parameters, and the
+parameters with each of them increased in turn. Their states continue from block to block. An iterated Kalman filter
+leads from block to block (`Follower`), both live and over a recording. Over a recording all blocks are then fitted
+together (`fit.Joint`). Of the two laws of friction the one that is more probable at the beginning is used.
 
-The result is the factor p(pressures | command) of the likelihood; a balance of position and angle is conditional on p_A
-and p_B, so that the two may be multiplied.
+The result is the factor p(pressures | command) of the likelihood. A balance of position and angle is conditional on
+p_A and p_B, so the two likelihoods may be multiplied.
 
 Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (iterated filter as Gauss-Newton steps).
 """
@@ -57,24 +57,25 @@ if TYPE_CHECKING:
 _FOLLOW = PRESSURE.follow
 #: Parameters that stay positive; minimum compliance of the contact [m/N] and lag [s].
 _POSITIVE, _MIN = [GAIN, K_OIL, F_C, K_BRK, C_C], 1e-9
-#: Gauss-Newton steps of a fit, fractions of a step that are tried together, and minimum gain of -2 log posterior for
-#: which another simulation is run.
+#: Gauss-Newton steps of a fit, fractions of a step that are tried together, and minimum expected decrease of -2 log
+#: posterior for another step.
 _N_STEPS, _FRACTIONS, _MIN_GAIN = 12, np.array([1.0, *np.geomspace(0.5, 0.02, 4)]), 5.0
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
-    """Space `count` starting values geometrically from `middle` / `factor` to `middle` * `factor`."""
+    """Return `count` values that are spaced geometrically from `middle` / `factor` to `middle` * `factor`."""
     return np.asarray(middle * np.geomspace(1.0 / factor, factor, count))
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Consecutive samples that are fitted with one set of parameters.
+    """Consecutive samples of a recording that are fitted with one set of parameters.
 
-    `command` (n + 1,) [V] with that of the previous sample; `dp` (n,) [Pa]; `states` (8, 12): simulated at the
-    previous sample, with the parameters and with each perturbed set; `waves` (m, n): mains waves, which are projected
-    out; `sample_weights` (n,): 1 for a recorded sample, 0 for a missing one. `smooth` [samples] > 0: width of a
-    Gaussian that smooths the residual before it is fitted.
+    `machine`: simulator; `priors`: of its parameters; `command` (n + 1,): command [V] at the previous sample and at
+    each sample; `dp` (n,): recorded p_A - p_B [Pa]; `states` (8, 12): simulated states at the previous sample, with
+    the parameters and with each of them increased; `waves` (m, n): waves of the mains hum, which are projected out;
+    `sample_weights` (n,): 1 for a recorded sample, 0 for a missing one; `smooth`: width [samples] of a Gaussian that
+    smooths the residual before it is fitted, 0 for no smoothing.
     """
 
     machine: Machine
@@ -88,16 +89,19 @@ class Segment:
 
     @cached_property
     def n_samples(self) -> float:
-        """Number of known samples."""
+        """Number of samples that are not missing."""
         return float(np.count_nonzero(self.sample_weights))
 
     @cached_property
     def _wave_gram_inverse(self) -> Array:
-        """Pseudo-inverse of the Gram matrix of the waves."""
+        """Pseudo-inverse of the Gram matrix of the mains waves, (m, m)."""
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth and mask rows (m, n); return them, their products (m, k) with the mains waves, and wave amplitudes."""
+        """Smooth rows (m, n) over the samples, set missing samples to zero, and fit k waves of the mains hum to them.
+
+        Returns the rows, their products with the waves (m, k), and the fitted amplitudes of the waves (m, k).
+        """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
             rows *= self.sample_weights
@@ -105,17 +109,20 @@ class Segment:
         return rows, products, products @ self._wave_gram_inverse
 
     def residual_squares(self, sets: Array) -> Array:
-        """Compute the residual sums of squares (m,) [Pa^2], about the mean, of up to 16 parameter sets (m, p)."""
+        """Compute the residual sum of squares about the mean [Pa^2] for each of up to 16 parameter sets (m, p).
+
+        The result has the shape (m,); it is infinite for a set whose simulation diverges.
+        """
         simulated, _ = self.machine.simulate(self.command, sets, self.states[:, np.zeros(len(sets), dtype=int)])
         residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
         squares = self.dp.size * np.var(residual - amplitudes @ self.waves, axis=1)
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
 
     def linearise(self, sets: Array) -> Linearisation:
-        """Linearise about the first of up to 5 parameter sets (m, p), and compute the residual squares of all.
+        """Linearise the model about the first of up to 5 parameter sets (m, p), and compute all sets' residuals.
 
-        The residual is dp - scale * simulated response - offset. Rows: the residual by the first set, its slopes (with
-        the sign of the response) by a unit of each parameter, and the residuals by the other sets.
+        The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
+        set and the derivatives of scale * response + offset by each parameter, in its unit.
         """
         theta, n_sets, n_slopes = sets[0], len(sets), SPRING + 1
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
@@ -123,7 +130,7 @@ class Segment:
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
         states = self.states[:, [*range(n_slopes + 1), *[0] * (n_sets - 1)]]
         responses, ends = self.machine.simulate(self.command, simulated, states)
-        n_rows = 1 + len(PARAMETERS)  # of the linearisation: residual and slopes; then residuals of the other sets
+        n_rows = 1 + len(PARAMETERS)  # residual and derivatives; after these come the residuals of the other sets
         rows = np.empty((n_rows + n_sets - 1, self.dp.size))
         rows[0] = self.dp - theta[SCALE] * responses[0] - theta[OFFSET]
         rows[1 : n_slopes + 1] = theta[SCALE] * (responses[1 : n_slopes + 1] - responses[0])
@@ -136,9 +143,9 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the slopes (3, n) of lead, lag and scale from the simulated p_A - p_B (n,).
+        """Compute the derivatives of the response by lead, lag and scale, (3, n), in their units, without simulation.
 
-        They need no further simulation.
+        `theta` (p,): parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
@@ -149,11 +156,12 @@ class Segment:
         return np.array([by_lead, by_lag, response]) * self.priors.unit[LEAD:OFFSET, None]
 
     def descend(self, fit: Linearisation, prior: Normal, n_steps: int, noise: float | None = None) -> Linearisation:
-        """Minimise -2 log posterior by Gauss-Newton steps with Levenberg-Marquardt damping from a linearisation.
+        """Fit the parameters by up to `n_steps` Gauss-Newton steps from a linearisation, and return the last one.
 
-        `noise`: its variance [Pa^2], None to estimate it from the residual. Fractions of each step are simulated
-        together with the Jacobian at the full step; if none gains, the step is damped. A step with a smaller expected
-        gain than `_MIN_GAIN` is not made.
+        The steps minimise -2 log posterior under a `prior`, with Levenberg-Marquardt damping. `noise`: variance of
+        the noise [Pa^2], None to estimate it from the residual. Fractions of each step are simulated together with
+        the Jacobian at the full step; if none is an improvement, the step is damped. The fit ends if the expected
+        decrease of -2 log posterior is below `_MIN_GAIN`.
         """
         damping = 0.0
         for _ in range(n_steps):
@@ -176,26 +184,33 @@ class Segment:
         return fit
 
     def bounds(self, theta: Array) -> tuple[Array, Array]:
-        """Return lower and upper limits (p,) of a step from `theta`: positive parameters halve or double at most."""
+        """Return lower and upper limits (p,) of the parameters after one step from `theta` (p,).
+
+        Parameters that must be positive can at most halve or double.
+        """
         low, high = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
         low[_POSITIVE], high[_POSITIVE] = 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE]
         low[LAG], low[COMPLIANCE] = 0.0, _MIN
         return low, high
 
     def residual_variance(self, squares: float) -> float:
-        """Compute the variance [Pa^2] of a residual from its sum of squares and the number of independent samples.
+        """Compute the variance of a residual [Pa^2] from its sum of squares [Pa^2].
 
-        2 sqrt(pi) sigma is the correlation length of noise smoothed by a Gaussian of width sigma [samples].
+        The sum is divided by the number of independent samples. 2 sqrt(pi) sigma is the correlation length of noise
+        that was smoothed by a Gaussian of width sigma [samples].
         """
         count = max(self.n_samples - len(PARAMETERS), 1.0)
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Test whether a chi-squared cost is consistent with the number of samples."""
+        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number."""
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
-        """Return the sums of a linearisation, with the scores of the conductance in each second."""
+        """Return the sums of a linearisation for the joint fit (`fit.Joint`).
+
+        They include the scores, i.e. products with the derivative by the conductance, in each second.
+        """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
@@ -203,19 +218,22 @@ class Segment:
 
 
 def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisation:
-    """Fit the parameters to a segment without any earlier fit; `noise`: its variance [Pa^2].
+    """Fit the parameters to a first segment of samples, from the priors alone.
 
-    The ringing makes many local minima. Therefore the slow part of the pressure is fitted first, from the best of
-    several gains; then all of it, from stiffnesses at the peaks of the spectrum of p_A - p_B over that of p_A + p_B,
-    `total` (n,), which does not ring, and from several breakaway forces.
+    `total` (n,): sum p_A + p_B of the pressures [Pa]; `noise`: variance of the noise [Pa^2].
+
+    The ringing causes many local minima. Therefore the slow part of the pressure is fitted first, from the best of
+    several gains. Then all of it is fitted, from several breakaway forces and from stiffnesses at the peaks of the
+    spectrum of p_A - p_B minus that of p_A + p_B, which does not ring.
     """
     priors = segment.priors
 
     def rank_starts(section: Segment, theta: Array, n_groups: int, values: dict[int, Array]) -> Array:
-        """Sort 16 variants of the parameters `theta` (p,) by their residual squares, the best first, within each group.
+        """Sort 16 variants of the parameters `theta` (p,) by their fit to a section, within each of several groups.
 
-        `values`: index of a parameter -> its value in each variant (16,). Consecutive variants form the `n_groups`
-        groups. Return (16/n_groups, n_groups, p): row 0 has the best variant of each group.
+        `values`: maps the index of a parameter to its value in each variant (16,). Consecutive variants form
+        `n_groups` groups. The result has the shape (16/n_groups, n_groups, p); row 0 contains the variant with the
+        smallest residual of each group.
         """
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, column in values.items():
@@ -239,7 +257,10 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
-    """Descend from several starts (s, p), a few steps from all and more from the `n_best`; return the best result."""
+    """Fit the parameters from several starts (s, p), and return the best fit.
+
+    All starts make a few steps; the `n_best` of them make more. `noise`: variance of the noise [Pa^2].
+    """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
         fits = [segment.descend(fit, prior, n_steps, noise) for fit in fits]
@@ -249,11 +270,12 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 
 
 class Follower:
-    """Iterated Kalman filter of the parameters of the response, from block to block.
+    """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
-    `machine`, `priors`; `sense`: 1 if p_A - p_B rises with the command, -1 if it falls. State: parameters `theta` (p,),
-    their `covariance` (p, p) in units, `variance` of the noise [Pa^2], simulated `states` (8, 12), `last` command [V],
-    and `excess`: (chi squared - n) / sqrt(2 n) of the last block.
+    `machine`: simulator; `priors`: of its parameters; `sense`: 1 if p_A - p_B rises with the command, -1 if it falls.
+    The state of the filter consists of the parameters `theta` (p,), their `covariance` (p, p) in units of
+    `priors.unit`, the `variance` of the noise [Pa^2], the simulated `states` (8, 12), the `last` command [V], and
+    `excess`, the misfit (chi squared - n) / sqrt(2 n) of the last block of n samples.
     """
 
     def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
@@ -264,9 +286,10 @@ class Follower:
 
     @staticmethod
     def fit_start(recording: Recording, rig: Rig) -> Follower:
-        """Fit a follower to the first seconds of a recording.
+        """Start a filter with parameters that are fitted to the beginning of a recording.
 
-        The friction is Stribeck's, or LuGre's if Stribeck's does not explain the samples and LuGre's fits better.
+        The law of friction is Stribeck's, or LuGre's if Stribeck's does not explain the samples and LuGre's fits
+        better.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
@@ -291,7 +314,7 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Refine the start parameters by filtering the beginning of a recording; reset covariance and states."""
+        """Refine the parameters by filtering the beginning of a recording, then reset covariance and states."""
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         stop = min(round(_FOLLOW.beginning * recording.rate), len(recording) - length + 1)
@@ -300,19 +323,26 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Return a follower with the same parameters for samples at another rate [Hz]."""
+        """Return a filter in the same state for samples at another rate [Hz]."""
         follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
         return follower
 
     def interrupt(self, gap_s: float) -> None:
-        """Widen the covariance after a gap of `gap_s` [s] without samples, by at most the prior variance."""
+        """Increase the uncertainty of the parameters after a gap of `gap_s` [s] without samples.
+
+        At most the prior variance is added.
+        """
         added = np.minimum(self.priors.wander_variance(gap_s), self.priors.variance)
         self.covariance, self.last = self.covariance + np.diag(added), math.nan
 
     def next_segment(self, block: Recording) -> Segment:
-        """Prepare the samples of the next block for a fit."""
+        """Return the samples of the next block, prepared for a fit.
+
+        At the start and after a gap the simulated stroke is centred, and the first samples have no weight, since the
+        drive settles.
+        """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
         if math.isnan(self.last):  # at the start or after a gap: centre the stroke, and let the drive settle
@@ -325,9 +355,10 @@ class Follower:
         return Segment(self.machine, self.priors, np.append(self.last, u), dp, self.states, waves, sample_weights)
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
-        """Compute the prior on the parameters in the next block, of `block_s` [s].
+        """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
 
-        `jumped`: index of a parameter that may have jumped, whose prior variance at the start is added.
+        `jumped`: index of a parameter that may have jumped; its variance is increased by that of the prior at the
+        start.
         """
         variance = self.priors.wander_variance(block_s)
         if jumped is not None:
@@ -335,13 +366,14 @@ class Follower:
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(variance))), self.priors.unit)
 
     def _fit_block(self, segment: Segment, block_s: float) -> tuple[Linearisation, Normal]:
-        """Fit a block of `block_s` [s]; return the linearisation and its prior.
+        """Fit the parameters to the next block, `block_s` [s] long; return the fit and the prior that it used.
 
-        If random walks do not explain the block, a jump of the conductance or of the stiffness is allowed.
+        If slow variations do not explain the block, a jump of the conductance or of the oil's stiffness is tried as
+        well.
         """
 
         def fit_candidate(start: Array, prior: Normal) -> tuple[float, Linearisation, Normal]:
-            """Fit the block from a start (p,); return the cost, the fit and its prior."""
+            """Fit the block from parameters `start` (p,); return -2 log posterior, the fit and its prior."""
             fit = segment.descend(segment.linearise(start[None]), prior, _N_STEPS, self.variance)
             return fit.cost(self.variance, prior), fit, prior
 
@@ -355,7 +387,10 @@ class Follower:
         return min(candidates, key=lambda entry: entry[0])[1:]
 
     def update(self, block: Recording) -> Block:
-        """Fit the next block, update the parameters and their covariance, and return the block's sums."""
+        """Fit the next block of samples, and return its sums for a joint fit of all blocks (`fit.Joint`).
+
+        The parameters, their covariance and the simulated states are updated.
+        """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
         excess = fit.cost(self.variance, prior) - segment.n_samples
@@ -369,10 +404,13 @@ class Follower:
 
 
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
-    """Fit the response of a usable recording; None if no parameters describe it. The result is computed once."""
+    """Fit the pressure response of a recording that meets its requirements; None if no parameters describe it.
+
+    The result is computed only once for a recording.
+    """
 
     def compute(recording: Recording) -> Joint | None:
-        """Follow the blocks from the first to the last, then fit all together."""
+        """Track the parameters through all blocks, then fit all blocks together."""
         edges = block_edges(recording)
         with np.errstate(over="ignore", invalid="ignore"):
             try:
@@ -389,7 +427,10 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 
 
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
-    """Estimate the conductance and the response's other parameters; None if they do not describe the recording."""
+    """Measure the leakage of a recording without position by the response of its pressures.
+
+    Return None if the recording does not meet the requirements, or if no parameters of the response describe it.
+    """
     joint = fit_response(recording, rig) if find_unmet_requirement(recording, rig) is None else None
     if joint is None:
         return None
@@ -403,8 +444,11 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute the likelihood of each parameter, by name, in blocks at `time` (K,) [s], of `seconds` in total."""
-    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk, beyond the time that priors state
+    """Compute the likelihood of each parameter of the response in K blocks, by the name of the parameter.
+
+    `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the recording [s].
+    """
+    growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk since the time that the priors state
     wander = growth * joint.priors.wander
     wander[G] = growth * PRESSURE.conductance.wander  # that of a healthy machine
     return {name: joint.information(k, time, float(wander[k])) for k, name in enumerate(PARAMETERS)}

@@ -1,4 +1,4 @@
-"""Samples for the response of the pressures: usable recordings, blocks and mains waves."""
+"""Preparation of samples for a fit of the pressure response: requirements, blocks, and waves of the mains hum."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 
 def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
-    """Return the first requirement of the response that a recording does not meet, as a text; None if it meets all.
+    """Find the first requirement of a fit of the pressure response that a recording does not meet.
 
-    It needs command and pressures in their units, of a pump that drives two equal areas, long and fast enough.
+    The fit needs the command [V] and both pressures [Pa] of a pump that drives a cylinder of two equal areas,
+    recorded for long enough and at a high enough rate. Return the requirement as a text, or None if all are met.
     """
     blocks = PRESSURE.blocks
     if not rig.circuit.pump_feeds_chambers:
@@ -48,16 +49,16 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
 
 
 def block_edges(recording: Recording) -> NDArray[np.int64]:
-    """Return the sample indices (K + 1,) at which the blocks of a recording begin and end."""
+    """Divide a recording into K blocks of equal length, and return the indices of samples between them, (K + 1,)."""
     n_blocks = max(1, min(PRESSURE.blocks.most, int(recording.duration / PRESSURE.blocks.shortest)))
     return np.round(np.linspace(0, len(recording), n_blocks + 1)).astype(np.int64)
 
 
 def mains_waves(total: Array, rate: float) -> Array:
-    """Build cosines and sines (2 m, n) of the mains hum and its harmonics.
+    """Compute the cosine and sine waves of the mains hum and its harmonics at n samples, shape (2 m, n).
 
-    The fundamentals are the strongest lines near 50 and 60 Hz in the spectrum of p_A + p_B, `total` (n,). Only waves
-    below half the `rate` [Hz] are built.
+    `total` (n,): sum p_A + p_B of the pressures, in whose spectrum the strongest lines near 50 and 60 Hz give the
+    fundamentals; `rate`: sampling rate [Hz]. The m frequencies are those below half the rate.
     """
     n_padded = 4 * total.size  # zero-padded for a finer grid of frequencies
     spectrum = np.abs(np.fft.rfft((total - total.mean()) * np.hanning(total.size), n_padded))

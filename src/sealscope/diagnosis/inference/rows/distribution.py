@@ -1,8 +1,9 @@
 """The distribution of p_A - p_B over a block, from which a sensor offset may be subtracted afterwards.
 
-Means over `SMOOTHED` seconds hide how a stiff circuit rings, and samples contain noise. In each stride of the weak form
-the samples' deviations from these means, of variance v, are multiplied by sqrt(max(v - s^2, 0) / v); s^2, the variance
-of white noise, is that of the sixth differences over 924, the sum of their squared coefficients.
+Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but samples contain noise. In each stride of the
+weak form the deviations of the samples from these means, of variance v, are therefore multiplied by sqrt(max(v - s^2,
+0) / v). The variance s^2 of white noise is that of the sixth differences of the samples over 924, the sum of the
+squared coefficients of such a difference.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ _ORDER = 6
 
 
 def sorted_part_means(pressure: Array, rate: float) -> Array:
-    """Compute the means of `PARTS` equal parts of the sorted samples of a pressure [Pa].
+    """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
-    White noise is first removed. `pressure` (n,): NaN where missing; samples after the last whole stride of the weak
-    form are omitted. The means are zeros if all samples are missing.
+    The spread due to white noise is removed first. `pressure` (n,): samples [Pa] at the sampling `rate` [Hz], NaN
+    where missing. Samples after the last whole stride of the weak form are omitted. The means, of shape (PARTS,), are
+    zeros if all samples are missing.
     """
     # lengths [samples] of the means of the pressure, and of the strides within which the noise is removed
     piece, stride = max(1, round(SMOOTHED * rate)), min(stride_samples(rate), max(len(pressure), 1))

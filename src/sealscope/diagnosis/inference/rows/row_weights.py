@@ -1,9 +1,10 @@
-"""Huber's weights of the rows of blocks, and Gram matrices of the weighted rows: compiled laws on the caller's arrays.
+"""Huber's weights of the rows of blocks, and Gram matrices of the weighted rows.
 
-A block's rows are v = (fast, slow, left side). Coefficients of fast columns are free in each block; those of slow
-columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
-min(1, HUBER sigma / abs(residual)) at the fit with these weights, sigma from the median of abs(residual), by
-iteration. No law allocates memory: a unit for other simulators (`fmu`) runs the same laws in C.
+A row of a block is v = (fast columns, slow columns, left side). Coefficients of fast columns are free in each block;
+those of slow columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
+min(1, HUBER sigma / abs(residual)), where sigma follows from the median of abs(residual). Weights and fit depend on
+each other and are found by iteration. The functions are compiled and write to arrays of the caller. They allocate no
+memory, since a unit for other simulators (`fmu`) runs the same functions in C.
 
 Source: P. J. Huber, Ann. Math. Statist. 35 (1964) 73 (weights).
 """
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from sealscope.compiled import large_law, law
 from sealscope.recordings.recording import Array
 
-#: Blocks whose rows are weighted together at the beginning of a stream; later the prior counts as so many blocks.
+#: Number of blocks whose rows are weighted together at the beginning of a stream; later the weight of the prior.
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
@@ -32,9 +33,11 @@ _Indices = NDArray[np.intp]
 
 
 class Workspace(NamedTuple):
-    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, s of them slow.
+    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, including the left side, s of them slow.
 
-    `weights`, `residual`, `ordered` (r,); `reduced` (K, c, c); `fit` (K, c - 1); `normal` (s + 1, s + 1).
+    `weights` and `residual` (r,) of the rows; `ordered` (r,), the magnitudes of the residuals, which the median
+    reorders; `reduced` (K, c, c), Gram matrices after elimination of the fast coefficients; `fit` (K, c - 1),
+    coefficients in each block; `normal` (s + 1, s + 1), normal equations of the slow coefficients.
     """
 
     weights: Any
@@ -46,16 +49,19 @@ class Workspace(NamedTuple):
 
 
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of a `Workspace`."""
+    """Return the shapes of the arrays of a `Workspace`, in the order of its fields.
+
+    The arguments are the numbers of rows, of blocks, of columns with the left side, and of slow columns without it.
+    """
     return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
 
 @large_law
 def eliminate(matrix: Any, count: int) -> None:
-    """Eliminate the first `count` unknowns of a positive semidefinite matrix with appended right sides, in place.
+    """Eliminate the first `count` unknowns of a positive semidefinite system with appended right sides, in place.
 
-    Gauss-Jordan elimination: the first rows then contain the unknowns in terms of the other columns, the other rows the
-    reduced system. Unknowns without information become zero.
+    After this Gauss-Jordan elimination the first `count` rows of `matrix` express the unknowns by the other columns,
+    and the other rows contain the reduced system. Unknowns without information become zero.
     """
     rows, columns = matrix.shape
     for i in range(count):
@@ -72,7 +78,7 @@ def eliminate(matrix: Any, count: int) -> None:
 
 @law
 def median(values: Any, n: int) -> float:
-    """Return the median of the first n values, by quickselect, which reorders them."""
+    """Compute the median of the first n values, by quickselect, which reorders them."""
     k, low, high = (n - 1) // 2, 0, n - 1
     while low < high:
         pivot, i, j = values[k], low, high
@@ -98,7 +104,10 @@ def median(values: Any, n: int) -> float:
 
 @law
 def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
-    """Compute the Gram matrix (m, m) of the weighted rows `begin` to `end` of `values` (r, m), written to `gram`."""
+    """Compute the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,).
+
+    It is written to `gram` (m, m).
+    """
     width = values.shape[1]
     for i in range(width):
         for j in range(width):
@@ -112,7 +121,10 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 @large_law
 def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
-    """Write a block's Gram matrix in `column_order` to `reduced`, with its first `n_fast` columns eliminated."""
+    """Eliminate the fast coefficients from a block's Gram matrix `gram` (m, m), and write the result to `reduced`.
+
+    `column_order`: indices of the c columns of `reduced` (c, c), the `n_fast` fast ones first.
+    """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
             reduced[i, j] = gram[column_order[i], column_order[j]]
@@ -121,7 +133,11 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 
 @large_law
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
-    """Compute Huber's weights from the residuals of the fit in the workspace; return True if they have converged."""
+    """Compute Huber's weights of the rows from the residuals of the current fit; return True if they have converged.
+
+    `values` (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted
+    columns, the left side last. The fit and the weights, which are replaced, are in `workspace`.
+    """
     count, left, block = len(values), len(column_order) - 1, 0
     for r in range(count):
         while r >= ends[block]:
@@ -149,11 +165,28 @@ def weigh_rows(
     workspace: Any,
     gram: Any,
 ) -> None:
-    """Weight the rows (r, m) of K blocks, compute their Gram matrices (K, m, m), and update the prior, in place.
+    """Weight the rows of K blocks by Huber's weights, and compute the Gram matrix of each block.
 
-    `ends`: index past the last row of each block. `column_order`: column indices, the `n_fast` fast ones first, the
-    left side last. `earlier_sums` (s + 1, s + 1): sums over earlier blocks for the slow columns, scaled to `SUPPORT`
-    blocks; they change by `update_fraction` of their difference from the sums of these blocks. `gram`: the result.
+    Parameters
+    ----------
+    values : array of float, shape (r, m)
+        Rows of all blocks.
+    ends : array of int, shape (K,)
+        Index past the last row of each block.
+    column_order : array of int
+        Indices of the columns that are fitted: first the `n_fast` fast ones, then the slow ones, the left side last.
+    n_fast : int
+        Number of fast columns, whose coefficients are free in each block.
+    earlier_sums : array of float, shape (s + 1, s + 1)
+        Sums over earlier blocks for the s slow columns and the left side, scaled to `SUPPORT` blocks. They are the
+        prior of the fit. They are changed in place, by `update_fraction` of their difference from the sums of these
+        blocks.
+    update_fraction : float
+        Between 0 and 1.
+    workspace : Workspace
+        Scratch arrays.
+    gram : array of float, shape (K, m, m)
+        Receives the Gram matrices of the weighted rows.
     """
     n_rows, left, n_blocks = len(values), len(column_order) - 1, len(ends)
     n_slow, normal, reduced = left - n_fast, workspace.normal, workspace.reduced
@@ -189,10 +222,11 @@ def weigh_rows(
 def block_gram_matrices(
     values: Array, ends: _Indices, fast: _Indices, slow: _Indices, earlier_sums: Array, update_fraction: float
 ) -> Array:
-    """Compute the Gram matrix (K, m, m) of the weighted rows (r, m) of each block, and update `earlier_sums`.
+    """Compute the Gram matrices (K, m, m) of K blocks from rows with Huber's weights, and update `earlier_sums`.
 
-    `ends`: index past the last row of each block; `fast`, `slow`: indices of columns whose coefficients are free in
-    each block, and of those shared by all blocks; the last of `slow` is the left side. Weights are as in `weigh_rows`.
+    `values` (r, m): rows of all blocks; `ends` (K,): index past the last row of each block; `fast`: indices of the
+    columns whose coefficients are free in each block; `slow`: indices of those with coefficients common to all
+    blocks, the left side last. `earlier_sums` and `update_fraction` are as in `weigh_rows`.
     """
     column_order = np.concatenate([fast, slow])
     workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(column_order), len(slow) - 1)))

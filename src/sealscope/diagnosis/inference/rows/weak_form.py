@@ -1,15 +1,16 @@
-"""The weak form of a balance: rows of a linear regression from the samples, without a derivative and without a cycle.
+"""The weak form of a balance: rows of a linear regression from samples, without derivatives and without a cycle.
 
 A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions of compact support and integrated,
 
     integral of phi_i dl = sum_j c_j integral of phi_i f_j dg_j,    phi_i(t) = (1 - s^2)^4 / norm,  s = (t - t_i) / h,
 
-one row for each test function, over the increments of each sampling interval. This is summation by parts of the form in
-which phi carries every derivative. phi and its first three derivatives vanish at its ends, so that noise there and the
-truncation do not matter. Rows are `STRIDE` apart and overlap, at any sampling rate.
+which gives one row for each test function, computed from the increments over each sampling interval. Summation by
+parts would move all derivatives to phi. phi and its first three derivatives vanish at its ends, so noise there and
+the truncation do not matter. Rows are `STRIDE` apart and overlap, at any sampling rate.
 
-Sources: M. Shinbrot, Trans. ASME 79 (1957) 547 (modulating functions); H. A. Preisig and D. W. T. Rippin, Computers and
-Chemical Engineering 17 (1993) 1; D. A. Messenger and D. M. Bortz, Multiscale Model. Simul. 19 (2021) 1474 (weak form).
+Sources: M. Shinbrot, Trans. ASME 79 (1957) 547 (modulating functions); H. A. Preisig and D. W. T. Rippin, Computers
+and Chemical Engineering 17 (1993) 1; D. A. Messenger and D. M. Bortz, Multiscale Model. Simul. 19 (2021) 1474 (weak
+form).
 """
 
 from __future__ import annotations
@@ -35,10 +36,11 @@ _FINE_RATE = 1e4
 
 
 class Rows(NamedTuple):
-    """Rows of a regression.
+    """Rows of a linear regression, one for each of r test functions.
 
-    `time` (r,): middle of each test function [s since the first sample]; `values` (r, c): integral of each column's
-    increments times the test function, a mean rate; `whole` (r,): flags of the rows without a missing sample.
+    `time` (r,): middle of each test function [s since the first sample]; `values` (r, c): integral of the test
+    function times the increments of each of c columns, i.e. a weighted mean rate of change [1/s of the column's
+    unit]; `whole` (r,): flags of the rows without a missing sample.
     """
 
     time: Array
@@ -47,13 +49,17 @@ class Rows(NamedTuple):
 
 
 def stride_samples(rate: float) -> int:
-    """Return the number of samples between neighbouring test functions."""
+    """Compute the number of samples between neighbouring test functions at a sampling `rate` [Hz], at least 1."""
     return max(1, round(STRIDE * rate))
 
 
 @lru_cache(maxsize=8)
 def test_function(rate: float) -> Array:
-    """Return the test function phi [1/s] at the middle of each interval of its support, shape (SPAN, stride)."""
+    """Compute the test function phi [1/s] in the middle of each sampling interval of its support.
+
+    It is bell-shaped with the integral 1. The result has the shape (SPAN, stride), with one row for each stride of
+    samples; `rate`: sampling rate [Hz].
+    """
     stride = stride_samples(rate)
     s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0
     phi = (1.0 - s * s) ** 4
@@ -67,9 +73,9 @@ def _transposed_test_function(rate: float) -> Array:
 
 
 def _variance_inflation() -> float:
-    """Compute the factor by which overlapping test functions raise the variance of a sum over rows of white noise.
+    """Compute by how much the overlap of test functions increases the variance of a sum over rows of white noise.
 
-    It is the sum of the correlations of a test function with itself and with its neighbours on either side.
+    The factor is the sum of the correlations of a test function with itself and with its neighbours on either side.
     """
     phi = test_function(_FINE_RATE).ravel()
     stride, energy = len(phi) // SPAN, float(phi @ phi)
@@ -81,9 +87,10 @@ OVERLAP = _variance_inflation()
 
 
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
-    """Integrate the increments of c columns, (n,) each, times each test function within the samples.
+    """Compute the rows of a regression: integrals of each test function times the increments of c columns.
 
-    NaN is a missing sample. There are n // stride - SPAN + 1 rows.
+    `increments`: arrays (n,), with NaN for missing samples; `rate`: sampling rate [Hz]. There are
+    n // stride - SPAN + 1 rows, one for each test function that lies within the samples.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
@@ -102,9 +109,10 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
 
 
 def weights_near_holes(holes: Array, rate: float) -> Array:
-    """Compute the weight of each row next to bridged holes: the fraction of its test function outside of holes.
+    """Compute the weight of each row: the fraction of its test function outside of holes of the recording.
 
-    `holes` (n,): 1 for a sample in a hole, else 0; result (r,): 0 below `MIN_WEIGHT`.
+    Holes are long gaps of missing samples that were bridged. `holes` (n,): 1 for a sample in a hole, else 0. The
+    weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
     """
     weights = 1.0 - weak_form_rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
     return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))

@@ -1,1 +1,1 @@
-"""The balance of volumes as a provider: its observables, its leak, and rivals of a rise."""
+"""The volume balance as a leak detector: tests of a recording, the leakage, and other causes of a change."""

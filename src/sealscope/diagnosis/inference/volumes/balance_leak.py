@@ -1,4 +1,4 @@
-"""Leakage measured by a volume balance: tests, mean flows, bounds and history, scaled to the machine."""
+"""Leakage that a volume balance measures in a recording: tests, mean flows, bounds and history."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from sealscope.units import LITRE_PER_MINUTE
 
 
 class _HoldLaws(NamedTuple):
-    """Leak past the piston, fitted to the holds under each leak law of `EXPONENTS` (k,).
+    """Leak past the piston as fitted to the holds of a load, under each of k laws with the exponents `EXPONENTS`.
 
-    `weights`: likelihood of each law, of sum 1; `units`: mean flow for a coefficient of 1; `flows`: fitted mean flows
-    and their standard `deviations` [m^3/s].
+    All have the shape (k,). `weights`: relative likelihood of each law, with the sum 1; `units`: mean flow for a
+    coefficient of 1; `flows`: fitted mean flows and their standard `deviations` [m^3/s].
     """
 
     weights: Array
@@ -51,13 +51,14 @@ class _HoldLaws(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BalanceLeak:
-    """The leakage of a recording by its balance of volumes (`observable.LeakMeasure`).
+    """The leakage of a recording as measured by its volume balance (`observable.LeakMeasure`).
 
     Parameters
     ----------
     provider : str
         Name of the detector.
     balance : RecordedBalance
+        Volume balance of the recording.
     healthy : sequence of RecordingSums
         Sums of the healthy recordings of the machine with the same terms.
     """
@@ -71,10 +72,10 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak, either the piston alone or "piston or pump".
+        """Cause of a leak that the balance can state: "piston leak" or "piston or pump leak".
 
-        The piston alone is named behind a servo valve, and if holds measure the rise while either the pump is cut off
-        at rest or the rise is too rare for a healthy machine.
+        Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
+        the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine.
         """
         hold_rise = self._hold_rise
         in_holds = hold_rise is not None and (self.balance.shut or hold_rise.chance < INFERENCE.held_oil.rare)
@@ -83,14 +84,15 @@ class BalanceLeak:
 
     @property
     def step(self) -> StepTest | None:
-        """Test of a step of the leakage; None if too few blocks have information."""
+        """Test for a leak that begins within the recording; None if too few blocks have information."""
         return self.balance.test
 
     @cached_property
     def step_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the step after its onset, averaged over leak laws, growths and onsets.
+        """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        Without a step test it is 0 with an infinite standard error.
+        It is averaged over the laws, growths and onsets of the leak. Without a step test it is 0 with an infinite
+        standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -101,42 +103,51 @@ class BalanceLeak:
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a leak of 1 m^3/(s Pa) at the recording's pressures."""
+        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
-        """Add the relative uncertainty of the leak law and of averaged pressures to a flow."""
+        """Add the uncertainty of the leak's law and of averaged pressures to the standard error of a flow."""
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Rise of the mean leakage beyond the healthy recordings, from holds if possible; None without recordings."""
+        """Amount by which the mean leakage exceeds that of the healthy recordings; None if there are none.
+
+        It is measured in holds of the load if these are precise enough, else over the whole recording.
+        """
         return self._motion_rise if self._hold_rise is None else self._hold_rise
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
-        """Rise over the whole recording, by the balance in motion and at rest."""
+        """Rise of the leakage over healthy recordings, from the whole recording; None if there are none."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
 
     @cached_property
     def _hold_rise(self) -> Rise | None:
-        """Rise during holds behind shut valves; None if it is too imprecise to replace the rise in motion."""
+        """Rise of the leakage over healthy recordings, from holds of the load behind shut valves.
+
+        None without such holds, or if it is too imprecise to replace the rise from the whole recording.
+        """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
             return None
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # more precise than the rise in motion, or precise enough to show that rise
+        # more precise than the rise from the whole recording, or precise enough to show it
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the rise after its onset; the total leakage without healthy recordings."""
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings, from its onset to the end.
+
+        Without healthy recordings it is the total leakage.
+        """
         balance = self.balance
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * end for end in balance.conductance)
@@ -160,9 +171,9 @@ class BalanceLeak:
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the rise within the recording, dated by holds.
+        """Onset [s] of the leakage above that of healthy recordings, as dated by holds of the load.
 
-        None if holds do not clearly show the rise, or if the leak may have been there from the start.
+        None if holds do not clearly show the leakage, or if it may have been there from the start.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
@@ -170,13 +181,16 @@ class BalanceLeak:
         return chambers.piston_onset
 
     def _hold_flow(self, rise: Rise) -> Flow:
-        """Estimate the mean flow of a rise during holds, averaged over leak laws by their likelihoods."""
+        """Estimate the mean flow of the leak that holds show, averaged over its laws by their likelihoods.
+
+        `rise`: the rise during holds, whose uncertainty is added to that of the fits.
+        """
         laws, (low, high) = self._hold_laws(), rise.interval()
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
     def _hold_laws(self) -> _HoldLaws:
-        """Fit a leak past the piston under each of `EXPONENTS` to the holds."""
+        """Fit a leak past the piston to the holds of the load, under each law with an exponent in `EXPONENTS`."""
         balance, chambers = self.balance, self.balance.chambers
         assert chambers is not None
         recording, (onset, offset) = balance.recording, chambers.piston_fit
@@ -189,9 +203,10 @@ class BalanceLeak:
         return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
-        """Compute the mean flow per unit rise and the log weight of each leak law in `EXPONENTS`.
+        """Compute for each law of a leak the mean flow if the coefficient rises by 1, and the law's log weight.
 
-        A law with exponent n lies the fraction f = 2 (1 - n) of the way from laminar to orifice flow:
+        A law with an exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice
+        flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one reading),
 
@@ -213,10 +228,10 @@ class BalanceLeak:
 
     @property
     def excess(self) -> float | None:
-        """Total leakage above the limit in the rig's file, in standard deviations of the leakage.
+        """Total leakage minus the limit in the rig's file, in standard deviations of the leakage.
 
-        None if the file states no limit or no size, if no channel measures the flow of a pump-controlled cylinder, or
-        if healthy recordings are compared instead.
+        None if the file states no limit or no size, behind a servo valve, if no channel measures the flow, or if
+        healthy recordings are compared instead.
         """
         balance = self.balance
         limit = healthy_leakage(balance.rig)
@@ -230,10 +245,11 @@ class BalanceLeak:
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the leak's mean flow [m^3/s], infinite if nothing was tested.
+        """95 % upper bound of the leak's mean flow [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it bounds the rise over them, from the holds as well if there are any; otherwise a step
-        within the recording. It covers the uncertainty of the machine's size and of the leak's law.
+        With healthy recordings it bounds the leakage above theirs, also by holds of the load if there are any.
+        Otherwise it bounds a leak that begins within the recording. It covers the uncertainty of the machine's size
+        and of the leak's law.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -242,10 +258,10 @@ class BalanceLeak:
         return bound * (1.0 + UPPER_95 * float(np.hypot(self.balance.size.deviation, INFERENCE.size.law)))
 
     def _hold_bound(self) -> float:
-        """Compute the 95 % upper bound of the mean flow of a rise, from a mixture of holds and the whole recording.
+        """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
-        Three hypotheses are mixed: the holds say nothing on the leak (the rise is that in motion), they show a leak
-        past the piston, or their leak goes to the outside.
+        It is a quantile of a mixture of three hypotheses: the holds say nothing about the leak, and the whole
+        recording counts; they show a leak past the piston; or the leak that they show goes to the outside.
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
@@ -275,15 +291,16 @@ class BalanceLeak:
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s], over the recording and while it delivers."""
+        """Mean flow of the pump [m^3/s]: over the whole recording, and while the pump delivers."""
         return self.balance.mean_flow, self.balance.blocks.moving_flow
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Rise over healthy recordings, and the evidence that the step within the recording caused it.
+        """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        `step_log_ratio` compares the rise that the step would cause with no rise. Holds after the step's onset show the
-        whole step; without such holds, the mean of the recording shows a part of it. None without healthy recordings.
+        The evidence (`step_log_ratio`) compares the rise that the step would cause with no rise. Holds after the
+        step's onset show the whole step. Without such holds, the mean over the recording shows a part of it. None
+        without healthy recordings.
         """
         step, rise, motion_rise = self.step, self.rise, self._motion_rise
         if rise is None or motion_rise is None or step is None:
@@ -296,37 +313,44 @@ class BalanceLeak:
         return LeakRise(rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
 
     def _hold_rise_since(self, onset: float) -> Rise | None:
-        """Estimate the rise in the holds after an onset [s]; None without such holds, or healthy holds to compare."""
+        """Estimate the rise of the leakage in the holds after an onset [s].
+
+        Return None without such holds, or if too few healthy recordings have holds to compare with.
+        """
         chambers = self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(onset)
         return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean leakage that lies after a step's onset."""
+        """Compute the fraction of the information on the mean leakage that comes from after a step's onset."""
         is_after = self.balance.running_blocks.time >= step.onset().value
         weights = self.balance.leak.precision.sum(axis=0)
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """L/min of a flow of 1 m^3/s; None if the machine's size is not stated."""
+        """Factor from a computed flow [m^3/s] to the machine's flow [L/min]; None if its size is not stated."""
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's size."""
+        """Relative standard deviation of the machine's size, which scales all flows."""
         return self.balance.size.deviation
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured ratio of displacement to area, relative to the assumed one; None if it is not measured."""
+        """Measured ratio of the pump's displacement to the piston's area, relative to the assumed ratio.
+
+        None if it is not measured.
+        """
         return self.balance.size.ratio
 
     def relative(self, flow: Flow) -> RelativeLeak:
-        """Convert a flow to a fraction of the pump's mean flow and to a creep speed of the piston.
+        """Convert a flow to a fraction of the pump's mean flow, and to the speed at which it makes the piston creep.
 
-        Each has a 95 % interval. They are None if the pump's flow is zero or the piston's area unknown.
+        Both have 95 % intervals. The fraction is None if the pump's flow is zero, the speed if the piston's area is
+        unknown.
         """
         pump_flow, area = self.balance.mean_flow, self.balance.size.area
         half_width = WITHIN_95 * flow.deviation
@@ -339,9 +363,10 @@ class BalanceLeak:
         )
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return the total leakage of pump and piston.
+        """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        `detectable_flow`: smallest step that would be detected [m^3/s], None if no step was tested.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
+        None if that was not tested.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -363,9 +388,9 @@ class BalanceLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the history of the leakage [L/min] with its 95 % interval; None if no size is stated.
+        """Return the leakage over time [L/min] with its 95 % interval; None if the machine's size is not stated.
 
-        After an onset [s] it is the growth of the leak since then; without an onset, the total leakage.
+        With an onset `onset_s` [s] it is the growth of the leakage since then, without one (None) the total leakage.
         """
         balance = self.balance
         if not balance.size.stated:
@@ -383,7 +408,7 @@ class BalanceLeak:
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks on contradicting sizes, sensor offsets, delays and unusual conditions."""
+        """Remarks on contradicting sizes, sensor offsets, a delay of the position, and unusual conditions."""
         balance = self.balance
         size, offset, delay = balance.size, balance.pressure_offset, balance.position_delay
         remarks = list[Remark]()
@@ -397,7 +422,7 @@ class BalanceLeak:
         return [*remarks, *self._iter_condition_remarks()]
 
     def _iter_condition_remarks(self) -> Iterator[Remark]:
-        """Yield a remark on each condition outside of the range of the healthy recordings."""
+        """Yield a remark on each condition (load, speed, oil) outside of the range of the healthy recordings."""
         for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":
@@ -409,10 +434,11 @@ class BalanceLeak:
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
-    """Build the distribution of a rise's flow, as a part of a mixture with a total `weight`.
+    """Compute the distribution of a leak's mean flow from the rise of its coefficient, for use in a larger mixture.
 
-    `value`: rise of the coefficient, used if positive, else 0; `unit`: flow of a unit coefficient; `oil_deviation`:
-    standard deviation of the coefficient due to the oil.
+    `rise`: rise over healthy recordings, whose errors are used; `value`: its size, where a negative one counts as 0;
+    `unit`: mean flow of a unit coefficient; `weight`: sum of the resulting weights; `oil_deviation`: additional
+    standard deviation of the coefficient due to the uncertain properties of the oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))
@@ -420,7 +446,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
 
 
 def _divide_interval(interval: tuple[float, float], divisor: float | None) -> tuple[float, float] | None:
-    """Divide an interval by a divisor, after raising a negative lower end to zero.
+    """Divide both ends of an interval by `divisor`; a negative lower end counts as zero.
 
     Return None if the divisor is None or not positive.
     """

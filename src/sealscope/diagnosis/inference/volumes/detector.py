@@ -1,4 +1,4 @@
-"""Volume balance as a detector: observables of a recording, and its leak relative to healthy recordings."""
+"""The volume balance as a leak detector: tests of a recording, and its leakage relative to healthy recordings."""
 
 from __future__ import annotations
 
@@ -65,16 +65,17 @@ MIN_STRIDE = 2
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Test whether the leakage surely exceeds a minimum fraction of the pump's mean flow.
+    """Return True if the lower limit of the leakage exceeds a minimum fraction of the pump's mean flow.
 
-    It does if a control loop holds the piston, since the pump then delivers little more than the leakage.
+    Every pump leaks at least that fraction (`held.share` in `priors.toml`). A smaller leakage means that no control
+    loop returns or holds the piston: the pump does not replace what leaks, and the balance does not show it.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
 
 
 class VolumeBalance:
-    """Leak detector by the volume balance, the flow of the pump that the piston does not displace.
+    """Leak detector by a volume balance: the pump's flow that the piston's motion does not account for leaks.
 
     It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
     position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
@@ -87,7 +88,7 @@ class VolumeBalance:
         self.rig = rig
 
     def usable(self, recording: Recording) -> str | None:
-        """Return the reason why the recording does not suffice for the balance; None if it does."""
+        """Return the reason why a recording cannot be used for a volume balance; None if it can."""
         channels = frozenset(recording.channels)
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             if self.rig.circuit.valve_controlled:
@@ -109,10 +110,10 @@ class VolumeBalance:
         return None
 
     def balance(self, recording: Recording, odds: float = 0.0, *, is_locked: bool = False) -> RecordedBalance | None:
-        """Set up the volume balance that the recorded channels allow; None if they allow none.
+        """Set up the volume balance of a recording; None if its channels or its length allow none.
 
-        `odds`: log odds, from healthy recordings, that valves cut the pump off at rest; `is_locked`: they surely do,
-        whatever this recording shows.
+        `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while it rests;
+        `is_locked`: true if they certainly do, whatever this recording shows.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
@@ -124,10 +125,10 @@ class VolumeBalance:
         return self._balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
-        """Choose, of the balances that need no position, the one that bounds a leak most closely.
+        """Choose among the balances that need no position the one with the smallest upper bound of a leak.
 
-        A balance of holds behind shut valves is always usable, another one only if the pump compensates the leakage.
-        Returns None if none is usable.
+        A balance of holds behind shut valves is always usable, any other only if the pump compensates the leakage
+        (`compensates_leakage`). Return None if none is usable.
         """
         cycle_balances = compute_once(
             recording, (self.name, self.rig), lambda samples: circulations(samples, self.rig), READ
@@ -144,11 +145,14 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks of a recording, only once; None if it allows no balance with a position."""
+        """Return the blocks of a recording, computed only once; None if it allows no balance with a position."""
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the balance of a recording for valves that are open, or shut, while the pump rests (`regime`)."""
+        """Build the volume balance of a recording from its blocks.
+
+        `regime`: the blocks for one assumption on the valves while the pump rests, open or shut.
+        """
         offset = float(regime.blocks.zero[0])
         oil_loss = compute_once(
             recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
@@ -159,11 +163,13 @@ class VolumeBalance:
         )
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Return the summary of a healthy recording: its sums (`scatter.RecordingSums`) and the terms of its balance.
+        """Summarise a healthy recording for later comparisons; None if it allows no balance.
 
-        `scale`: factor from the rig's flows to the machine's, 0 if its size is not stated. If the machine rests:
-        `shut_sums` for a pump cut off at rest, `held` leaks during holds, and the log odds that it is cut off, by the
-        balance at rest (`shut_odds`) and by the holds (`held_odds`).
+        The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
+        and `scale`, the factor from the rig's flows to the machine's, 0 if the machine's size is not stated. If the
+        machine rests, it also contains `shut_sums`, the sums for a pump that is cut off at rest, and `shut_odds`, the
+        log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks during holds, and
+        `held_odds`, the log odds from these.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
@@ -179,7 +185,11 @@ class VolumeBalance:
         return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
 
     def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], repeated: int = 1) -> Rise:
-        """Predict the rise of a healthy recording on a later day, given `repeated` times as many healthy days."""
+        """Predict the rise that a healthy recording of a later day will show, and its uncertainty.
+
+        The rise is the leakage above that of the healthy recordings with the given `summaries` (`learn`). `channels`:
+        names of their channels; `repeated`: predict for that many times as many healthy days.
+        """
         shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
         repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(repeated) for sums in healthy]
@@ -190,10 +200,11 @@ class VolumeBalance:
         return rise(judged, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
-        """Compute the log odds, by healthy recordings, that valves cut the pump off at rest.
+        """Compute the log odds that valves cut the pump off at rest, from the summaries of healthy recordings.
 
-        With `MIN_FOR_SCATTER` recordings or more it is the log likelihood ratio of their leakage's scatter, with the
-        pump cut off and with it connected, for an unknown scale; with fewer it is the sum of the log odds of each.
+        With at least `MIN_FOR_SCATTER` recordings it is the log likelihood ratio of two assumptions, by the scatter
+        of their leakage if the pump is cut off and if it stays connected, for an unknown scale. With fewer recordings
+        it is the sum of the log odds of each.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -209,12 +220,18 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the columns of each balance of the machine; `shut`: for valves that cut the pump off at rest."""
+        """Return the roles of the columns in each balance of the machine.
+
+        `channels`: names of the recorded channels; `shut`: true if valves cut the pump off at rest.
+        """
         balances = equations(self.rig, channels)
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the coefficients of the balance's terms for steps, and compare the leak with healthy recordings."""
+        """Report on a recording: tests of each term of the balance for a step, and the leakage.
+
+        The leakage is compared with that of the healthy recordings in `baseline` that have the same terms.
+        """
         summaries = healthy_summaries(self, baseline)
         is_locked = _are_valves_shut(summaries, "shut_odds")
         odds = self._shut_log_odds(summaries, frozenset(recording.channels))
@@ -233,9 +250,10 @@ class VolumeBalance:
         )
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Report on a recording without healthy ones, under both hypotheses on the valves at rest.
+        """Report on a recording without healthy ones, under both assumptions on the valves while the pump rests.
 
-        Key False: the valves leave the resting pump in the circuit; True: they cut it off, if the recording has rests.
+        The report with the key False is for a pump that stays connected to the cylinder. The one with the key True is
+        for valves that cut it off; it exists only if the recording has rests.
         """
         has_position_balance = bool(equations(self.rig, frozenset(recording.channels)))
         blocks = self._recorded(recording) if has_position_balance else None
@@ -247,9 +265,10 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Report the tests and the leak of a balance, and the fraction of the recording that it judges.
+        """Make the report of a balance: tests, leakage, and the fraction of the recording that is judged.
 
-        The report is empty, with the reason, if neither a step nor a rise of the leak can be tested.
+        `healthy`: sums of the healthy recordings. The report contains only a reason if the leakage can be tested
+        neither for a step nor against healthy recordings.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
@@ -269,14 +288,16 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Compare the flow explained by motion with the healthy recordings; a change means another machine or scale.
+    """Test whether the flow that the piston's motion takes differs from that of healthy recordings.
 
-    Load and speed outside of the range of the healthy recordings make it less certain.
+    A change means another machine or another scale of a sensor. Load and speed outside of the range of the healthy
+    recordings make the comparison less certain. Yields one observable, or none if there are too few healthy
+    recordings. `roles`: roles of the columns in the balance.
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate the log ratio of a recording's flow to the healthy one."""
+        """Estimate the log ratio of the flow of motion in a recording to that in the healthy ones."""
         change, error = motion_change(sums.sums[0], healthy_sums, roles)
         return Estimate(change, float(np.hypot(prior.error, error)))
 
@@ -289,24 +310,29 @@ def compare_motion(
 
 
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
-    """Test whether healthy recordings show that valves cut the pump off at rest.
+    """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    Their mean log odds must exceed a limit. `odds_key`: entry of the summaries, "shut_odds" (balance over all rests) or
-    "held_odds" (holds of a load alone); False if no summary has it.
+    Their mean log odds must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries with these
+    odds, "shut_odds" (from all rests) or "held_odds" (from holds of a load only). The result is False if no summary
+    has it.
     """
     log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
     return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Shift the start [s since 1970] of a recording by `n_ages` times the maximum age of a machine; None if undated."""
+    """Return the start of a recording [s since 1970], delayed by `n_ages` times the maximum age of a machine.
+
+    Recordings delayed by different multiples belong to different sessions. Return None if the recording is undated.
+    """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the sums of a recording from its summary.
+    """Restore the sums of a healthy recording from its summary (`VolumeBalance.learn`).
 
-    `shut`: for valves that cut the pump off at rest; `locked`: with the leaks during holds, if there are any.
+    `shut`: true for the sums under the assumption that valves cut the pump off at rest; `locked`: true to include the
+    leaks during holds, if the summary has them.
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:

@@ -1,4 +1,4 @@
-"""Volume balance of one recording: leak, observables, holds, and the scale of its flows."""
+"""Volume balance of one recording: the leakage, tests of all terms, holds of the load, and the scale of its flows."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Quantile of the lowest pressure that is the charge pressure, and of the position at an end of the stroke.
+#: Quantile of the lower chamber pressure that counts as charge pressure, and of the position at an end of the stroke.
 END_QUANTILE = 0.02
 
 
 class Size(NamedTuple):
-    """Scale of the machine's flows, and the sizes that it follows from.
+    """Scale of the machine's flows, since a balance is computed with an assumed displacement of the pump.
 
-    `scale`: flow of the machine over that by the assumed displacement, with its relative standard `deviation`;
-    `stated`: True if L/min can be stated; `ratio`: measured displacement over area relative to the assumed ratio, None
-    if the position has no unit; `area` of the piston by the assumed displacement [m^2]; `disagrees`: stated
-    displacement and area contradict each other.
+    `scale`: true flow of the machine over the computed one, with its relative standard `deviation`; `stated`: true if
+    flows can be stated in L/min; `ratio`: measured ratio of displacement to area, relative to the assumed one, None
+    if the position has no unit; `area`: piston area as measured with the assumed displacement [m^2], None if unknown;
+    `disagrees`: true if stated displacement and stated area contradict each other.
     """
 
     scale: float
@@ -77,11 +77,13 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RecordedBalance:
-    """Volume balance of a recording.
+    """Volume balance of a recording, and the estimates that follow from it.
 
-    `oil_loss`: step tests of external leaks by the accumulator's balance, by term name; `plain`: the blocks without the
-    correction of the pressure offset, if they differ; `shut`: a valve cuts the pump off at rest, so that the leak is
-    the piston's alone (`regimes`); `locked`: holds behind shut valves measure the leaks.
+    `blocks`: sums of the balance; `equations`, `columns`: the balances and the roles of their columns; `rig`: sizes
+    of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term;
+    `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`: true if valves cut the
+    pump off at rest, so the leak is that of the piston alone (`regimes`); `locked`: true if holds of the load behind
+    shut valves measure the leaks.
     """
 
     blocks: Blocks
@@ -96,37 +98,37 @@ class RecordedBalance:
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
-        """Pairs of the name and the unit of each channel."""
+        """Pairs (name, unit) of all recorded channels."""
         return frozenset(self.recording.units.items())
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first block with motion; 0 if the blocks from there on are too few for a step."""
+        """Index of the first block in which the machine moves; 0 if too few blocks follow for a step test."""
         first = int(np.argmax(self.blocks.is_moving))
         return first if len(self.blocks) - first >= MIN_BLOCKS else 0
 
     @property
     def running_blocks(self) -> Blocks:
-        """Blocks from the first motion on, in which steps are sought.
+        """Blocks from the first motion on, which are tested for steps.
 
-        Before the first motion the machine may be off with its valves shut. The flow with which the pump then begins to
-        hold the load is no leak.
+        Before the first motion the machine may be off with its valves shut. The flow with which the pump afterwards
+        begins to hold the load is not a leak.
         """
         return self.blocks[self._first_motion :]
 
     @cached_property
     def leak(self) -> Information:
-        """Likelihood of the leak's coefficient in each of the `running_blocks`."""
+        """Likelihood of the leak's conductance in each block from the first motion on (`running_blocks`)."""
         return information(self.running_blocks, self.columns, self.columns[0].leak)
 
     @cached_property
     def test(self) -> StepTest | None:
-        """Test of a step of the leak's coefficient; None if too few blocks have information."""
+        """Test for a leak that begins within the recording; None if too few blocks have information."""
         return step_test(self.leak)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
-        """Tests of steps of the terms' coefficients, the highest score first."""
+        """Tests of each term's coefficient for a step within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         return volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio
@@ -134,13 +136,16 @@ class RecordedBalance:
 
     @property
     def volume_ratio(self) -> float:
-        """Measured over assumed ratio of area to displacement, by which the balance scales the cylinder's volumes."""
+        """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured.
+
+        The balance scales the volumes of the cylinder by it.
+        """
         ratio = self.size.ratio
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Sums of the recording, for comparison with other recordings."""
+        """Summary of the recording for comparison with other recordings of the machine."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         held = None if self.chambers is None else np.array(self.chambers.leaks)
@@ -148,7 +153,11 @@ class RecordedBalance:
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
-        """Chambers during holds, in which valves shut them off from the resting pump; None without such holds."""
+        """Estimator of the chambers' leaks during holds, in which valves cut them off from the resting pump.
+
+        None if valves do not hold the load (`locked`), if no hold is long enough or loaded, if the pressures have no
+        unit, or if the piston's areas are unknown.
+        """
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
             return None
@@ -158,7 +167,7 @@ class RecordedBalance:
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = float(np.nanquantile(lower_pressure, END_QUANTILE))
-        # gauge to absolute pressure; more if sensor offsets would leave less than a small positive pressure
+        # from gauge to absolute pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
         holds = [
@@ -170,9 +179,10 @@ class RecordedBalance:
         return HeldChambers(holds, sides, begin, end, charge + to_absolute) if holds else None
 
     def _is_pump_off(self, hold: LockedHold, pumped: Array) -> bool:
-        """Test whether the pump rests in a hold, by the volumes (n - 1,) [m^3] that it delivers between samples.
+        """Return True if the pump probably rests in a hold, rather than holding the load by replacing what leaks.
 
-        The alternative is a pump that holds the load: it delivers what leaks, however little a noisy speed shows of it.
+        `pumped` (n - 1,): volumes that the pump delivers between the samples of the recording [m^3]. The mean flow is
+        compared with zero and with the typical flow of a pump that holds a load.
         """
         recording = self.recording
         begin, end = np.searchsorted(recording.t, hold.t[[0, -1]])
@@ -183,10 +193,10 @@ class RecordedBalance:
         return rest_log_odds(abs(float(flow.mean())), variance, holding_flow, variance) > 0.0
 
     def _is_loaded(self, hold: LockedHold) -> bool:
-        """Test whether p_A - p_B in a hold is surely a load, and not the sensors' offset under equal pressures.
+        """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        A leak equalises the pressures that no load maintains, so that a hold of equal pressures shows none. Loads up to
-        the largest pressure difference of the recording are equally likely.
+        With equal pressures nothing flows through a leak, so such a hold would not show it. In the comparison all
+        loads up to the largest pressure difference of the recording are equally probable.
         """
         prior = INFERENCE.zero
         pressure = float(np.abs(hold.mean(hold.p_A - hold.p_B)).max())
@@ -197,10 +207,10 @@ class RecordedBalance:
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
 
     def locked_odds(self) -> float | None:
-        """Compute the log odds that valves shut the chambers in holds; None without holds.
+        """Compute the log odds that valves really shut off the chambers in holds; None without holds.
 
-        The leaks in holds are compared with the total leakage: through open valves the resting pump would leak like the
-        turning one.
+        The leaks in holds are compared with the total leakage: through open valves the resting pump would leak as
+        much as the turning one. The odds are limited by `rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
@@ -214,7 +224,10 @@ class RecordedBalance:
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate the piston areas and the ends of the stroke; None if they are undetermined."""
+        """Estimate the piston areas and the ends of the recorded stroke; None if they are not determined.
+
+        That is the case if nothing moves, or if the ratio of the areas is implausible.
+        """
         area_A, area_B = self._signed_areas()
         x = self.recording["x"][np.isfinite(self.recording["x"])]
         if not x.size:
@@ -226,10 +239,12 @@ class RecordedBalance:
         return CylinderSides(area_A, area_B, low, high)
 
     def _signed_areas(self) -> tuple[float, float]:
-        """Estimate the piston areas of A and B by the assumed displacement [m^2], negative if x is reversed.
+        """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        The area of a side is the mean of its coefficients of motion, weighted by their energy. The side with less
-        energy takes the area of the other if it never carries the load. Both are zero if nothing moves.
+        They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion,
+        weighted by the sums of squares of their columns. If the rig's file states the areas, they are used, scaled to
+        the flows of the balance. A side that never carries the load takes the area of the other. Both are zero if
+        nothing moves.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -253,14 +268,15 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Sensor offset of p_A - p_B [Pa], which only a change of the leak reveals."""
+        """Sensor offset of p_A - p_B [Pa]; it stays near 0 unless the leak changes, which alone reveals it."""
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
     def position_delay(self) -> Estimate | None:
-        """Delay of x behind the flow [s], from the coefficient of the lag over the area.
+        """Delay of the recorded position behind the flow [s], with its standard deviation; negative if x is early.
 
-        None if the balance has no lag or no motion, or if the measured area is not positive.
+        It is the coefficient of the balance's term of lag over the piston area. None if the balance has no such term
+        or no motion, or if the measured area is not positive.
         """
         roles = self.columns[0]
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -271,18 +287,18 @@ class RecordedBalance:
         return Estimate(value / area, deviation / area) if area > 0.0 else None
 
     def mean_pressure(self, since: float = -np.inf) -> float:
-        """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, sensor offset removed."""
+        """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, without the sensor offset."""
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean absolute flow of the pump [m^3/s]."""
+        """Mean magnitude of the pump's flow over the recording [m^3/s]."""
         return self.mean_of_blocks(self.blocks.flow)
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average values of the blocks (K,) from the time `since` [s] on, weighted by their numbers of rows.
+        """Average `values` (K,) of the blocks from the time `since` [s] on, weighted by their numbers of rows.
 
-        A block counts if its middle is `since` or later; if none is, the last block counts.
+        A block counts if its middle is at `since` or later. If there is none, the last block counts.
         """
         is_after = self.blocks.time >= since
         if not is_after.any():
@@ -291,21 +307,22 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Scale of the machine's flows, relative to those by the assumed displacement."""
+        """Scale of the machine's flows, relative to those computed with the assumed displacement."""
         return _flow_scale(self)
 
     @cached_property
     def conductance(self) -> Interval:
-        """Total leakage of pump and piston over the recording, as a conductance with its interval.
+        """Mean total leakage of pump and piston, as a conductance [m^3/(s Pa)] with its 95 % interval.
 
-        The pressures at the pump's ports hardly differ from those of the chambers, so that only the sum is determined.
+        The pressures at the pump's ports hardly differ from those of the chambers, so only the sum of both leaks is
+        determined.
         """
         weights = np.maximum(self.blocks.rows, 0.0)
         return self.total_history.average(weights / weights.sum())
 
     @cached_property
     def total_history(self) -> History:
-        """Total leakage of pump and piston in each block, as a conductance."""
+        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)]."""
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
         total = information(self.blocks, self.columns, roles.leak, pump)
@@ -313,20 +330,20 @@ class RecordedBalance:
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
     def leak_history(self, *, with_step: bool) -> History:
-        """Estimate the leak's coefficient in each of the `running_blocks` blocks, with the best step or without one."""
+        """Estimate the leak's coefficient in each of the `running_blocks`, with the best step or without any step."""
         return fit_history(self.leak, self.test, with_step=with_step)
 
 
 def _flow_scale(balance: RecordedBalance) -> Size:
-    """Determine the scale of flows and its uncertainty from the stated displacement and area.
+    """Determine the scale of the machine's flows and its uncertainty from the sizes that the rig's file states.
 
-    A flow meter needs no scale. Otherwise the balance measures the ratio of displacement and area: a stated
-    displacement scales every flow directly, a stated area through that ratio; if both are stated and disagree, the
-    difference is the uncertainty.
+    The flow of a flow meter needs no scale. Otherwise the balance measures the ratio of displacement to area. A
+    stated displacement gives the scale directly, a stated area through that ratio. If both are stated and disagree,
+    their difference is the uncertainty. Behind a servo valve the areas give the flow.
     """
     roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     prior = INFERENCE.size
-    source = flow_source(balance.recording.channels)  # a meter's unit follows from the area
+    source = flow_source(balance.recording.channels)  # the unit of a meter follows from the area
     has_flow_unit = source == "q_pump" or (source, COUNTS) not in balance.units
     has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
     states_displacement = rig.states("pump.q_b") and has_flow_unit
@@ -353,7 +370,10 @@ def _flow_scale(balance: RecordedBalance) -> Size:
 
 
 class _Area(NamedTuple):
-    """Area of the side under load [m^2]: `measured` by the assumed displacement, with its interval, and `assumed`."""
+    """Piston area of the loaded side [m^2]: as `measured` with the assumed displacement, and as `assumed`.
+
+    `low`, `high`: 95 % interval of the measured area.
+    """
 
     measured: float
     low: float
@@ -362,7 +382,10 @@ class _Area(NamedTuple):
 
 
 def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
-    """Estimate the area of the loaded side: the mean over directions and sides, weighted by their information."""
+    """Estimate the piston area of the loaded side, as a mean over directions of motion and sides.
+
+    `motion`: indices of the columns of motion, whose weights are the sums of their squares.
+    """
     roles, cylinder = balance.columns[0], balance.rig.cylinder
     energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]
     weights = energy / max(float(energy.sum()), np.finfo(float).tiny)

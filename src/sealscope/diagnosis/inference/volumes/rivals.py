@@ -1,9 +1,10 @@
-"""Other causes than a leak past piston or pump of a change since the healthy recordings: rivals of the leak's rise.
+"""Rivals of a leak: other faults that may explain a change of the flow since the healthy recordings.
 
-The coefficient of each term that a fault changes is fitted to the residual of a recording under the healthy
-coefficients, with priors on the differences of all other coefficients, the leak's included (`priors.toml`). The
-scatter of this difference between the healthy recordings is its null (`differences`). A leak to the outside and one
-past the piston look nearly alike: the likelihood ratio of the two is stated with the observable.
+Such faults are an external leak, wear of the pump, and free air. The coefficient of each such term is fitted to the
+residual of a recording under the healthy coefficients, with priors on the differences of all other coefficients,
+including the leak's (`priors.toml`). The scatter of this difference among the healthy recordings shows which size is
+normal (`differences`). A leak to the outside and one past the piston look nearly alike. The likelihood ratio of the
+two is therefore stated with the observable.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
-#: `Observable.data` of the leakage of the turning pump, if rests show the piston alone.
+#: `Observable.data` of the leakage of the turning pump, in a machine whose rests show the piston's leakage alone.
 TURNING_DATA = "turning"
 
 
@@ -32,10 +33,26 @@ def rival_rises(
     columns: Sequence[ColumnRoles],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Compare the coefficients of rival causes with their values in healthy recordings.
+    """Test whether faults other than a leak past the piston explain a change since the healthy recordings.
 
-    The rivals are external leaks, the leak of the turning pump, and free air. If holds show the external leaks, these
-    are compared during holds (`held_rivals`). `volume_ratio`: measured over assumed ratio of area to displacement.
+    These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are
+    compared during holds if possible (`held_rivals`).
+
+    Parameters
+    ----------
+    judged : RecordingSums
+        The recording.
+    healthy : sequence of RecordingSums
+        The healthy recordings of the same machine.
+    columns : sequence of ColumnRoles
+        Roles of the columns in each equation.
+    volume_ratio : float
+        Measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air scale.
+
+    Returns
+    -------
+    tuple of Observable
+        One for each rival that can be compared.
     """
     names, hold_rivals = columns[0].names, held_rivals(judged, healthy)
     turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
@@ -62,7 +79,7 @@ def rival_rises(
             continue
         if names[k] == TURNING:
             pump_rise = rise(judged, healthy, [roles.replace_leak(TURNING) for roles in columns])
-            # a rise that warmer oil explains, in logarithms, is none
+            # a rise that warmer oil explains does not count
             observable = replace(observable, chance=max(observable.chance, pump_rise.chance))
         elif not is_air:
             fit = compare_with_leak(judged, healthy, columns, names[k])
@@ -73,10 +90,10 @@ def rival_rises(
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Compare the external leaks of chambers A and B during holds with those of healthy recordings.
+    """Test whether the external leaks of chambers A and B during holds exceed those of healthy recordings.
 
-    Returns one observable for each chamber that can be compared; None if the judged recording has no holds, or fewer
-    than `MIN_WITH_HOLDS` healthy recordings have any.
+    In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
+    judged recording has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any.
     """
     healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -95,18 +112,19 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Set the advantage of an external leak by the prior on its flow, as a large leak would be noticed."""
+    """Set the advantage of an external leak from the prior on its flow: a large one is improbable, as oil is seen."""
     return replace(
         observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
     )
 
 
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
-    """Estimate the change of the coefficient `tested` from healthy recordings to another, and its standard error.
+    """Estimate by how much a coefficient of a recording differs from healthy recordings, and the standard error.
 
-    `gram`, `reference`: Gram matrices (E, m, m) of the recording and of the healthy ones. The other coefficients differ
-    from the healthy ones by a normal prior and are eliminated (Schur complement): change = moment / precision, summed
-    over the equations. Without information the change is 0 and the error infinite.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the healthy ones, for each
+    equation; `tested`: index of the coefficient's column, whose coefficient counts as 0 in the healthy ones. The
+    other coefficients differ by a normal prior and are eliminated (Schur complement): change = moment / precision,
+    both summed over the equations. Without information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     leak_deviation: float = INFERENCE.between.pump

@@ -1,1 +1,1 @@
-"""Headings: names and units of columns, their likely channels, and remarks on the recording."""
+"""Headings of tables: names and units of columns, the channels that they may mean, and remarks on the recording."""

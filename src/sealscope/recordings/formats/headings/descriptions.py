@@ -22,10 +22,10 @@ _SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
 
 
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
-    """Rename labels by the descriptions in tables of channels and rows of labels above the heading.
+    """Rename labels by descriptions above the heading, in a table of channels or in a row of labels.
 
-    The columns' own names stay in `called`. A description may give the unit if the heading does not. `rows`: cells of
-    the lines above the heading, and of rows of labels in it.
+    `rows`: cells of the lines above the heading, and of rows of labels in it. A description may state the unit if the
+    heading does not. The columns' own names are kept in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
@@ -45,17 +45,17 @@ def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -
 
 
 def _fold(text: str) -> str:
-    """Remove blanks and case from a text, for comparison."""
+    """Remove blanks and upper case from a text, for comparison."""
     return text.replace(" ", "").casefold()
 
 
 def _column_key(label: Label) -> str:
-    """Return the last word of a column's name for comparison, because a group name may precede it."""
+    """Return the last word of a column's name, without case, because the name of a group may precede it."""
     return _fold(label.name.rpartition(" ")[2] or label.name)
 
 
 def _rename_label(label: Label, name: str) -> Label:
-    """Rename a label unless the new name is empty, too long or the column's own name."""
+    """Rename a label, unless the new name is empty, too long or the column's own name."""
     if not name or len(name) > _MAX_NAME or _fold(name) == _column_key(label):
         return label
     renamed = Label.parse(name)  # the description may end in a unit
@@ -66,8 +66,8 @@ def _rename_label(label: Label, name: str) -> Label:
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
     """Parse the heading of a TwinCAT Scope export to (labels, number of its lines); None for any other text.
 
-    `lines`: those above the first sample. Each row of a property repeats its name above the time columns, which are in
-    milliseconds since the start of the export.
+    `lines`: the lines above the first sample. In an export each row of a property, such as the units, repeats its
+    name above the time columns, which are in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
@@ -84,10 +84,10 @@ def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Labe
 
 
 def split_pairs(labels: Sequence[Label]) -> list[Label]:
-    """Rename the labels of alternating times X and values Y to `t` and the channels' names; return others unchanged.
+    """Rename alternating columns of times X and values Y to `t` and the channels' names; other labels stay.
 
-    `X [s], p_A [bar], X [s], p_B [bar]` and `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`; an X without a unit is in
-    seconds.
+    Pairs are named as in `X [s], p_A [bar], X [s], p_B [bar]` or in `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`. An X
+    without a unit is in seconds.
     """
     times, values = labels[::2], labels[1::2]
     are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)

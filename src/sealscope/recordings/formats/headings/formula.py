@@ -25,9 +25,9 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Formula(Generic[K]):
-    """A linear formula: `constant` plus the sum of columns times `factors`; `unit` of the result, None if not stated.
+    """A linear formula: `constant` plus the sum of columns times `factors`.
 
-    `factors`: name or number of a column -> factor.
+    `factors`: name or number of a column -> factor; `unit`: unit of the result, None if it is not stated.
     """
 
     factors: Mapping[K, float]
@@ -36,18 +36,21 @@ class Formula(Generic[K]):
 
     @property
     def column(self) -> K | None:
-        """The column, if the formula is a column without factor and constant; else None."""
+        """The column, if the formula is a single column without factor and constant; else None."""
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
-        """Add another formula, multiplied by `times`; the sum has no unit."""
+        """Add another formula, multiplied by the number `times`; the sum has no unit."""
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor
         return Formula(factors, self.constant + times * other.constant)
 
     def values(self, columns: Mapping[K, Array]) -> Array:
-        """Compute the samples (n,) in `unit`; a column without factor and constant is returned itself, not a copy."""
+        """Compute the formula's values (n,) from the samples of the columns; they are in `unit`.
+
+        A column without factor and constant is returned itself, not as a copy.
+        """
         if self.column is not None:
             return columns[self.column]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -56,10 +59,11 @@ class Formula(Generic[K]):
 
 
 def parse_formula(text: str) -> Formula[str]:
-    """Parse a formula of sums, products with numbers, quotients by numbers and brackets, and the unit after it.
+    """Parse the text of a formula and the unit after it, such as `2*(ch1 - 0.5) + ch2/4 bar`.
 
-    The longest beginning of the text that is a formula is used; it is parsed as Python but never evaluated. Raises
-    InputError for any other text, such as a product of two columns.
+    Sums, brackets, products with numbers and quotients by numbers are permitted. The formula is the longest possible
+    beginning of the text; it is parsed as Python but never evaluated. Raises InputError for any other text, such as a
+    product of two columns.
     """
     if len(text) > _MAX_LENGTH:
         raise InputError(f"{_RULE}, got {len(text)} signs")
@@ -67,7 +71,7 @@ def parse_formula(text: str) -> Formula[str]:
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
-            """Replace a column's name, which Python may not parse, by `columnN`."""
+            """Replace the name of a column, which Python may not parse, by `columnN`."""
             names.append(match[1] or match[2])
             return _COLUMN.format(len(names) - 1)
 
@@ -84,7 +88,10 @@ def parse_formula(text: str) -> Formula[str]:
 
 
 def _parse_linear(tree: ast.expr, names: list[str]) -> Formula[str]:
-    """Convert a syntax tree, with `columnN` for `names[N]`, to a formula; raise ValueError if it is not linear."""
+    """Convert Python's syntax tree of a formula to a Formula; raise ValueError if it is not linear.
+
+    The name `columnN` in the tree stands for the column `names[N]`.
+    """
     empty = Formula[str]({})
     match tree:
         case ast.Name(id=name):

@@ -17,9 +17,10 @@ _TRAILING_UNIT = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<uni
 
 @dataclass(frozen=True)
 class Label:
-    """A column's heading: `whole` as written, `name` without the unit, `unit` or None.
+    """Heading of a column.
 
-    `called`: the column's own name, if `name` is a description that the user has entered for the channel.
+    `whole`: the heading as written; `name`: without the unit; `unit`: the unit, or None; `called`: the column's own
+    name, if `name` is a description that the user has entered for the channel.
     """
 
     whole: str
@@ -29,7 +30,10 @@ class Label:
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi`; a `unit` from elsewhere takes precedence."""
+        """Parse a heading such as `p_A [psi]`, `p_A (psi)`, `p_A / psi` or `p_A in psi` into name and unit.
+
+        `unit`: unit that is stated elsewhere, such as in a row of units, and takes precedence.
+        """
         whole = text.strip().translate(_WIDE_BRACKETS)
         name, bracket_text = split_square_brackets(whole)
         if bracket_text is not None:
@@ -55,7 +59,7 @@ def is_unit(text: str) -> bool:
 
 
 def split_square_brackets(text: str) -> tuple[str, str | None]:
-    """Split `name [unit]` into both, stripped; (text, None) for any other text."""
+    """Split `name [unit]` into name and unit; return (text, None) for any other text."""
     begin = text.rfind("[")
     if begin < 0 or not text.endswith("]") or "]" in text[begin:-1]:
         return text, None
@@ -63,7 +67,10 @@ def split_square_brackets(text: str) -> tuple[str, str | None]:
 
 
 def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
-    """Split `name (unit)` or `name / unit`, whichever comes first; (text, None) for any other text."""
+    """Split `name (unit)` or `name / unit` into name and unit, at the first possible place.
+
+    Returns (text, None) for any other text.
+    """
     splits: list[tuple[int, int]] = []  # end of the name, beginning of the unit
     parts = text.split("/")
     for count in (2, 1):  # `name / m/s`, `name / s`

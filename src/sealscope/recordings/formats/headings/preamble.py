@@ -31,7 +31,10 @@ _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d
 
 
 def stated_rate(remarks: Mapping[str, str]) -> float | None:
-    """Find the sampling rate [Hz] in a file's remarks, stated as a rate or an interval; None if there is none."""
+    """Find the sampling rate [Hz] in the remarks of a file; None if it is not stated.
+
+    A remark may state the rate or the interval between samples.
+    """
     for name, text in remarks.items():
         label = Label.parse(name)
         if label.unit is None and (ending := _ENDING.fullmatch(label.name)):  # SamplePeriod_ms
@@ -53,7 +56,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
 
 
 def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
-    """Find the start time stated by a TwinCAT Scope export; None if there is none."""
+    """Find the start time in the remarks of a TwinCAT Scope export; None if it is not stated."""
     for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:
@@ -62,7 +65,10 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
 
 
 def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Collect remarks, name -> text, from pairs with both, printable and shortened; of a repeated name the first."""
+    """Collect remarks, name -> text, from pairs of name and text, made printable and shortened.
+
+    Of several remarks with one name the first is kept, and at most `_MAX_REMARKS` in all.
+    """
     remarks: dict[str, str] = {}
     for name, value in pairs:
         key, text = _clean_text(str(name), _MAX_NAME), _clean_text(str(value), _MAX_TEXT)
@@ -74,13 +80,16 @@ def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks in a recording's provenance, name -> text, made printable and short."""
+    """Return the remarks in the provenance of a recording, name -> text, made printable and shortened."""
     remarks = provenance.get("about")
     return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 
 
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
-    """Parse remarks in the lines above a log's header: `Operator: N. N.`, `Oil = 40 degC`, `Date;2024-05-31`."""
+    """Parse the remarks in the lines above a log's heading to name -> text.
+
+    A remark is written as in `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`, with the delimiter of the log.
+    """
     pairs: list[tuple[str, str]] = []
     for line in lines[: 4 * _MAX_REMARKS]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]
@@ -96,7 +105,7 @@ def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 
 
 def _clean_text(text: str, max_length: int) -> str:
-    """Make a text printable, on one line and at most `max_length` characters."""
+    """Make a text printable, on a single line and at most `max_length` characters long."""
     return " ".join(printable(text[: 4 * max_length], instead=" ").split()).strip("\"'")[:max_length]
 
 

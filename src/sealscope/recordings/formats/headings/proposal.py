@@ -1,4 +1,4 @@
-"""Guess the channel of a foreign column from the words of its name, in several languages, and its unit."""
+"""Guess the channel of a foreign column from its unit and the words of its name, in several languages."""
 
 from __future__ import annotations
 
@@ -36,7 +36,11 @@ _MAX_NAME = 80
 
 
 class _Guess(NamedTuple):
-    """Guessed meaning of a column, with `kind` of quantity, `side` (`_find_side`), and `unit` or None."""
+    """Guessed meaning of a column.
+
+    `kind`: the quantity, such as "pressure"; `side`: chamber or pump port, as from `_find_side`; `unit`: the unit, or
+    None.
+    """
 
     kind: str
     side: str
@@ -44,17 +48,18 @@ class _Guess(NamedTuple):
 
     @property
     def channel(self) -> str | None:
-        """The channel with this meaning; None if there is none."""
+        """Name of the channel with this meaning; None if there is none."""
         if self.kind == "flow":
             return "q_pump" if self.side == "A" else None
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
 
 
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
-    """Propose a map, channel (or ``t``) -> column, from columns whose names reveal their meaning.
+    """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
 
-    Leaves out columns that already have a channel's name, and channels that fit several columns. A unit at the end of a
-    name (``PA_bar``) becomes the column's unit.
+    Columns that already have a channel's name, and channels that several columns may mean, are left out. A unit at
+    the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would contain the time
+    alone.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head = _find_head_side(labels)
@@ -95,24 +100,24 @@ def format_map(channel_map: Mapping[str, str]) -> str:
 
 
 def is_time(label: Label) -> bool:
-    """Test whether a column's name, with or without a number after it, means the time."""
+    """Test whether a column is a time by its name, which may end in a number."""
     guess = _guess_meaning(label)
     return _is_named_time(label) or (guess is not None and guess.kind == "time")
 
 
 def _is_named_time(label: Label) -> bool:
-    """Test whether a column has a usual name of the time, with or without a number after it: `X_Value.1`."""
+    """Test whether a column has one of the usual names of a time, possibly with a number after it: `X_Value.1`."""
     return _COUNTED.sub("", label.name.casefold()) in WORDS["time"]
 
 
 def unit_of_time(label: Label) -> str | None:
-    """Return the unit of a time column, in its heading or at the end of its name; None if there is none."""
+    """Find the unit of a time column in its heading or at the end of its name; None if it has none or is no time."""
     guess = _guess_meaning(label)
     return guess.unit if guess is not None and guess.kind == "time" else None
 
 
 def has_known_word(text: str) -> bool:
-    """Test whether a text contains a known word of a script without spaces between words."""
+    """Test whether a text contains a known word of a script that has no spaces between words, such as Chinese."""
     return any(word in text for word in _UNSPACED)
 
 
@@ -126,7 +131,7 @@ _AMBIGUOUS_UNITS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "posit
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if the unit fits no channel."""
+    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if no channel has such a unit."""
     parts = name.replace(" ", "_").split("_")
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
     last_word = _LAST_WORD.search(name)
@@ -147,7 +152,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether a column's name ends in `words`, as `ADC1_Channel_2` does in `ch2` and `Main_Pa` in `Pa`."""
+    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` does in `ch2` and `Main_Pa` in `Pa`."""
     tokens = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
@@ -155,13 +160,16 @@ def ends_in(name: str, words: str) -> bool:
 
 
 def is_temperature(label: Label) -> bool:
-    """Test whether a column has a unit of temperature."""
+    """Test whether the unit of a column, in its heading or at the end of its name, is one of temperature."""
     unit = split_unit(label.name)[1] if label.unit is None else label.unit
     return unit is not None and same_dimension(unit, "K")
 
 
 def is_measured(label: Label) -> bool:
-    """Test whether a column is a measured pressure, position, speed or flow, by its name or unit."""
+    """Test whether a column is a measured pressure, position, speed or flow, by its name or unit.
+
+    Demands, and values computed from others, are not measured.
+    """
     if len(label.name) > _MAX_NAME:
         return False
     name, unit_of_name = split_unit(label.name)
@@ -179,7 +187,7 @@ def is_measured(label: Label) -> bool:
 
 
 def _strip_accents(text: str) -> str:
-    """Replace umlauts by two letters and remove accents."""
+    """Remove accents from a text, and write umlauts as two letters: `ä` becomes `ae`."""
     for umlaut, letters in zip("äöüßÄÖÜłŁ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "l", "L"), strict=True):
         text = text.replace(umlaut, letters)
     return "".join(
@@ -188,7 +196,10 @@ def _strip_accents(text: str) -> str:
 
 
 def _split_words(name: str) -> set[str]:
-    """Split a name into lower-case words; add the ends of compounds (`weg` of `kolbenweg`), and `p`, `a` for `pa`."""
+    """Split a name into its words, in lower case.
+
+    Added are the last parts of German compounds (`weg` of `kolbenweg`), and `p` and `a` for `pa`.
+    """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
         words |= {token, "p", token[1:]} if token in ("pa", "pb") else {token}
@@ -197,9 +208,9 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that "head" means in these labels; empty if unknown.
+    """Find the chamber that columns called "head" mean: A if others are called rod, B if others are called cap.
 
-    Chamber A if other columns are called rod, B if they are called cap.
+    Empty if that is not known.
     """
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
@@ -208,7 +219,10 @@ def _find_head_side(labels: Sequence[Label]) -> str:
 
 
 def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
-    """Guess a column's meaning from its name and unit, None if unknown; `head`: the chamber that "head" stands for."""
+    """Guess the meaning of a column from its name and unit; None if it is not known.
+
+    `head`: the chamber, "A" or "B", that the word "head" means.
+    """
     if len(label.name) > _MAX_NAME:
         return None
     name, unit = split_unit(label.name)
@@ -243,17 +257,20 @@ def _guess_meaning(label: Label, head: str = "") -> _Guess | None:
 
 
 def _is_command_unit(unit: str) -> bool:
-    """Test whether a command can have this unit."""
+    """Test whether a command can have this unit: a voltage, a current or a fraction of full scale."""
     return is_current_or_fraction(unit) or same_dimension(unit, "V")
 
 
 def is_current_or_fraction(unit: str) -> bool:
-    """Test whether a unit is a fraction of full scale, or a current (of a valve or a controller's output)."""
+    """Test whether a unit is one of current, for the command of a valve, or a fraction of full scale, such as %."""
     return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess from its name that a column is the pressure before or behind (`kind`) a valve; None for other columns."""
+    """Guess from the name of a column that it is the pressure before or behind a valve; None for other columns.
+
+    `kind`: "before" or "behind".
+    """
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
     words = _split_words(name if label.unit is None else label.name)
@@ -263,7 +280,10 @@ def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
 
 
 def suggest_map_entry(label: Label) -> str:
-    """Format a map entry of a column and its likely channel: `q_pump=Flow [l/min]`, or `CHANNEL=...` if unknown."""
+    """Format the entry of a map for a column and its likely channel: `q_pump=Flow [l/min]`.
+
+    The channel is `CHANNEL` if it is not known.
+    """
     guess = _guess_meaning(label)
     channel = None if guess is None else "q_pump" if guess.kind == "flow" else guess.channel
     if channel is None:
@@ -273,7 +293,7 @@ def suggest_map_entry(label: Label) -> str:
 
 
 def _find_side(words: set[str]) -> str:
-    """Find the side that words name: A, B, pump, pump 1, pump 2 or a number; empty if unknown."""
+    """Find the side that the words of a name mean: A, B, pump, pump 1, pump 2, 1 or 2; empty if it is not known."""
     cap, rod = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
     number = next((digit for digit in ("1", "2") if digit in words), "")
     if words & _SIDE["pump"] or (words & _SIDE["port"] and cap == rod):

@@ -1,4 +1,4 @@
-"""Time in several columns: separate hours, minutes and seconds, or parts of a second next to a stamp."""
+"""Time in several columns: hours, minutes and seconds, or parts of a second beside a time stamp."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ _MIN_FRACTION = 0.9
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
-    """Find the columns that together form the time: part -> column.
+    """Find the columns that together form the time: part of the time, such as "hour" -> column.
 
-    Hours, minutes and seconds must occur once each; otherwise the result is empty. Parts of a second are added, and
-    year, month and day if all three exist. `only_subsecond`: find ms, us and ns only, which accompany whole seconds.
+    There must be one column each of hours, minutes and seconds; otherwise the result is empty. Columns of milli-,
+    micro- and nanoseconds are added, and year, month and day if all three exist. `used`: columns to ignore;
+    `only_subsecond`: find only the parts of a second, which accompany a column of whole seconds.
     """
     columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
@@ -48,11 +49,11 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 
 
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
-    """Combine dates or whole seconds with columns of time parts to time stamps or seconds (n,).
+    """Combine a column of dates or whole seconds with columns of time parts to time stamps or seconds (n,).
 
-    `base` (n,): datetime64, or doubles in `unit`; with hours among the parts only its dates are used. `parts`: part of
+    `base` (n,): datetime64, or doubles in `unit`; if the parts have hours, only its dates are used. `parts`: part of
     the time -> values (n,). None if the parts do not belong to this time, such as fractional hours, or milliseconds
-    since the start next to stamps.
+    since the start beside stamps.
     """
     second_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = second_parts[-1] if second_parts else "second"
@@ -79,7 +80,10 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Test whether `offset` (n,) grows within most seconds of `base` (n,), and falls at the next second."""
+    """Test whether parts of a second grow within each second and fall at the next one, as they should.
+
+    `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ.
+    """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)
     if 2 * np.count_nonzero(is_same_second) < steps.size:  # most seconds have one sample
@@ -91,7 +95,10 @@ def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
 
 
 def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
-    """Make the date stamps (n,) of year, month and day, or else of `base`; 1970-01-01 if neither has dates."""
+    """Make date stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,).
+
+    They are 1970-01-01 if neither has dates.
+    """
     if all(part in parts for part in _DATE):
         year, month, day = (np.nan_to_num(parts[part], nan=1.0) for part in _DATE)
         # months since 1970, as numpy counts them

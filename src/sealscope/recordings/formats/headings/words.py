@@ -1,4 +1,4 @@
-"""The words of headings, from `words.toml`."""
+"""The words of headings and their meanings, from `words.toml`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def _split_lists(tree: Any) -> Any:
-    """Replace each text of a tree by the tuple of its comma-separated words."""
+    """Split each text in a tree of tables into the tuple of its comma-separated words."""
     if isinstance(tree, str):
         return tuple(tree.replace("\n", "").split(", "))
     return {key: _split_lists(value) for key, value in tree.items()}

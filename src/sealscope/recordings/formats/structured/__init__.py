@@ -1,1 +1,1 @@
-"""Logs of more than one table: trees of signals, JSON, packets."""
+"""Logs with a structure of their own, such as trees of signals, JSON and packets, and archives."""

@@ -1,6 +1,7 @@
 """Recordings in an archive (.gz, .bz2, .xz, .zst, .zip, .tar), unpacked into a private folder while they are read.
 
-A subprocess unpacks (`run_in_subprocess`), and stops when the output exceeds the limit for an archive of this size.
+A subprocess unpacks them (`run_in_subprocess`), and stops if the output exceeds the limit for an archive of this
+size.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _CHUNK, _MEMORY = 2**20, 2**30
 
 
 def is_workbook(path: Path) -> bool:
-    """Test whether a ZIP archive is a spreadsheet."""
+    """Test in a subprocess whether a ZIP archive is a spreadsheet; raise UnreadableFile if it is damaged."""
     with raising_unreadable("a zip archive", path):
         return _run_limited(_is_workbook, path)
 
@@ -54,8 +55,9 @@ def _is_workbook(path: Path) -> bool:
 def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
     """Unpack the single file of an archive, yield its path, and remove it at the end.
 
-    Raises UnreadableFile if a ZIP or tar has no recording or several, if the archive is damaged, or if it unpacks to
-    more than `max_bytes` or half of the free disk space; MissingExtra for .zst without pyarrow.
+    `kind`: kind of the archive, such as "zip". Raises UnreadableFile if a ZIP or tar contains no recording or
+    several, if the archive is damaged, or if it unpacks to more than `max_bytes` or half of the free disk space.
+    Raises MissingExtra for .zst without pyarrow.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         max_bytes = min(max_bytes, shutil.disk_usage(folder).free // 2)
@@ -65,7 +67,10 @@ def unpack(path: Path, kind: str, max_bytes: int) -> Iterator[Path]:
 
 
 def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
-    """Write the single file of an archive into a folder, and return its path."""
+    """Unpack the single file of an archive into a folder, and return its path.
+
+    Raises UnreadableFile if it has more than `max_bytes`.
+    """
     name = path.stem if path.suffix.lower() in _SUFFIXES else path.name
     with _open_member(path, kind) as (source, member, size):
         check_unpacked(size, max_bytes, path)
@@ -82,7 +87,7 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
     """Open the single file in an archive; yield (stream, name, size [bytes]).
 
-    Name and size are "" and 0 if the archive does not state them.
+    If the archive does not state name and size, they are "" and 0.
     """
     with ExitStack() as stack:
         if kind == "zip":
@@ -104,7 +109,10 @@ def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
 
 
 def _select_recording(names: Sequence[str], path: Path) -> str:
-    """Select the only recording among the names in an archive, without documents; raise UnreadableFile otherwise."""
+    """Select the only recording among the names of an archive's files, leaving out documents such as a readme.
+
+    Raises UnreadableFile if there is no recording or several; `path`: the archive.
+    """
     names = [name for name in names if "__MACOSX" not in name and not Path(name).name.startswith(".")]
     candidates = [name for name in names if Path(name).suffix.lower() not in _DOCUMENTS] if len(names) > 1 else names
     if len(candidates) > 1:

@@ -36,7 +36,7 @@ _decoder = json.JSONDecoder()
 
 
 def is_json(head: bytes) -> bool:
-    """Test whether `head` begins a JSON file: an object or an array, not a heading in brackets."""
+    """Test whether `head` begins a JSON file, with an object or an array; a heading in brackets does not."""
     encoding = detect_encoding(head)
     text = "" if encoding is None else head.decode(encoding, errors="replace").lstrip("\ufeff \t\r\n\x1e")
     if not _BEGINS.match(text):
@@ -56,7 +56,7 @@ def is_json(head: bytes) -> bool:
 
 
 def read_json(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a JSON file; a truncated last value is omitted."""
+    """Read the requested columns of a JSON file to the fields of a recording; a truncated last value is left out."""
     place = str(path)
     with path.open("rb") as head:
         encoding = detect_encoding(head.read(SNIFF))
@@ -82,7 +82,10 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the values of a text; return them, and True if a truncated last one was omitted."""
+    """Read the values in a JSON text; return them, and True if a truncated last one was left out.
+
+    `place`: the file, for messages. Raises InputError for damaged JSON.
+    """
     members, is_cut = list[Any](), False
     try:
         for member in _iter_members(text):
@@ -100,7 +103,7 @@ def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
 
 
 def _iter_members(text: str) -> Iterator[Any]:
-    """Yield the values of a JSON text one after the other; of an array of arrays or objects, its members."""
+    """Yield the values of a JSON text one after the other; for an array of arrays or objects, its members."""
     position, in_array = 0, False
     while (position := _SEPARATORS.match(text, position).end()) < len(text):  # type: ignore[union-attr]
         if in_array and text[position] == "]":
@@ -118,7 +121,11 @@ def _is_cell(value: object) -> bool:
 
 
 def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple[str, str, Any, str | None]]:
-    """Yield (group, name, cell, unit) of each cell in a value of a record; nested names form the group."""
+    """Yield (group, name, cell, unit) for each cell in a value of a record.
+
+    The value is a cell itself, a vector, or a record of further values, whose name then belongs to the group.
+    `depth`: number of records and vectors around it. Raises InputError for other values.
+    """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")
         if name and set(value) == {"value", "unit"} and _is_cell(value["value"]) and isinstance(unit, str):
@@ -136,7 +143,10 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
 
 
 def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
-    """Make a series for each name of records, of rows after a row of names, or of blocks of columns."""
+    """Make a series for each name in a sequence of records, of rows after a row of names, or of blocks of columns.
+
+    `place`: the file, for messages. Raises InputError for other values, and for a name with several units.
+    """
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}
     row_names: list[str] | None = None
@@ -172,16 +182,16 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     check_size(rows, len(columns))
 
     def read_values(key: tuple[str, str]) -> NDArray[Any]:
-        """Return the cells of a column, missing ones included."""
+        """Convert the cells of a column to an array, with one for each row; `key`: its group and name."""
         return _parse_array([columns[key].get(row) for row in range(rows)], key[1])
 
     return [Series(key[0], Label.parse(key[1], units.get(key)), rows, partial(read_values, key)) for key in columns]
 
 
 def _block_length(member: Mapping[str, Any]) -> int | None:
-    """Return the number of rows in a block of columns; None if the member is no such block.
+    """Find the number of rows in a block of columns; None if the value is no such block.
 
-    A block is a mapping of arrays of equal length, one of which is the time.
+    A block of columns is a mapping of arrays of equal length, one of which is the time.
     """
     if not all(isinstance(value, list) for value in member.values()):
         return None
@@ -190,7 +200,10 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
-    """Convert cells to doubles (n,), NaN if missing, or to texts if any is a text; raise InputError for infinity."""
+    """Convert cells to doubles (n,), NaN if missing, or to texts (n,) if any of them is a text.
+
+    `name`: the column in messages. Raises InputError for an infinite number.
+    """
     if any(isinstance(cell, str) for cell in cells):
         texts = ["" if cell is None or is_missing(str(cell)) else str(cell) for cell in cells]
         check_texts(len(texts), max(map(len, texts)), name)
@@ -205,7 +218,11 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 
 
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
-    """Convert the lists in a document: samples and rows to arrays, records to columns by name, structs to mappings."""
+    """Convert the lists in a JSON document to arrays, for `iter_series`.
+
+    A list of samples or of equally long rows becomes an array, a list of records a mapping of columns by name, and
+    another list of mappings a mapping with the names `(1)`, `(2)`, ... `depth`: number of mappings around the value.
+    """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}
     if not isinstance(value, list) or not value:

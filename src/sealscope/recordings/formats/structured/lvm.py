@@ -26,9 +26,10 @@ _END_MARK = "***End_of_Header***"
 
 @dataclass
 class _Packet:
-    """A packet of samples.
+    """A packet of samples in a LabVIEW measurement file.
 
-    `head`: rows of the channels' header by name; `names`: of the columns; `rows`: samples, NaN where a row is shorter.
+    `head`: rows of the packet's header, name -> an entry for each channel; `names`: names of the columns; `rows`:
+    samples of each row, NaN where it is shorter than others.
     """
 
     head: Mapping[str, list[str]]
@@ -36,19 +37,22 @@ class _Packet:
     rows: list[Array] = field(default_factory=list)
 
     def entry(self, name: str, index: int) -> str:
-        """Return the entry in header row `name` of channel `index`; empty if there is none."""
+        """Return the entry of channel `index` in the header's row `name`; empty if there is none."""
         cells = self.head.get(name, [])
         return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
-        """Return the number in header row `name` of channel `index`; NaN if there is none."""
+        """Return the number of channel `index` in the header's row `name`; NaN if there is none."""
         try:
             return float(self.entry(name, index).replace(",", "."))
         except ValueError:
             return np.nan
 
     def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
-        """Return the time of a channel's first sample; None if the header does not state it."""
+        """Return the time stamp of the first sample of channel `index`; None if the header does not state it.
+
+        `day_first`: order of day and month in dates.
+        """
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
         seconds, _, fraction = time.partition(".")
         try:
@@ -57,17 +61,20 @@ class _Packet:
             return None
 
     def column(self, index: int) -> Array:
-        """Return the samples (n,) of a column."""
+        """Return the samples (n,) of the column `index`."""
         return np.array([row[index] for row in self.rows])
 
 
 def is_lvm(head: bytes) -> bool:
-    """Test whether `head` begins a LabVIEW measurement file: the end mark of a header begins a line."""
+    """Test whether `head` begins a LabVIEW measurement file: a line of it begins with the end mark of a header."""
     return any(f"{end}{_END_MARK}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
 def read_lvm(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of a LabVIEW measurement file; packets of the same channels are joined."""
+    """Read the requested channels of a LabVIEW measurement file to the fields of a recording.
+
+    Packets with the same channels are joined.
+    """
     with path.open("rb") as file:
         encoding = detect_encoding(file.read(SNIFF)) or "cp1252"
     with path.open(encoding=encoding, errors="replace") as text:
@@ -90,7 +97,10 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 
 
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
-    """Yield the packets of a file from its numbered lines; rows are added to a packet after it was yielded."""
+    """Yield the packets of a file from its numbered lines; the rows of a packet are added after it was yielded.
+
+    `place`: the file, for messages. Raises InputError for a word in place of a number.
+    """
     head: dict[str, list[str]] = {}
     packet: _Packet | None = None
     in_head = True
@@ -106,7 +116,7 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
             names = packet.names
 
             def format_place(index: int, number: int = number, names: Sequence[str] = names) -> str:
-                """Format line, column and file of a cell."""
+                """Format the line, column and file of a cell for messages; `index`: its column."""
                 return f"(line {number}, column {names[index]}, {place})"
 
             values, words = parse_numbers(cells[: len(names)] + [""] * (len(names) - len(cells)), decimal, format_place)
@@ -124,10 +134,10 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
 
 
 def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
-    """Make a series for each channel from all packets that have its columns.
+    """Make a series for each channel from all packets that have the same columns as the first one.
 
-    `x_columns`: "one" column of times for all channels, "multi", one before each channel, or "no", in which case the
-    packet's header states start and step.
+    `x_columns`: "one" if there is one column of times for all channels, "multi" if there is one before each channel,
+    or "no" if the headers of the packets state start and step instead.
     """
     first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
@@ -159,7 +169,10 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
-    """Compute the times (count,) [s] of a channel without a column of times, from the packet's header."""
+    """Compute the times (count,) [s] of channel `index` from start and step in the header of its packet.
+
+    Raises InputError if the step is not positive.
+    """
     step = packet.number("delta_x", index)
     if not step > 0:
         raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
@@ -167,7 +180,10 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 
 
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Compute the offset of each packet's times [s]; all 0 if the times continue or a start is unknown."""
+    """Compute the offset of each packet's times from the first packet [s].
+
+    All offsets are 0 if the times continue from packet to packet, or if the date of a packet is not known.
+    """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]
     known = [moment for moment in moments if moment is not None]

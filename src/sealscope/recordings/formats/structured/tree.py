@@ -1,4 +1,4 @@
-"""Signals in a tree of structs, as in MATLAB and JSON files: vectors, matrices, signals with unit and time.
+"""Series of samples in a tree of structs, as in MATLAB and JSON files.
 
 A row or column vector is a series, and so is each column of a matrix; a struct, a table or an object is a group. A
 struct with the fields of a time series (``time`` and ``signals``, or ``Time`` and ``Data``) gives its series a clock.
@@ -28,16 +28,16 @@ _COLUMN_NAME_FIELDS = ("colheaders", "header", "headers", "labels", "channels", 
 def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
     """Yield the series in the values of a file.
 
-    `fields`: name -> value: an array (n,) or (n, m), a struct as a mapping, a table or an object.
+    `fields`: name -> value, which is an array (n,) or (n, m), a struct as a mapping, a table or an object.
     """
     yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
 
 
 def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series in a value of any type, called `name`.
+    """Yield the series in a value of any type with the name `name`.
 
-    `group`: path of the structs that contain the value; `clock`: times of series that state none, None if unknown;
-    `depth`: number of structs around the value.
+    `group`: names of the structs around the value, with slashes between; `clock`: times of series that state none,
+    None if unknown; `depth`: number of structs around the value.
     """
     if depth > _MAX_DEPTH:
         return
@@ -55,7 +55,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
     """Return the fields of a struct, or the properties of an object, by name; None for other values.
 
-    An array of structs has its structs as fields, called `(1)`, `(2)`, ...
+    The fields of an array of structs are these structs, with the names `(1)`, `(2)`, ...
     """
     properties = getattr(value, "properties", value)
     if isinstance(properties, Mapping):
@@ -69,7 +69,10 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 
 
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct, which is a time series, a signal, or a group (arguments as of `_iter_value`)."""
+    """Yield the series in a struct, which is a time series, a signal with a unit, or a group of other values.
+
+    The arguments are those of `_iter_value`, with the fields of the struct by name.
+    """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
     samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)
@@ -87,7 +90,10 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct with times, the `clock`; `by_name`: its fields by lower-case name."""
+    """Yield the series in a struct with times.
+
+    `by_name`: its fields by their names in lower case; `clock`: the times; other arguments as for `_iter_value`.
+    """
     data = by_name.get("data")
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
@@ -102,7 +108,10 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 
 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in each field of a struct; fields such as `units` and `names` describe the others."""
+    """Yield the series in each field of a struct; fields such as `units` and `names` describe the others.
+
+    `group`: names of the struct and of those around it, with slashes between; other arguments as for `_iter_value`.
+    """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
         head, _, last = key.rpartition("_")
@@ -127,12 +136,15 @@ def _is_vector(value: Any) -> bool:
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first field in `names` that is present, "" if it is no text; None if none is present."""
+    """Return the text of the first of the fields `names` that is present; None if none is present.
+
+    The result is empty if the field is no text. `by_name`: fields by their names in lower case.
+    """
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
 
 def _find_field_units(fields: Mapping[str, Any]) -> dict[str, str]:
-    """Return the units of a struct's fields, name -> unit, from its struct called `units`."""
+    """Find the units of a struct's fields, name -> unit, in its field `units`; empty if there is none."""
     for key, value in fields.items():
         if key.casefold() in _UNIT_FIELDS and (units_by_name := _struct_fields(value)) is not None:
             return {name: text for name, member in units_by_name.items() if (text := _single_text(member))}
@@ -140,7 +152,7 @@ def _find_field_units(fields: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
-    """Return the names of a matrix's columns from a cell array of texts in the same struct; [] if there is none."""
+    """Find the names of a matrix's columns in a list of texts in the same struct; empty if there is none."""
     for key, value in fields.items():
         if (
             key.casefold() in ("name", "names", *_COLUMN_NAME_FIELDS)
@@ -155,7 +167,10 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct: numbers, or start, increment and length; None if it has none."""
+    """Read the times (n,) [s] of a struct, given as numbers, or by start, increment and length; None if it has none.
+
+    `by_name`: fields by their names in lower case.
+    """
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")
@@ -170,7 +185,7 @@ def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None
 
 
 def _list_structs(value: Any) -> list[Mapping[str, Any]]:
-    """List the structs of an array of structs, or the single struct."""
+    """List the structs in an array of structs, or the single struct, as mappings of their fields."""
     fields = _struct_fields(value) or {}
     members = [member for field in fields.values() if (member := _struct_fields(field)) is not None]
     return members if members and all(key.startswith("(") for key in fields) else [fields]
@@ -179,7 +194,10 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
 def _iter_columns(
     group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None
 ) -> Iterator[Series]:
-    """Yield a series for a vector, or for each column of a matrix, called `name(:,1)` and so on."""
+    """Yield a series for a vector, or for each column of a matrix, with names such as `name(:,1)`.
+
+    Arrays of other types, shapes or with too many columns are left out.
+    """
     if value.dtype.kind not in "fiubmMU":
         return
     flat = np.squeeze(value)
@@ -193,7 +211,7 @@ def _iter_columns(
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table; the row times of a timetable are their clock."""
+    """Yield the columns of a table, a pandas data frame; the row times of a timetable are their clock."""
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
     clock, index = None, np.asarray(frame.index)
     if index.dtype.kind in "mM" and index.size:
@@ -207,7 +225,7 @@ def _iter_table(group: str, frame: Any) -> Iterator[Series]:
 
 
 def _single_text(value: Any) -> str:
-    """Return the only text in a value, empty if there is none or several."""
+    """Return the only text in a value; empty if there is none or several."""
     flat = np.asarray(value).reshape(-1) if value is not None else np.empty(0)
     return str(flat[0]).strip() if flat.size == 1 and isinstance(flat[0], str) else ""
 
@@ -219,6 +237,6 @@ def single_number(value: Any) -> float | None:
 
 
 def format_remark(value: Any) -> str:
-    """Format a single text or number for a remark; empty for any other value."""
+    """Format a single text or number as the text of a remark; empty for any other value."""
     number = single_number(value)
     return _single_text(value) if number is None else f"{number:.12g}"

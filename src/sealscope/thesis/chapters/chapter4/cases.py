@@ -1,7 +1,7 @@
-"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers from which claims are judged.
+"""The twelve cases of Tables 4.2 and 4.3, the readings of the equations, and the numbers by which claims are judged.
 
-A case is run with the thesis's method and step ("as_published"), and with a step that converges; the equations are the
-same.
+A case is simulated with the thesis's method and step ("as_published"), and with a step that converges; the equations
+are the same. A reading is one way to understand equations that the thesis states inconsistently.
 """
 
 from __future__ import annotations
@@ -61,9 +61,10 @@ CASES: dict[str, tuple[str, float | None]] = {
 class Reading:
     """One reading of the throttles' equations, which the thesis states inconsistently or incompletely.
 
-    `metering`: "meter-out" (the text: return flow throttled on both sides) or "literal" (eqs. 4.11, 4.12 as printed);
-    `closed_means`: "area" (eq. 4.8) or "diameter" (the text's 3.75 mm of 5 mm); `d_line_mm`: 7 (Table 4.1) or 5 (the
-    text); `V_line_cm3`: V_1 = V_2, which the thesis does not give.
+    `metering`: "meter-out" (the text: the return flow is throttled on both sides) or "literal" (eqs. 4.11, 4.12 as
+    printed); `closed_means`: a throttle is closed by a fraction of its "area" (eq. 4.8) or of its "diameter" (the
+    text's 3.75 mm of 5 mm); `d_line_mm`: diameter of the lines, 7 (Table 4.1) or 5 (the text); `V_line_cm3`: volume
+    V_1 = V_2 of each line, which the thesis does not give.
     """
 
     metering: Literal["meter-out", "literal"] = "meter-out"
@@ -73,13 +74,17 @@ class Reading:
 
     @property
     def title(self) -> str:
-        """Short description of the reading."""
+        """Short description of the reading, such as "meter-out, closed by area, 7 mm"."""
         metering = "as printed" if self.metering == "literal" else "meter-out"
         text = f"{metering}, closed by {self.closed_means}, {self.d_line_mm:g} mm"
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Return the rig's parameters for throttles closed by `closed_pct` [%] (0: open; None: absent)."""
+        """Return the rig's parameters under this reading for throttles closed by `closed_pct` [%].
+
+        A closing of 0 means open throttles, None a rig without throttles. Each parameter is a pair (dotted name,
+        value).
+        """
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
@@ -113,9 +118,10 @@ def make_experiment(
     duration: float = DURATION,
     overrides: Mapping[str, str | float] = MappingProxyType({}),
 ) -> Experiment:
-    """Build the experiment of a command with throttles closed by `closed_pct` [%] (None: absent).
+    """Build the experiment of a command with throttles closed by `closed_pct` [%], None for no throttles.
 
-    `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that replace the reading's.
+    `reading`: reading of the throttles' equations; `solver`: "as_published" for the thesis's method and step;
+    `duration` [s]; `overrides`: parameters that replace the reading's.
     """
     values = {**dict(reading.values(closed_pct)), **overrides}
     experiment = Experiment.of(command=command, duration=duration, set=values)
@@ -125,9 +131,9 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build the long experiment with section 4.3's command, on which the drift of the piston is measured.
+    """Build the long experiment, with the command of section 4.3, in which the drift of the piston is measured.
 
-    `closed_pct`, `solver`, `overrides`: as in `make_experiment`.
+    The arguments are those of `make_experiment`.
     """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
@@ -136,45 +142,51 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command with the thesis's solver and with a converged one; return the runs by solver."""
+    """Simulate a command with the thesis's solver and with a converged one; return both runs by solver.
+
+    `closed_pct`, `reading`: as in `make_experiment`.
+    """
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
 def all_resolved(runs: Runs) -> bool:
-    """Return True if all runs passed the test with half the step."""
+    """Return True if all runs passed the test with half the solver's step."""
     return all(run.resolved for run in runs.values())
 
 
 def completed_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
-    """List (solver, label, run) of the runs that did not diverge."""
+    """List the runs of a case that did not diverge, as (solver, label in legends, run)."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 
 def steady_mask(run: SimulatedRun) -> np.ndarray:
-    """Return the mask (n,) of the samples within `STEADY`."""
+    """Return the mask (n,) of the samples of a run within its steady part, the interval `STEADY`."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
 def steady_output(run: SimulatedRun, name: str) -> Array:
-    """Return the samples of an output within `STEADY`; a single nan if the run diverged."""
+    """Return the values of an output in the steady part of a run, the interval `STEADY`.
+
+    Returns a single nan if the run diverged.
+    """
     return np.array([math.nan]) if run.diverged else np.asarray(run.outputs[name][steady_mask(run)])
 
 
 def steady_range(run: SimulatedRun, name: str) -> float:
-    """Compute the range (maximum minus minimum) of an output within `STEADY`."""
+    """Compute the maximum minus the minimum of an output in the steady part of a run, the interval `STEADY`."""
     return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Compute the mean of the difference `first` - `second` of two outputs within `STEADY`."""
+    """Compute the mean of the output `first` minus the output `second` in the steady part of a run (`STEADY`)."""
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Summarise the pressures [Pa] of a run in its steady part `STEADY`, by name of the number.
+    """Summarise the pressures and flows in the steady part of a run (`STEADY`) by a few numbers, by name.
 
-    The numbers are ranges, peaks and minimum of the pressures, and mean and largest drop at the orifices. `flows
-    differ`: rms of Q_A - Q_B over that of Q_A. All values are nan if the run diverged.
+    They are in Pa: range and peak of each pressure, the lowest pressure, and mean and largest drop at the orifices.
+    The number `flows differ` is the rms of Q_A - Q_B over the rms of Q_A. All numbers are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
@@ -189,9 +201,9 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Compute the drift [m] of the piston: its mean position in the last whole period minus the first.
+    """Compute the drift [m] of the piston in a run: its mean position in the last whole period minus the first.
 
-    nan if the run diverged.
+    It is nan if the run diverged.
     """
     if run.diverged:
         return math.nan
@@ -202,6 +214,9 @@ def piston_drift(run: SimulatedRun) -> float:
 
 
 def visible_pressure() -> float:
-    """Compute the smallest visible pressure difference [Pa]: the standard deviation of a transducer's noise."""
+    """Compute the smallest pressure difference [Pa] that counts as visible.
+
+    It is the standard deviation of a pressure transducer's noise.
+    """
     sensors = load_rig("thesis").sensors
     return math.hypot(sensors.p_A.noise, sensors.common_noise)

@@ -1,7 +1,7 @@
 """Judge the testable sentences of chapter 4.
 
-Claims on the orifices are judged on converged runs under both readings of the equations; the results of RK4 at 1e-4 s
-are stated for comparison.
+Claims on the orifices are judged on converged runs under both readings of the equations (`cases.Reading`); the
+results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
 """
 
 from __future__ import annotations
@@ -50,9 +50,10 @@ Rows = list[dict[str, float]]
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
-    """Compute the median peak-to-peak ringing [Pa] of the true p_A within `after` [s] of the pump's reversals.
+    """Compute the median peak-to-peak ringing [Pa] of the noise-free p_A after the pump's reversals.
 
-    The ringing is p_A minus its moving mean over `window` [s].
+    The ringing is p_A minus its moving mean over `window` [s]. It is measured from `window` to `after` [s] after each
+    reversal of the pump's direction, without those in the first second.
     """
     rate = 1.0 / float(run.t[1] - run.t[0])
     p_A, omega = run.outputs["p_A"], run.outputs["omega"]
@@ -67,7 +68,7 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
 
 
 def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, 4.2 a) to c)."""
+    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, which are 4.2 a) to c)."""
     runs = {command: context.run(make_experiment(command, None)) for command in COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
@@ -88,7 +89,7 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
 
     def drift_mm(**overrides: float) -> float:
-        """Compute the drift [mm] of the piston over a long run with some parameters replaced."""
+        """Compute the drift [mm] of the piston in a long run, with some of the rig's parameters replaced."""
         run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
         return 1e3 * cases.piston_drift(run)
 
@@ -99,11 +100,11 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 
 
 def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.1 and 4.3 on the solver's step and the gains of the speed loop."""
+    """Judge claims 4.1 and 4.3 on the solver's step and on the gains of the speed loop."""
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
     def largest_change(*, with_throttles: bool) -> str:
-        """Format the largest change of a pressure when the step is halved."""
+        """Format the largest change of a pressure when the step is halved, in the cases with or without throttles."""
         matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
         changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
         return f"{max(changes):.3g} Pa rms" if changes else "diverged"
@@ -155,7 +156,10 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 
 
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Format the number of passed tests; if only some passed, also the readings that pass all tests."""
+    """Format how many tests passed, such as "7 of 16 tests pass".
+
+    If only some passed, the text also names the readings of the equations under which all tests pass.
+    """
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
     text = f"{sum(results)} of {len(results)} tests pass"
@@ -170,9 +174,10 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` by the converged runs of both readings, and state the results of both solvers.
+    """Judge claim 4.`number` by the converged runs under both readings of the equations.
 
-    `numbers`: by solver and reading; `test`: tests the numbers of one reading; `format_numbers`: formats those of all.
+    The results of both solvers are stated. `numbers`: results of the runs by solver and reading; `test`: tests the
+    results of one reading; `format_numbers`: formats the results of all readings.
     """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
@@ -186,32 +191,37 @@ def _judge_runs(
 
 
 def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
-    """Format minimum and maximum of the values, scaled by `factor` to `unit`."""
+    """Format the smallest and the largest of some values, multiplied by `factor` to be in `unit`."""
     scaled = [value * factor for value in values]
     return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats `head` and a range [kPa] over the rows of all readings.
+    """Build a function that formats the range [kPa] of some numbers over all readings of the equations.
 
-    `values`: extracts the numbers [Pa] from the rows of one reading.
+    `head`: text before the range; `values`: takes these numbers [Pa] from the rows of one reading.
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute the change of each pressure's `statistic` from the first row to each later row, as one list.
+    """Compute by how much a statistic of each pressure changes [Pa] from the first row to each later row.
 
-    `statistic`: "peak" or "range".
+    `rows`: summaries of runs (`summarise_run`); `statistic`: "peak" or "range"; `names`: the pressures. The changes
+    are in one list, row by row.
     """
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Simulate cases (command, closing [%]) and summarise each run, by solver and reading (`summarise_run`)."""
+    """Simulate some cases, given as (command, closing [%]), under both readings and with both solvers.
+
+    Returns a summary of each run (`summarise_run`) by solver and reading.
+    """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
+        """Simulate one case under one reading with one solver, and summarise its run."""
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
 
     return {
@@ -221,16 +231,17 @@ def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> d
 
 
 def _judge_opening(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.8 to 4.12 on the change from open orifices to 25 % closed."""
+    """Judge claims 4.8 to 4.12 on the change from open orifices to orifices that are 25 % closed."""
     min_visible = cases.visible_pressure()
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
     p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
 
     def peak_and_range_changes(rows: Rows) -> list[float]:
+        """Compute the changes of all pressures' peaks and ranges [Pa] from open orifices to 25 % closed."""
         return _changes(rows, "peak") + _changes(rows, "range")
 
     def format_flow_difference(rows_of_readings: list[Rows]) -> str:
-        """Format the largest difference of the two flows at 25 % closed."""
+        """Format the largest relative difference of the flows Q_A and Q_B with orifices that are 25 % closed."""
         largest = max(rows[1][flows] for rows in rows_of_readings)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
@@ -252,18 +263,21 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
 
     def range_changes_to_last(rows: Rows) -> list[float]:
+        """Compute the changes of all pressures' ranges [Pa] from the first row to the last."""
         return _changes([rows[0], rows[-1]], "range")
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Test for each pressure that its range grows with the closing, and visibly from 25 to 75 %."""
+        """Test for each pressure that its range grows with the closing, and visibly so from 25 to 75 % closed."""
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
     def chamber_peak_changes(rows: Rows) -> list[float]:
+        """Compute the changes of the chamber pressures' peaks [Pa] from the first row to each later row."""
         return _changes(rows, "peak", CHAMBERS)
 
     def largest_drops(rows: Rows) -> list[float]:
+        """List the largest pressure drop [Pa] at the orifices in each row."""
         return [row["largest drop"] for row in rows]
 
     changes = _range_text(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", range_changes_to_last)
@@ -280,7 +294,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     """Judge claims 4.18 and 4.19 on the drift of the piston with orifices."""
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
-        """Compute the drift [m] of the piston over a long run."""
+        """Compute the drift [m] of the piston in a long run; `closed`: closing of the orifices [%], None for none."""
         return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
     drift_without = drift(DEFAULT_READING, None, "converged")
@@ -291,9 +305,13 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     }
 
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build the function that formats the drift added by the orifices at each closing, as a range."""
+        """Build the function that formats the drift that orifices add at each closing.
+
+        It states the range over both readings of the equations; `head`: text before it.
+        """
 
         def format_drift(rows: list[list[float]]) -> str:
+            """Format the added drift [mm] at each closing, as the range over `rows`, one row for each reading."""
             parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
             texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
             return f"{head} {', '.join(texts)}"
@@ -301,11 +319,11 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Test at each closing that the drift differs from the drift without orifices."""
+        """Test at each closing that the drift differs from that without orifices."""
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Test that the drift grows from each closing to the next."""
+        """Test that the drift is larger at each closing than at the one before."""
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 
     head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"
@@ -325,7 +343,7 @@ _HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 
 
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
-    """Tabulate the numbers under both readings, all closings and solvers, and judge the claims of chapter 4."""
+    """Judge the claims of chapter 4, and tabulate the numbers of one command by reading, solver and closing."""
     without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
     with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)
     judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]

@@ -36,7 +36,7 @@ from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 
 class FigureUnit(NamedTuple):
-    """Unit of a quantity in the figures, and the factor `scale` to it from SI."""
+    """Unit in which the figures show a quantity, and the factor `scale` from SI units to it."""
 
     unit: str
     scale: float
@@ -60,19 +60,25 @@ _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0,
 
 
 def item_reading(item: Item) -> Reading:
-    """Return the reading of the equations that an item names."""
+    """Return the reading of the throttles' equations that an item names, the default one if it names none."""
     return Reading(**item.inputs.get("reading", {}))
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Simulate the case of Table 4.2 or 4.3 that an item shows; return its runs and the notes on them."""
+    """Simulate the case of Table 4.2 or 4.3 that an item shows, with both solvers.
+
+    Returns the runs by solver, and the notes on them.
+    """
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
     return runs, _run_notes(runs, reading if closed_pct is not None else None)
 
 
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
-    """Format the notes on a figure of the runs; `reading`: None without orifices."""
+    """Format the notes on a figure of a case: reading of the equations, and runs that failed or are not resolved.
+
+    `reading`: None for a case without orifices.
+    """
     notes = [format_note("measured-curve")]
     if reading is not None:
         notes.append(f"Reading: {reading.title}.")
@@ -87,24 +93,27 @@ def _run_notes(runs: Runs, reading: Reading | None) -> str:
 
 
 def _axis_label(name: str) -> str:
-    """Format a quantity with its unit in the figures."""
+    """Format the label of a quantity with its unit in the figures, such as "p_A [MPa]"."""
     return f"{name} [{FIGURE_UNITS[name].unit}]"
 
 
 def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the line of an output over time, in the figures' unit."""
+    """Build the curve of an output of a run over time, in the figures' unit."""
     return FigureCurve(run.t, run.outputs[name] * FIGURE_UNITS[name].scale, label, role)
 
 
 def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build a few marks of an output that coincides with another curve."""
+    """Build the curve of an output as a few marks, for one that coincides with another curve."""
     thinned = slice(None, None, max(1, run.t.size // _N_MARKS))
     values = run.outputs[name][thinned] * FIGURE_UNITS[name].scale
     return FigureCurve(run.t[thinned], values, f"{label} (the same)", role, "points")
 
 
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
-    """Build the curves of an output with both solvers; the published solver's are marks if the two coincide."""
+    """Build the curves of an output with both solvers.
+
+    If they coincide, that of the thesis's solver is drawn as a few marks.
+    """
     converged = runs["converged"]
     max_difference = _COINCIDENCE_FRACTION * steady_range(converged, name) * FIGURE_UNITS[name].scale
     if len(completed_runs(runs)) == 2 and _rms_difference(runs, name) < max_difference:
@@ -114,16 +123,16 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 
 
 def _rms_difference(runs: Runs, name: str) -> float:
-    """Compute the rms difference of an output between the runs of both solvers, in the figure's unit.
+    """Compute the rms difference of an output between the runs with both solvers, in the figures' unit.
 
-    The difference is over the steady periods; nan if a run diverged.
+    It is computed over the steady part of the runs; nan if one of them diverged.
     """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
 
 
 def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate minimum, maximum and standard deviation of each quantity of a case, with both solvers."""
+    """Tabulate minimum, maximum and standard deviation of each quantity in a case, with both solvers."""
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []
     for name in list(FIGURE_UNITS)[1:]:  # without the command
@@ -139,7 +148,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the item's quantities over time, each with both solvers."""
+    """Draw the quantities that the item names over time, each with both solvers."""
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
     t = runs["converged"].t
@@ -175,7 +184,10 @@ def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve, ...]:
-    """Build the curves of both pressures over time; the pump's is drawn as marks if they coincide."""
+    """Build the curves of the pressures on both sides of an orifice over time.
+
+    `pump`, `chamber`: names of the two pressures. If they coincide, the pump's is drawn as a few marks.
+    """
     chamber_curve = _line_curve(run, chamber, chamber, "A" if chamber == "p_A" else "B")
     rms_difference = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
     if rms_difference >= _COINCIDENCE_FRACTION * steady_range(run, chamber):
@@ -186,10 +198,10 @@ def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureC
 def _sweep_curves(
     template: str, sweep: Mapping[float, Runs], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
-    """Build curves and numbers [MPa] of a measure over a varied parameter.
+    """Build the curve of a measure over a varied parameter for each solver, and list its points as numbers [MPa].
 
-    `sweep`: value of the parameter -> runs; `measure`: computes the measure [Pa] of a run; `template`: name of a number
-    with a placeholder for the parameter's value.
+    `sweep`: runs by value of the parameter; `measure`: computes the measure [Pa] of a run; `template`: name of a
+    number, with a placeholder for the parameter's value.
     """
     curves, numbers = [], []
     for solver in solvers:
@@ -201,7 +213,10 @@ def _sweep_curves(
 
 
 def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one pressure at 25, 50 and 75 % closed with both solvers, and its range over the closing."""
+    """Draw one pressure with orifices that are 25, 50 and 75 % closed, and its range over the closing.
+
+    Both are drawn with both solvers; the item names the pressure.
+    """
     name, reading = item.inputs["quantity"], item_reading(item)
     sweep = {closed: run_both_solvers(context, COMMAND, closed, reading) for closed in CLOSINGS}
     panels = []
@@ -219,7 +234,10 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the ranges of p_1 and p_A and their mean difference over V_1 = V_2, which the thesis does not give."""
+    """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give.
+
+    The panels show the ranges of p_1 and of p_A and the mean of p_1 - p_A.
+    """
     command, closed = "3 sin(4t)", 25.0
     volumes = _QUICK_VOLUMES if context.quick else _VOLUMES
     sweep = {volume: run_both_solvers(context, command, closed, Reading(V_line_cm3=volume)) for volume in volumes}
@@ -238,6 +256,6 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the figures of chapter 4 with measured curves only, and the simulated figures that replace them."""
+    """Tabulate the figures of chapter 4 that show only measured curves, and the simulated figures in their place."""
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)

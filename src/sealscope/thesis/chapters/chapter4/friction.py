@@ -1,4 +1,7 @@
-"""Draw Figs. 4.2 and 4.3: friction models, and the rig's Stribeck curve under both bracketings of eq. (4.22)."""
+"""Draw Figs. 4.2 and 4.3: friction models, and the rig's Stribeck curve for both readings of eq. (4.22).
+
+Eq. (4.22) is printed with an unbalanced bracket, which can be closed in two places.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +27,10 @@ def thesis_rig() -> Rig:
 
 
 def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
-    """Compute the rig's friction [N] at `v` [m/s] (n,) under the Coulomb force `F_C` [N], eqs. (4.21), (4.22).
+    """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22).
 
-    `literal_bracket`: place the bracket of eq. (4.22) as printed, which makes the friction jump at v_th.
+    `F_C` [N]: Coulomb force; `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) as printed, which
+    makes the friction jump at the threshold velocity v_th.
     """
     f = thesis_rig().friction
     friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
@@ -34,7 +38,10 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 
 
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Compute friction [N] at and just above v_th for both bracketings of eq. (4.22), "continuous" and "literal"."""
+    """Compute the friction [N] at the threshold velocity v_th and just above it, for both readings of eq. (4.22).
+
+    Returns the two forces by the name of the reading: "continuous", or "literal" with the bracket as printed.
+    """
     v_th = thesis_rig().friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
     forces = {}
@@ -45,13 +52,17 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
 
 def falling_friction_limit(F_C: float) -> float:
-    """Compute the velocity [m/s] up to which friction falls with speed: F_v = F_C (K_brk - 1) C_c exp(-C_c v)."""
+    """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` [N].
+
+    It solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), where viscous friction rises as fast as Stribeck friction falls,
+    and is 0 if the friction never falls.
+    """
     f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
 
 
 def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with Table 4.1's numbers."""
+    """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve, with numbers of Table 4.1."""
     f = thesis_rig().friction
     F, F_brk, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
@@ -74,7 +85,7 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, near standstill for both readings of eq. 4.22's bracket, and its slope."""
+    """Draw Fig. 4.3: friction over velocity, its slope, and both readings of eq. (4.22) near standstill."""
     rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
