@@ -117,8 +117,22 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         below = np.abs(residual[residual < 0.0])
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
-    error = cluster_errors(design * weight[:, None], residual * weight, [0])[0]
-    return float(coefficients[0]), float(error)
+    errors = cluster_errors(design * weight[:, None], residual * weight, [0])[0], _envelope_error(time, residual)
+    return float(coefficients[0]), float(np.hypot(*errors))
+
+
+def _envelope_error(time: Array, residual: Array) -> float:
+    """Compute the standard error of the slope of a lower envelope from its scatter between the parts of a recording.
+
+    The robust weights hide a part that lies off the envelope as a whole. With the low quantile r_k of the residuals of
+    part k of n, at the mean time t_k:
+
+        error^2 = sum (r_k - mean)^2 / (n - 2) / sum (t_k - mean)^2.
+    """
+    parts = [part for part in np.array_split(np.arange(len(residual)), PARTS) if part.size]
+    levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
+    times = np.array([time[part].mean() for part in parts])
+    return float(levels.std() / np.sqrt(len(parts) - 2) / max(float(times.std()), TINY))
 
 
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
