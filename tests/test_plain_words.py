@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -45,9 +45,9 @@ RELATIVES = re.compile(r"\b(as|that|what|where|which|whose)\b")
 MOST_RELATIVES = 2
 
 
-def stored_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
+def stored_names(nodes: Iterable[ast.AST]) -> Iterator[tuple[int, str]]:
     """Yield line and name of each variable and argument."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.lineno, node.id
         elif isinstance(node, ast.arg):
@@ -56,12 +56,13 @@ def stored_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 def faults_of(tree: ast.AST, file: str) -> list[str]:
     """List the names and first lines of a file that do not read plainly."""
+    nodes = list(ast.walk(tree))
     faults = [
         f"{file}:{line} variable {name}"
-        for line, name in stored_names(tree)
+        for line, name in stored_names(nodes)
         if VARIABLE.fullmatch(name) and (file, name) not in KEPT
     ]
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             continue
         is_function = not isinstance(node, ast.ClassDef)
@@ -83,9 +84,9 @@ def test_a_package_reads_plainly(package: str):
 def test_every_exception_is_needed():
     names = set()
     for file, _ in KEPT:
-        tree = ast.parse((SOURCE / file).read_text("utf-8"))
-        names |= {(file, name) for _, name in stored_names(tree)}
-        names |= {(file, node.name) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+        nodes = list(ast.walk(ast.parse((SOURCE / file).read_text("utf-8"))))
+        names |= {(file, name) for _, name in stored_names(nodes)}
+        names |= {(file, node.name) for node in nodes if isinstance(node, ast.FunctionDef)}
     assert names >= KEPT
 
 

@@ -31,6 +31,7 @@ ss.simulte()
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_types_reach_a_user_s_project(tmp_path):
     """What mypy says of a script outside the project; `py.typed` is all that it knows of Sealscope."""
     pytest.importorskip("mypy", reason="mypy is not installed")

@@ -165,6 +165,8 @@ def test_a_case_that_fails_costs_no_other(plan_with):
             assert "smaller than the pump's mean flow" in rows[case.id].error
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_cell_that_cannot_be_run_costs_no_other(text):
     """A command that drives the piston into the cap and a pressure below vacuum."""
     tree = tomllib.loads(text)

@@ -138,7 +138,9 @@ def test_an_installed_controller_is_run(tmp_path, monkeypatch):
     assert isinstance(case_experiment(plan, list_cases(plan)[0]).active_controller, Flatness)
 
 
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize(
+    "name", [PROFILES[0], *(pytest.param(name, marks=[pytest.mark.slow, pytest.mark.long]) for name in PROFILES[1:])]
+)
 def test_each_family_is_either_for_development_or_held_out(name):
     plans = [load_plan(each) for each in plan_names() if each.startswith(f"bench-{name}")]
     assert {plan.name for plan in plans if plan.part != "development"} == {f"bench-{name}"}

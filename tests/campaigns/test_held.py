@@ -66,6 +66,7 @@ def count_leaks(rig: Rig, hold: PlannedHold, conductance: float, count: int) -> 
     return found
 
 
+@pytest.mark.slow
 def test_a_leak_as_planned_is_found_in_simulated_holds(rig: Rig, hold: PlannedHold) -> None:
     assert count_leaks(rig, hold, 1.5 * hold.conductance, 5) >= 4
     assert count_leaks(rig, hold, 0.2 * hold.conductance, 5) <= 1

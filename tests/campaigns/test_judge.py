@@ -63,6 +63,7 @@ def test_the_table_counts_by_hand():
     assert table[SIGN, 1.0].false_alarm.value == pytest.approx(0.5, abs=0.1)  # a threshold of its own
 
 
+@pytest.mark.slow
 def test_the_false_alarm_rate_is_kept_on_fresh_records():
     """Over many campaigns the mean rate on fresh records is the one asked for (exact: 10 of 200 are beyond)."""
     rates = [

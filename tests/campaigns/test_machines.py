@@ -52,6 +52,7 @@ def test_the_same_case_gives_the_same_bytes(bench):
     assert rows[0]["error"] is None
 
 
+@pytest.mark.slow
 def test_a_leak_has_its_mean_on_its_own_machine(bench):
     """Sized over a short run; the row tells what the record had."""
     assert bench.duration_s < SIZING_SECONDS

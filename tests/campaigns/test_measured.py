@@ -81,6 +81,8 @@ def test_recordings_are_calibrated_and_judged(folder):
     assert {path.name: path.read_bytes() for path in again} == before
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_numbers_in_names_count_as_numbers(folder):
     """`healthy-10` comes after `healthy-9`: the first ten are those numbered 1 to 10."""
     rows = judge_recordings(plan_of(folder), folder)
@@ -90,6 +92,8 @@ def test_numbers_in_names_count_as_numbers(folder):
     assert len(left_out) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
     (folder / "leaky-9.csv").write_text("t [s],p_A [Pa]\n0,1\n", encoding="utf-8")
     rows = judge_recordings(plan_of(folder), folder)
@@ -161,6 +165,7 @@ def test_a_set_without_files_and_a_file_in_two_sets_are_refused(folder):
         judge_recordings(plan_of(folder, PLAN.replace("first = 11", "first = 10")), folder)
 
 
+@pytest.mark.slow
 def test_rotary_strokes(real_folder):
     """Levels of d3 lie high where the seal is defective; ten healthy strokes raise one alarm at 10 %."""
     result = judge_recorded_campaign(load_plan("rotary-seal"), real_folder / "vtnsi_actuator")

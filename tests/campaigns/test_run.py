@@ -41,6 +41,8 @@ def once(tiny, finished_tiny):
     return plan, files_of(plan, finished_tiny)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_processes_make_the_same_bytes(once, tmp_path):
     plan, expected = once
     assert {"records.csv", "table.csv", "pod.csv", "cells.csv", "thresholds.csv"} <= set(expected)
@@ -119,6 +121,8 @@ def test_no_process_outlives_a_killed_campaign(tiny, tmp_path):
     until(lambda: not any(alive(pid) for pid in workers))
 
 
+@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGINT") or os.name == "nt", reason="interrupts as POSIX does")
 def test_an_interrupt_ends_it_and_keeps_the_rows(tiny, tmp_path):
     process = start(tiny, tmp_path / "stopped")
@@ -162,6 +166,8 @@ def break_some(plan, case, folder=None):
     return run_case(plan, case, folder)
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     plan = load_plan(tiny)
     bad = sum(doomed(case) for case in list_cases(plan))
@@ -179,6 +185,7 @@ def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
     assert campaign.run(plan, tmp_path / "bad", jobs=1, retry=True).failed == 0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
@@ -273,6 +280,8 @@ def test_a_spoilt_line_is_refused_with_its_place(tiny, tmp_path):
         store.read_progress(plan, tmp_path)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_recordings_are_kept_only_where_asked(tiny, text, tmp_path):
     few = text.replace("count = 6", "count = 1").replace("count = 5", "count = 1").replace("count = 10", "count = 8")
     path = tmp_path / "keep.toml"

@@ -57,6 +57,8 @@ def test_what_is_separable_from_the_pump_is_no_smaller_than_what_is_found(rig: R
     assert minute.conductance < usual.conductance < min(rarer.conductance, surer.conductance)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_the_shortest_recording_that_finds_it_is_planned(
     monkeypatch: pytest.MonkeyPatch, rig: Rig, minute: DetectableLeak
 ) -> None:

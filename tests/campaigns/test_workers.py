@@ -29,6 +29,8 @@ def test_a_process_that_dies_loses_its_own_item_alone(die_on):
     assert results == {item: None if item == 3 else item for item in range(8)}
 
 
+@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
 def test_a_process_that_dies_idle_loses_nothing():
     others = {child.pid for child in multiprocessing.active_children()}

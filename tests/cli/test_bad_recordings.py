@@ -187,6 +187,7 @@ def test_a_name_with_a_line_break_is_still_one_line(call, tmp_path):
     assert "two\N{REPLACEMENT CHARACTER}lines.csv" in call("diagnose", tmp_path / "two\nlines.csv").refused(1)
 
 
+@pytest.mark.slow
 def test_names_beyond_the_terminal_s_characters(shell, tmp_path):
     path = tmp_path / "cylinder \N{SNOWMAN}.csv"
     path.write_text(HEAD + rows(*pressures(400)))

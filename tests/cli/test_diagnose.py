@@ -111,7 +111,7 @@ def test_text_says_the_same(call, recordings):
 
 
 def test_a_process_of_its_own_prints_the_same(shell, call, recordings):
-    words = ("diagnose", recordings / "leak.nc", "--format", "jsonl")
+    words = ("diagnose", recordings / "healthy_1.nc", "--format", "jsonl")
     assert shell("sealscope", *words) == call(*words)
 
 
@@ -125,6 +125,8 @@ def test_the_false_alarm_probability_sets_the_threshold(call, recordings):
     assert len(set(thresholds)) == 3
 
 
+@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_methods")
 def test_baselines_after_one_flag_or_one_flag_each(call, recordings):
     leak, *healthy = (recordings / name for name in ("leak.nc", "healthy_1.nc", "healthy_2.nc", "healthy_3.nc"))
@@ -227,19 +229,20 @@ def test_foreign_logs_without_times_may_be_of_another_day(call, strokes):
         assert "of which the sessions are not known" in item["reason"]
 
 
-def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path):
+@pytest.mark.parametrize("count", [1, pytest.param(4, marks=[pytest.mark.slow, pytest.mark.long])])
+def test_foreign_logs_with_a_map_and_a_rate(call, strokes, tmp_path, count):
     """Ringing alone proves no leak: oil, load and duty change it more often; what fell is stated."""
     leaking, healthy = in_one_session(strokes, tmp_path)
-    files = leaking + healthy[:4]
+    files = leaking[:count] + healthy[:count]
     done = call("diagnose", *files, "--baseline", *healthy, *FOREIGN, "--format", "jsonl")
     assert (done.status, done.err) == (0, "")
     assert [item["file"] for item in done.objects] == [str(file) for file in files]
     verdicts = [item["verdict"] for item in done.objects]
-    assert verdicts[:4] == ["cannot tell"] * 4 and "leak" not in verdicts[4:]
-    assert all("fall of" in item["reason"] and "or a leak (" in item["reason"] for item in done.objects[:4])
-    for item, count in zip(done.objects, [20] * 4 + [19] * 4, strict=True):
+    assert verdicts[:count] == ["cannot tell"] * count and "leak" not in verdicts[count:]
+    assert all("fall of" in item["reason"] and "or a leak (" in item["reason"] for item in done.objects[:count])
+    for item, others in zip(done.objects, [20] * count + [19] * count, strict=True):
         check_contract(item)
-        assert f"{count} comparable leak-free recordings" in item["reason"]  # of both directions
+        assert f"{others} comparable leak-free recordings" in item["reason"]  # of both directions
 
 
 def test_a_stroke_beside_strokes_of_the_opposite_direction_is_no_leak(call, strokes):
@@ -259,7 +262,11 @@ def test_a_foreign_log_without_a_rate_takes_its_time_column_and_without_a_map_is
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data/real/vtnsi_actuator is absent")
 @pytest.mark.parametrize(
-    "every", [pytest.param(12, marks=pytest.mark.slow), pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])]
+    "every",
+    [
+        pytest.param(24, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
 )
 def test_every_real_stroke_gets_a_verdict(call, every):
     healthy, worn = (sorted((REAL / name).glob("*.txt")) for name in ("act_1_healthy", "act_4_seal_defect"))
@@ -324,6 +331,12 @@ def test_scripts_may_fail_on_a_verdict(call, recordings):
     assert call("diagnose", *files, "--quiet", "--fail-on", "leak").status == 3
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak").status == 0
     assert call("diagnose", files[1], "--quiet", "--fail-on", "leak", "--fail-on", "no leak").status == 3
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("two_methods")
+def test_scripts_may_fail_on_a_level(call, recordings):
+    files = (recordings / "leak.nc", recordings / "healthy_1.nc")
     words = ("--quiet", "--rig", "thesis", "--limit", "0.1 mL/min", "--fail-on")
     for level in ("monitor", "plan", "repair"):  # over the limit: as bad as each or worse
         assert call("diagnose", files[0], *words, level).status == 3

@@ -89,6 +89,8 @@ def result_of(plan: SimulatedPlan, folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in write_result(judge_simulated_campaign(plan, folder), folder)}
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_campaign_goes_on_when_there_is_room_again(plan: SimulatedPlan, tmp_path: Path) -> None:
     assert run(plan, tmp_path / "whole", jobs=1).complete
     expected, refusals = result_of(plan, tmp_path / "whole"), 0
@@ -109,6 +111,8 @@ def test_a_campaign_goes_on_when_there_is_room_again(plan: SimulatedPlan, tmp_pa
     assert {name: (tmp_path / "full" / name).read_bytes() for name in expected} == expected
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_clock_that_runs_backwards_changes_no_byte(
     plan: SimulatedPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,8 @@ from scipy.fft import next_fast_len
 import sealscope as ss
 from sealscope.recordings.quality import fast_length
 
+from ..representatives import OTHERS
+
 HEAVY = {
     "numba",
     "scipy",
@@ -77,11 +79,17 @@ def run_files(tmp_path_factory):
 
 
 #: Commands that load what another one here loads, and little else: they are slow.
-SIMILAR = ("convert run.csv run2.nc", "trend . --every 1d", "report run.nc -o page.html")
+SIMILAR = ("inspect run.nc", "trend . --every 1d")
+#: ... and by hand alone.
+ALIKE = ("parameters", "convert run.csv run2.nc", "report run.nc -o page.html")
 
 
 @pytest.mark.parametrize(
-    "command", [pytest.param(words, marks=pytest.mark.slow if words in SIMILAR else ()) for words in BUDGETS]
+    "command",
+    [
+        pytest.param(words, marks=OTHERS if words in ALIKE else pytest.mark.slow if words in SIMILAR else ())
+        for words in BUDGETS
+    ],
 )
 def test_a_command_loads_what_it_needs(shell, run_files, command):
     budget, needless = BUDGETS[command]

@@ -47,6 +47,7 @@ def test_diagnose_goes_on_after_a_defect(batch, call, monkeypatch):
     assert "must be whole" in second
 
 
+@pytest.mark.slow
 def test_diagnose_goes_on_after_a_workbook_that_ends_its_reader(batch, call):
     pytest.importorskip("python_calamine")
     workbook(batch / "corner.xlsx", [rows([("A1", 1), ("XFD1048576", 2)])])

@@ -155,6 +155,7 @@ def test_the_shell_s_script_calls_the_command_back(call, monkeypatch):
     assert re.search(r"^complete .* sealscope$", done.out, re.MULTILINE)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_bash_completes_with_the_script_that_is_shown(shell, tmp_path):
     """As a person presses Tab: bash evaluates what `--show-completion` prints, and calls the function it registers."""

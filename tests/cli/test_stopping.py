@@ -10,6 +10,8 @@ import time
 
 import pytest
 
+from ..representatives import few
+
 
 def interrupt(*_, **__):
     raise KeyboardInterrupt
@@ -63,6 +65,7 @@ def test_a_real_interrupt_of_a_long_simulation(untouched, surroundings):
     assert (child.returncode, err.removeprefix("\n")) == (130, "sealscope: interrupted\n")
 
 
+@pytest.mark.slow
 def test_an_interrupt_within_a_finalizer_is_not_lost(untouched, surroundings):
     """Python prints and ignores what a finalizer raises: the run went on for its hour, and ended with status 0."""
     tell = (
@@ -96,7 +99,7 @@ SEALSCOPE = '"$PYTHON" -m sealscope'
 
 @pytest.mark.parametrize(
     ("words", "reader"),
-    [("parameters", "true"), ("parameters --format csv", "head -1"), ("--version", "true")],
+    few([("parameters", "true"), ("parameters --format csv", "head -1"), ("--version", "true")], 1),
 )
 def test_a_reader_that_goes_away_is_no_error(shell, words, reader):
     done = shell("bash", "-c", f"{SEALSCOPE} {words} | {reader}")
@@ -105,7 +108,7 @@ def test_a_reader_that_goes_away_is_no_error(shell, words, reader):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")  # noqa: PTH110
-@pytest.mark.parametrize("words", ["parameters --format csv", "--version"])
+@pytest.mark.parametrize("words", few(["parameters --format csv", "--version"], 1))
 def test_a_full_disk_behind_the_output_is_one_line(shell, words):
     done = shell("bash", "-c", f"{SEALSCOPE} {words} > /dev/full")
     assert "No space left on device" in done.refused(1)

@@ -47,11 +47,14 @@ def test_json_and_csv_hold_every_recording(call, days: Path, tmp_path: Path) -> 
     assert float(rows[-1]["level [L/min]"]) == tree["points"][-1]["value"]
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_the_order_of_files_does_not_matter(call, days: Path) -> None:
     files = [days / f"day_{k}.nc" for k in (3, 1, 2, 8, 7, 5, 6, 4)]
     assert call("trend", *files).out == call("trend", days).out
 
 
+@pytest.mark.slow
 def test_what_sealscope_wrote_into_the_folder_is_skipped_and_dates_are_enough(call, days: Path, tmp_path: Path) -> None:
     for k in range(1, DAYS + 1):
         own = replace(ss.read(days / f"day_{k}.nc"), provenance={})
@@ -107,6 +110,7 @@ def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path)
     assert call("diagnose", *files, "--quiet").err == ""
 
 
+@pytest.mark.slow
 def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path) -> None:
     file, first = tmp_path / "press.toml", [days / f"day_{k}.nc" for k in (1, 2, 3)]
     assert call("commission", *first, "-o", file, "--rig", "thesis", "--limit", "3 mL/min").status == 0
@@ -131,6 +135,8 @@ def test_cells_of_strangers_are_no_formulas_and_command_no_terminal(call, days: 
     assert "\x1b" not in text
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_link_out_of_a_folder_is_left_out(call, days: Path, tmp_path: Path, caplog) -> None:
     """What lies elsewhere on the machine is read where it is named, and shows in no text otherwise."""
     folder, secret = tmp_path / "logs", tmp_path / "secret"

@@ -16,6 +16,8 @@ CALLS = [
     "rigs new press --area-A 500 --area-B 400 --stroke 300 --displacement 6", "plugin new stroke",
     "simulate -o run.nc --duration 20 --leak 0.01[L/min] --fault", "campaign status bench-thesis",
 ]  # fmt: skip
+#: Calls that simulate, judge or draw more than one recording.
+LONG = (CALLS[4], CALLS[7], CALLS[9], CALLS[10])
 
 
 @pytest.fixture
@@ -36,7 +38,10 @@ def widest(text: str) -> str:
 
 
 @pytest.mark.usefixtures("folder", "verbose")
-@pytest.mark.parametrize("words", CALLS)
+@pytest.mark.parametrize(
+    "words",
+    [pytest.param(words, marks=[pytest.mark.slow, pytest.mark.long]) if words in LONG else words for words in CALLS],
+)
 def test_what_is_printed_fits_a_terminal(words: str, call) -> None:
     faults = ["sensor p_A offset 2 psi from 10 s"] if words.endswith("--fault") else []
     done = call(*words.split(), *faults)
@@ -45,6 +50,8 @@ def test_what_is_printed_fits_a_terminal(words: str, call) -> None:
     assert len(widest(done.out)) <= 80, widest(done.out)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_folder_beside_its_machine_fits_a_terminal(folder: Path, call) -> None:
     call("commission", *(f"healthy_{k}.nc" for k in (1, 2, 3)), "-o", "m.toml", "--rig", "thesis")
     (folder / "days" / "press_2024-05-04.nc").rename(folder / "days" / "press_7_of_hall_3_2024-05-04_10-15.nc")

@@ -58,7 +58,7 @@ def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
     np.testing.assert_allclose(m.k_p * (omega_d - omega) + m.K_i * integral, needed, rtol=2e-3)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [pytest.param(1.0, marks=[pytest.mark.slow, pytest.mark.long]), -1.0])
 def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     balance = FaultTolerant.from_rig(RIG).balance
     (observer,), rate, G = make_observer(balance, 500.0), 500.0, 3e-13

@@ -49,6 +49,8 @@ class Late:
         return self.inner.start()
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_delay_within_the_margin_takes_its_share_of_the_phase():
     m = margins(RIG, PI)
     samples = 10

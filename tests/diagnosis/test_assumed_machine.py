@@ -44,6 +44,8 @@ def flow(recording: Recording, share: float = 1.0) -> float:
     return share * LEAK * float(np.mean(np.abs(recording["p_A"] - recording["p_B"])[recording.t > 60.0])) * LPM
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(foreign: Recording) -> None:
     """Displacement, area and leak five times as large: 0.021 L/min was stated as 0.0043."""
     result = diagnose(foreign)

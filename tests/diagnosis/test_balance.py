@@ -171,6 +171,8 @@ def test_the_score_grows_with_the_leak() -> None:
     assert scores[0] < 12.0 < scores[2]
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_longer_recordings_never_widen_the_interval() -> None:
     deviations = []
     for duration in (20.0, 40.0, 80.0, 160.0):

@@ -33,14 +33,15 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
         assert says(result.reason, "bound.against", count=count)
 
 
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 7])
+@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
 def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(4)]
     assert "leak" not in [one.verdict for one in result]
     assert all(says(one.reason, "bound.ringing") for one in result)
 
 
-@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 4])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.long), 4])
 def test_more_noise_than_in_the_baseline_is_no_leak(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     alarms = 0
     for seed in range(6):

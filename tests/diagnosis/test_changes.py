@@ -16,6 +16,8 @@ from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
 
+from ..representatives import few
+
 RATE, SECONDS = 200.0, 120.0
 CHANCE = 0.01
 T = np.arange(round(RATE * SECONDS)) / RATE
@@ -149,12 +151,14 @@ def test_swapped_sensors_are_a_sensor_fault() -> None:
 
 @pytest.mark.parametrize(
     ("fault", "cause"),
-    [
-        ("friction +20 % from 60 s", "friction change"),
-        ("sensor p_A offset 5 psi from 60 s", "sensor fault"),
-        ("sensor p_A gain 2 % from 60 s", "sensor fault"),
-        ("duty amplitude x1.1 from 60 s", "changed duty"),
-    ],
+    few(
+        [
+            ("friction +20 % from 60 s", "friction change"),
+            ("sensor p_A offset 5 psi from 60 s", "sensor fault"),
+            ("sensor p_A gain 2 % from 60 s", "sensor fault"),
+            ("duty amplitude x1.1 from 60 s", "changed duty"),
+        ]
+    ),
 )
 def test_faults_of_the_simulated_rig(fault: str, cause: str) -> None:
     event = other_event(simulate(command="3 sin(4t)", fault=fault, duration="120 s", seed=1))
@@ -162,13 +166,18 @@ def test_faults_of_the_simulated_rig(fault: str, cause: str) -> None:
     assert (event.cause, round(onset_of(event) / 10.0)) == (cause, 6)
 
 
-@pytest.mark.parametrize("leak", [(), "0.0042 L/min from 60 s", "0.02 L/min from 60 s"])
+@pytest.mark.parametrize(
+    "leak",
+    [(), pytest.param("0.0042 L/min from 60 s", marks=[pytest.mark.slow, pytest.mark.long]), "0.02 L/min from 60 s"],
+)
 def test_a_leak_moves_none_of_them(leak: str) -> None:
     recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
     assert other_event(recording) is None
 
 
-@pytest.mark.parametrize("leak", ["0.1 L/min from 60 s", "0.5 L/min from 60 s"])
+@pytest.mark.parametrize(
+    "leak", [pytest.param("0.1 L/min from 60 s", marks=[pytest.mark.slow, pytest.mark.long]), "0.5 L/min from 60 s"]
+)
 def test_a_large_leak_slows_the_piston_and_is_a_leak(leak: str) -> None:
     recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1)
     assert min(observable.chance for observable in observe_signals(recording).observables) < CHANCE

@@ -101,7 +101,9 @@ def every_detector(monkeypatch: pytest.MonkeyPatch) -> None:
 #: Detectors that only say whether something changed, and not when.
 UNDATED = ("ringing energy",)
 #: What is examined by the slow tests only: a recording, and whether beside a baseline.
-OTHER_CASES = (("healthy", False), ("leaky", True))
+OTHER_CASES = (("healthy", False), ("healthy", True))
+#: ... and by hand alone.
+ALIKE_CASES = (("leaky", True),)
 #: Detectors to which the size of a pressure means something.
 PHYSICAL = ("volume balance", "pressure response")
 COURSE = ("t", "lpm", "low", "high")
@@ -183,7 +185,7 @@ def test_deterministic(detector, leaky: Recording) -> None:  # type: ignore[no-u
     assert alike(first_examined(detector, leaky), examined(detector, leaky))
 
 
-@pytest.mark.parametrize("case", ["leaky", pytest.param("healthy", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", ["leaky", pytest.param("healthy", marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
 def test_neither_unit_nor_zero_matters(  # type: ignore[no-untyped-def]
     detector, factor: float, offset: float, case: str, request: pytest.FixtureRequest
@@ -226,7 +228,13 @@ def test_onset_is_on_the_recordings_own_clock(detector, leaky: Recording) -> Non
     assert later.onset_interval_s == pytest.approx([one + 1000.0 for one in here.onset_interval_s], abs=1e-6)
 
 
-@pytest.mark.parametrize("names", [["x"], ["x", "theta", "omega", "p_1", "p_2"]])
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(["x"], marks=[pytest.mark.slow, pytest.mark.long]),
+        ["x", "theta", "omega", "p_1", "p_2"],
+    ],
+)
 def test_holes_in_other_channels_are_no_fault(detector, names: list[str], leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     """Only the pressures and the command are promised to be whole."""
     holes = np.arange(len(leaky)) % 7919 == 100
@@ -266,7 +274,11 @@ def test_noise_alone_never_is_a_leak(leaky: Recording) -> None:
 
 @pytest.mark.parametrize(
     ("case", "with_baseline"),
-    [("leaky", False), ("healthy", True), *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHER_CASES)],
+    [
+        ("leaky", False),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHER_CASES),
+        *(pytest.param(*each, marks=[pytest.mark.slow, pytest.mark.long]) for each in ALIKE_CASES),
+    ],
 )
 def test_the_chance_agrees_with_score_and_threshold(
     detector,  # type: ignore[no-untyped-def]

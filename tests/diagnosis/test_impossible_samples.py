@@ -11,6 +11,8 @@ import pytest
 import sealscope as ss
 from sealscope.recordings import Recording
 
+from ..representatives import few
+
 
 @pytest.fixture(scope="module")
 def leaking() -> Recording:
@@ -19,7 +21,10 @@ def leaking() -> Recording:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("p_A", 1e308), ("p_A", -1e150), ("p_A", 1e30), ("x", 1e308), ("omega", -1e150), ("theta", 1e30), ("u", 1e308)],
+    few(
+        [("p_A", 1e308), ("x", -1e150), ("u", 1e30), ("x", 1e308), ("p_A", -1e150), ("omega", -1e150), ("theta", 1e30)],
+        3,
+    ),
 )
 def test_a_sample_that_no_sensor_reads_is_missing(leaking, name, value, capfd):
     channels = {key: values.copy() for key, values in leaking.channels.items()}
@@ -31,7 +36,7 @@ def test_a_sample_that_no_sensor_reads_is_missing(leaking, name, value, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("name", ["x", "omega", "theta"])
+@pytest.mark.parametrize("name", few(["x", "omega", "theta"], 1))
 def test_a_channel_without_values_is_none(leaking, name, capfd):
     channels = {**leaking.channels, name: np.full(len(leaking), np.nan)}
     with warnings.catch_warnings():

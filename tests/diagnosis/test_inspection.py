@@ -70,7 +70,16 @@ def test_of_copies_the_one_with_the_most_channels_is_kept(healthy: list[Recordin
 
 
 @pytest.mark.usefixtures("two_methods")
-@pytest.mark.parametrize("fault", ["stuck", "clipped", "constant", "too short"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "stuck",
+        *(
+            pytest.param(fault, marks=[pytest.mark.slow, pytest.mark.long])
+            for fault in ("clipped", "constant", "too short")
+        ),
+    ],
+)
 def test_a_baseline_with_a_fault_is_left_out_for_every_detector(fault: str, healthy: list[Recording]) -> None:
     recording, leak_free, other = healthy
     p_A, p_B = np.array(other["p_A"]), np.array(other["p_B"])

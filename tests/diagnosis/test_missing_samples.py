@@ -82,7 +82,7 @@ MOTIONS = {
 }
 
 
-@pytest.mark.parametrize("gaps", MOTIONS)
+@pytest.mark.parametrize("gaps", ["samples here and there", pytest.param("a slower encoder", marks=pytest.mark.slow)])
 def test_a_motion_with_short_gaps_is_that_of_a_mass(gaps: str, late_leak: Recording, healthy: Recording) -> None:
     """A position on every fifth row ended in an error of linear algebra, single samples in `cannot tell`."""
     whole, missing = diagnose(late_leak), diagnose(MOTIONS[gaps](late_leak))
@@ -157,7 +157,14 @@ def test_a_poll_with_holes_gives_the_same_leak(late_leak: Recording, polled_leak
     assert rows.mean() > 0.94 * rows.max()
 
 
-@pytest.mark.parametrize(("name", "every"), [("x", 50), ("p_A", 15), pytest.param("p_B", 50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "every"),
+    [
+        ("x", 50),
+        pytest.param("p_A", 15, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param("p_B", 50, marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
+)
 def test_a_channel_that_repeats_its_samples_gives_the_same_leak(late_leak: Recording, name: str, every: int) -> None:
     """Samples held for 0.03 or 0.1 s: the mean delay of x was 50 ms."""
     held = late_leak[name][np.arange(len(late_leak)) // every * every]

@@ -210,7 +210,9 @@ def coverage(random: np.random.Generator, count: int, walk: float, size: float, 
 
 
 @pytest.mark.parametrize(("count", "walk"), [(10, 0.0), (25, 0.0), (25, 3.0), (60, 1.0)])
-@pytest.mark.parametrize("size", [1.0, 3.0, 8.0])
+@pytest.mark.parametrize(
+    "size", [*(pytest.param(size, marks=[pytest.mark.slow, pytest.mark.long]) for size in (1.0, 8.0)), 3.0]
+)
 def test_onset_interval_and_bound_hold(count: int, walk: float, size: float) -> None:
     draws = 60
     held, bounded = coverage(np.random.default_rng(count), count, walk, size, draws)
@@ -242,7 +244,7 @@ def test_too_few_blocks_have_no_test() -> None:
     assert step_test(silent._replace(precision=0.0 * silent.precision, vector=0.0 * silent.vector)) is None
 
 
-@pytest.mark.parametrize("walk", [0.0, 1.0])
+@pytest.mark.parametrize("walk", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_what_is_believed_of_slope_and_walk_keeps_the_false_alarms_and_finds_more(walk: float) -> None:
     """A slope that is believed is nearly known: a step is found that a free slope would pass for."""
     count, draws = 30, 200

@@ -28,7 +28,7 @@ def leaking(lpm: float, command: str) -> Recording:
 
 
 #: How long a detector's turn takes, where it is not slow.
-MARKS = {"volume balance": (), "pressure response": (pytest.mark.slow, pytest.mark.long)}
+MARKS = {"rms change": (), "pressure response": (pytest.mark.slow, pytest.mark.long)}
 
 
 @pytest.mark.parametrize(

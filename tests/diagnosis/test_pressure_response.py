@@ -30,10 +30,10 @@ def recorded(**values: object) -> ss.Recording:
 @pytest.mark.parametrize(
     ("fault", "cause"),
     [
-        ("friction +20 %", "friction change"),
-        ("air 1 %", "air in the oil"),
+        pytest.param("friction +20 %", "friction change", marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param("air 1 %", "air in the oil", marks=pytest.mark.slow),
         ("sensor p_A offset 5 psi", "sensor fault"),
-        pytest.param("sensor p_B gain 2 %", "sensor fault", marks=pytest.mark.slow),
+        pytest.param("sensor p_B gain 2 %", "sensor fault", marks=[pytest.mark.slow, pytest.mark.long]),
     ],
 )
 def test_what_else_steps_is_named_and_is_no_leak(fault: str, cause: str) -> None:
@@ -42,6 +42,8 @@ def test_what_else_steps_is_named_and_is_no_leak(fault: str, cause: str) -> None
     assert evidence.cause == cause
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_the_score_grows_with_the_leak_and_without_one_there_is_a_bound() -> None:
     healthy_run = examined()
     assert healthy_run.verdict == "no leak"
@@ -52,6 +54,7 @@ def test_the_score_grows_with_the_leak_and_without_one_there_is_a_bound() -> Non
     assert healthy_run.bound_lpm < 0.02
 
 
+@pytest.mark.slow
 def test_a_leak_from_the_first_sample_is_above_the_baseline_only() -> None:
     healthy = [recorded(seed=seed) for seed in (11, 12, 13)]
     assert examined(leak="0.05 L/min").verdict == "no leak"  # no change within the recording

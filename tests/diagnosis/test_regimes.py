@@ -116,6 +116,7 @@ def test_a_machine_that_is_switched_on_does_not_leak_from_then_on() -> None:
         assert leaking.onset().low < 60.0 < leaking.onset().high
 
 
+@pytest.mark.slow
 def test_healthy_recordings_tell_which_it_is_for_a_leaking_one() -> None:
     detector = VolumeBalance(RIG)
     odds = sum(summary["shut_odds"] for summary in summaries())

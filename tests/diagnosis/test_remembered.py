@@ -97,6 +97,7 @@ def test_nothing_is_kept_of_a_recording_that_is_gone() -> None:
     assert [reference() for reference in held] == [None, None]
 
 
+@pytest.mark.slow
 def test_a_baseline_is_followed_once_for_many_files(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = load_rig("thesis")
     baseline = [simulate(command="7 sin(4t)", duration=20.0, seed=seed) for seed in (1, 2)]

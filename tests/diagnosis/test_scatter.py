@@ -22,6 +22,8 @@ from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
 
+from ..representatives import few
+
 PRESSURE, FLOW = 1e5, 1e-5
 #: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
 PRIORS = INFERENCE.scatter.leak * FLOW / PRESSURE
@@ -96,7 +98,11 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
 
 @pytest.mark.parametrize("draws", [16, pytest.param(100, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize(
-    "days", [(1, 1, 1, 2), pytest.param((1, 1, 2, 2, 3, 3, 3, 4), marks=pytest.mark.slow), (1, 1, 2, 2, 2, 2)]
+    "days",
+    [
+        (1, 1, 1, 2),
+        *(pytest.param(days, marks=pytest.mark.slow) for days in ((1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2))),
+    ],
 )
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
@@ -141,7 +147,7 @@ def test_days_that_are_known_narrow_what_another_day_may_be() -> None:
     random = np.random.default_rng(4)
 
     def deviation(days: int) -> float:
-        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(5)]
+        made = [fleet(random, [*np.repeat(range(days), 2), days], 0.01, PRIORS) for _ in range(3)]
         return float(np.median([rise(judged, healthy, (COLUMNS,)).deviation for *healthy, judged in made]))
 
     assert deviation(1) > 1.5 * deviation(6) > 1.5 * deviation(30)
@@ -154,7 +160,9 @@ def believed_scatter(random: np.random.Generator) -> float:
     return float(np.exp(random.uniform(*ends)))
 
 
-@pytest.mark.parametrize("count", [1, *(pytest.param(count, marks=pytest.mark.slow) for count in (2, 3)), 6])
+@pytest.mark.parametrize(
+    "count", [1, pytest.param(3, marks=[pytest.mark.slow, pytest.mark.long]), pytest.param(6, marks=pytest.mark.slow)]
+)
 def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) -> None:
     random = np.random.default_rng(count)
     made = [risen(random, count, believed_scatter(random)) for _ in range(80)]
@@ -165,7 +173,13 @@ def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "count", [1, pytest.param(2, marks=pytest.mark.long), 3, 6, pytest.param(12, marks=pytest.mark.long)]
+    "count",
+    [
+        1,
+        *(pytest.param(count, marks=pytest.mark.long) for count in (2, 3)),
+        6,
+        pytest.param(12, marks=pytest.mark.long),
+    ],
 )
 @pytest.mark.parametrize("scatter", [pytest.param(0.2, marks=pytest.mark.long), 1.0, 6.0])
 def test_level_at_a_scatter_that_was_not_expected(count: int, scatter: float) -> None:
@@ -206,10 +220,11 @@ def machine(random: np.random.Generator, count: int, differs: float) -> Rise:
     return beyond(day(), [day() for _ in range(count)])
 
 
-def test_a_machine_that_repeats_itself_is_judged_closer_and_another_not_falsely() -> None:
+@pytest.mark.parametrize("draws", [12, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.long])])
+def test_a_machine_that_repeats_itself_is_judged_closer_and_another_not_falsely(draws: int) -> None:
     random = np.random.default_rng(7)
     believed = COLUMNS.between_deviation[0]
-    same, usual, other = ([machine(random, 8, share * believed) for _ in range(60)] for share in (1e-3, 1.0, 10.0))
+    same, usual, other = ([machine(random, 8, share * believed) for _ in range(draws)] for share in (1e-3, 1.0, 10.0))
     closer, wider = (float(np.median([own.deviation for own in made])) for made in (same, other))
     assert closer < 0.5 * wider
     for made in (same, usual, other):
@@ -256,7 +271,7 @@ def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> Non
     assert 0.0 <= made.chance <= 1.0 and made.threshold(0.01) > 0.0
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", few(range(4), 1))
 def test_what_others_let_expect_is_that_of_dense_algebra(seed: int) -> None:
     """A Gaussian process of an unknown mean, written out, integrated over sigma on a fine grid."""
     random = np.random.default_rng(seed)
@@ -335,7 +350,7 @@ def warm_days(random: np.random.Generator, slope: float, judged: float, logged: 
 
 
 @pytest.mark.parametrize("draws", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])])
-@pytest.mark.parametrize("logged", [True, False])
+@pytest.mark.parametrize("logged", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool, draws: int) -> None:
     random = np.random.default_rng(9)
     for judged in (60.0, 70.0):
@@ -365,17 +380,18 @@ def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: 
     return rise(judged, healthy, (COLUMNS,))
 
 
-def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_logged() -> None:
+@pytest.mark.parametrize("draws", [2, pytest.param(9, marks=[pytest.mark.slow, pytest.mark.long])])
+def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_logged(draws: int) -> None:
     random, leak = np.random.default_rng(12), 20.0 * PRIORS
     precise, vague, useless = (
-        [oily_days(random, 0.0, error, shows=shows) for _ in range(9)]
+        [oily_days(random, 0.0, error, shows=shows) for _ in range(draws)]
         for error, shows in ((0.02, True), (1.0, True), (0.02, False))
     )
     assert np.median([own.chance for own in precise]) > 0.1
     assert np.median([own.deviation for own in precise]) < 0.5 * np.median([own.deviation for own in vague])
     assert sum(own.chance < 0.0075 for own in (*vague, *useless)) <= 1
     found, doubted = (
-        np.median([oily_days(random, leak, error, shows=True).chance for _ in range(9)]) for error in (0.02, 1.0)
+        np.median([oily_days(random, leak, error, shows=True).chance for _ in range(draws)]) for error in (0.02, 1.0)
     )
     assert found < 0.01 and found < 0.2 * doubted
 

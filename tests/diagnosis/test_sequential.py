@@ -55,6 +55,7 @@ def test_the_verdict_of_a_stream_is_decided_as_that_of_a_recording():
     assert (evidence.onset_s, evidence.onset_interval_s) == (leak.onset_s, leak.onset_interval_s)
 
 
+@pytest.mark.slow
 def test_a_rise_that_nothing_explains_yet_scores_below_the_threshold(monkeypatch):
     monkeypatch.setattr("sealscope.diagnosis.live.watch.explain_rise", lambda *arguments: UNKNOWN)
     watch = Watch(RIG, 1000.0, 1000.0)
@@ -93,7 +94,14 @@ def run_length(values: np.ndarray, threshold: float, stated: float = 1.0) -> int
     return None
 
 
-@pytest.mark.parametrize("q", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize(
+    "q",
+    [
+        pytest.param(0.0, marks=[pytest.mark.slow, pytest.mark.long]),
+        pytest.param(0.01, marks=[pytest.mark.slow, pytest.mark.long]),
+        1.0,
+    ],
+)
 def test_false_alarms_are_as_rare_as_stated(q: float):
     """Whatever noise and walk are: at 1/alpha = 200 blocks under 1 in 200 of 12 x 250 blocks, by its own account."""
     random = np.random.default_rng(5)

@@ -57,7 +57,7 @@ def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-unty
 
 
 @few_and_all(3, 8)
-@pytest.mark.parametrize("throttled", [False, True])
+@pytest.mark.parametrize("throttled", [pytest.param(False, marks=[pytest.mark.slow, pytest.mark.long]), True])
 def test_without_a_leak_there_is_none(throttled: bool, count: int, records) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, throttled=throttled)) for seed in range(count)]
     assert "leak" not in [one.verdict for one in result]
@@ -114,7 +114,14 @@ def test_a_duty_without_cycle_is_judged_too(records) -> None:  # type: ignore[no
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate, samples", [(10.0, 6000), (20.0, 8000), (50.0, 9000), (500.0, 45000)])
+@pytest.mark.parametrize(
+    "rate, samples",
+    [
+        (10.0, 6000),
+        *(pytest.param(*each, marks=pytest.mark.long) for each in ((20.0, 8000), (50.0, 9000))),
+        (500.0, 45000),
+    ],
+)
 def test_white_noise_alarms_as_seldom_as_stated_at_any_rate(rate: float, samples: int, noise_record) -> None:  # type: ignore[no-untyped-def]
     alarms = sum(
         diagnose(noise_record(seed, samples, rate), false_alarm_probability=0.05).verdict == "leak"

@@ -63,6 +63,7 @@ def test_a_leak_from_the_first_sample_is_stated(law: str) -> None:
         assert np.mean((evidence.course.low <= true) & (true <= evidence.course.high)) > 0.9
 
 
+@pytest.mark.slow
 def test_the_smallest_step_is_found_and_half_of_it_is_not() -> None:
     detector = VolumeBalance(rig(None))
     for seed in (1, 2, 3):

@@ -95,8 +95,9 @@ def test_without_the_temperature_the_summer_looks_like_wear(readings: list[LeakR
     assert trend_of(healthy, healthy=5).verdict == "leak"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real strokes are not beside this checkout")
-@pytest.mark.parametrize("session", [pytest.param("act_1_healthy", marks=pytest.mark.slow), "act_4_seal_defect"])
+@pytest.mark.parametrize("session", [pytest.param("act_1_healthy", marks=pytest.mark.long), "act_4_seal_defect"])
 def test_real_strokes_of_a_specimen_raise_no_alarm(session: str) -> None:
     """Thirty strokes in seven minutes: counts and no command, so the ringing alone, which never says `leak`."""
     files = sorted((REAL / session).glob("*.txt"))

@@ -41,6 +41,7 @@ def test_the_ratio_of_two_drops_is_theirs() -> None:
     assert thick_error < thin_error < 0.1
 
 
+@pytest.mark.slow
 def test_its_standard_error_is_the_scatter_of_records() -> None:
     estimates = np.array([log_drop(record(seed=seed)) for seed in range(30)])
     assert 0.6 < estimates[:, 0].std() / np.median(estimates[:, 1]) < 1.6

@@ -15,6 +15,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.simulate import simulate_experiment
 
+from ..representatives import few
 from .balance_machine import irregular, machine, step
 from .judging import judge
 
@@ -80,7 +81,7 @@ SIGNS: dict[str, Callable[[Recording], Recording]] = {
 }
 
 
-@pytest.mark.parametrize("turned", SIGNS)
+@pytest.mark.parametrize("turned", few(SIGNS))
 def test_no_sign_convention_is_assumed(detector: VolumeBalance, worn: Recording, turned: str) -> None:
     plain, other = judge(detector, worn), judge(detector, SIGNS[turned](worn))
     assert other.verdict == "leak"
@@ -88,6 +89,8 @@ def test_no_sign_convention_is_assumed(detector: VolumeBalance, worn: Recording,
     assert other.leak_lpm == pytest.approx(plain.leak_lpm, rel=0.02)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_duties_that_do_not_repeat_and_loads(detector: VolumeBalance) -> None:
     def push(t: np.ndarray) -> np.ndarray:
         return 8.0e4 + 4.0e4 * np.sin(0.7 * t)
@@ -178,7 +181,7 @@ MENDED: dict[str, Callable[[Recording], Recording]] = {
 }
 
 
-@pytest.mark.parametrize("trouble", MENDED)
+@pytest.mark.parametrize("trouble", few(MENDED))
 def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, tight: Recording, trouble: str) -> None:
     result = judge(detector, MENDED[trouble](worn))
     assert result.verdict == "leak"
@@ -187,7 +190,13 @@ def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, ti
     assert judge(detector, MENDED[trouble](tight)).verdict == "no leak"
 
 
-@pytest.mark.parametrize("factor, offset", [(3.0, 0.0), (1.0, 1.0e5), (1.0 / 6894.757, -50.0)])
+@pytest.mark.parametrize(
+    "factor, offset",
+    [
+        (1.0 / 6894.757, -50.0),
+        *(pytest.param(*each, marks=[pytest.mark.slow, pytest.mark.long]) for each in ((3.0, 0.0), (1.0, 1.0e5))),
+    ],
+)
 def test_neither_unit_nor_zero_of_the_pressures_matters(
     detector: VolumeBalance, worn: Recording, factor: float, offset: float
 ) -> None:
@@ -221,6 +230,7 @@ def test_on_the_simulated_rig(detector: VolumeBalance, leaky: Recording, healthy
     assert judge(detector, healthy).verdict == "no leak"
 
 
+@pytest.mark.slow
 def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:
     """6 % of the flow at the judged duty's speed, more than the healthy duties lost: it hid 0.03 L/min."""
     rig = load_rig("thesis")
@@ -242,7 +252,8 @@ def test_what_a_pump_loses_over_speed_is_no_leak_and_hides_none() -> None:
     assert low < 0.03 < high
 
 
-@pytest.mark.parametrize("side", ["A", pytest.param("B", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("side", ["A", pytest.param("B", marks=pytest.mark.long)])
 def test_a_rod_seal_of_either_side_is_no_piston_leak_where_check_valves_make_up(side: str) -> None:
     fault = f"rod seal {side} 0.05 L/min from 20 s"
     recording = ss.simulate(rig="thesis-closed-loop", command="3 sin(4t)", duration="40 s", seed=1, fault=fault)

@@ -114,8 +114,9 @@ def test_an_open_loop_delivers_nothing_of_what_leaks() -> None:
         assert (evidence.verdict, evidence.bound_lpm) == ("cannot tell", None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "channels", [("u", "p_A", "p_B"), pytest.param(("omega", "p_A", "p_B"), marks=pytest.mark.slow)]
+    "channels", [("u", "p_A", "p_B"), pytest.param(("omega", "p_A", "p_B"), marks=[pytest.mark.slow, pytest.mark.long])]
 )
 @pytest.mark.parametrize(
     ("rig", "command", "load", "leak"),

@@ -74,6 +74,7 @@ def test_the_bound_is_that_of_the_band_on_many_records():
     assert low[0] == pytest.approx(0.9, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_bound_covers():
     """a90 of the truth is 0.003 * 3 = 0.009; 95 % bounds lie above it in about 95 % of the campaigns."""
     above = sum(fit_hit_miss(*drawn(seed, n=25)).a90_95 >= 0.009 for seed in range(200))

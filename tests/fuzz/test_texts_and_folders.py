@@ -12,15 +12,15 @@ from .runs import MOST_MEMORY, attack, peak_memory
 from .targets import TARGETS
 
 FEW = {
-    "options": 300,
-    "rigs": 60,
-    "machines": 40,
-    "profiles": 120,
+    "options": 150,
+    "rigs": 30,
+    "machines": 20,
+    "profiles": 60,
     "plans": 60,
     "campaign folders": 8,
-    "kept files": 60,
+    "kept files": 30,
 }
-FEW |= {"machines": 12, "monitor messages": 200, "CBOR messages": 1500, "Sparkplug messages": 300}
+FEW |= {"machines": 6, "monitor messages": 100, "CBOR messages": 700, "Sparkplug messages": 150}
 MANY = {
     "options": 6000,
     "rigs": 2000,

@@ -70,6 +70,7 @@ def test_fifteen_seconds_of_a_simulated_machine_are_no_leak(names: tuple[str, ..
         assert ss.diagnose(lost).verdict != "leak"
 
 
+@pytest.mark.slow
 def test_a_recording_and_a_stream_miss_the_same_samples():
     recording = dropped(machine(3, duration=240.0, rate=200.0).only(VOLUMES), 100.0, 40.0)
     missing = np.isnan(remove_dropouts(recording)["p_A"])

@@ -125,7 +125,9 @@ def test_a_page_with_a_token_answers_guesses_later(service: Service, tmp_path: P
     assert page.get("/metrics", headers=right).status_code == 200
 
 
-@pytest.mark.parametrize("proxies", [[], ["192.0.2.1"], ["127.0.0.1"]])
+@pytest.mark.parametrize(
+    "proxies", [pytest.param([], marks=[pytest.mark.slow, pytest.mark.long]), ["192.0.2.1"], ["127.0.0.1"]]
+)
 def test_who_asks_is_who_connects_unless_a_proxy_is_named(service: Service, tmp_path: Path, monkeypatch, proxies):
     """300 guesses, each for another address: looked at are five, or all where the settings believe this machine."""
     monkeypatch.setattr("sealscope.monitor.page.guard._FIRST_PAUSE_S", 50.0)

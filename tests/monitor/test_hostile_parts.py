@@ -273,7 +273,15 @@ def watched(tmp_path: Path) -> Iterator[Service]:
 
 
 @pytest.mark.parametrize(
-    "answer", [b"SSH-2.0-x\r\n", b"", b"\xff\x00" * 9, b"HTTP/1.1 2x4 ?\r\n\r\n", b"HTTP/1.1 200\r\n" * 500]
+    "answer",
+    [
+        b"SSH-2.0-x\r\n",
+        *(
+            pytest.param(answer, marks=[pytest.mark.slow, pytest.mark.long])
+            for answer in (b"", b"\xff\x00" * 9, b"HTTP/1.1 2x4 ?\r\n\r\n")
+        ),
+        b"HTTP/1.1 200\r\n" * 500,
+    ],
 )
 def test_a_webhook_that_speaks_no_http_is_an_outage_and_asked_again(watched: Service, answer):
     server = OddServer((answer, 0.0))
@@ -317,7 +325,7 @@ def opened(kind: str) -> io.TextIOWrapper:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-@pytest.mark.parametrize("kind", ["full", "closed"])
+@pytest.mark.parametrize("kind", ["full", pytest.param("closed", marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_standard_output_that_takes_nothing_ends_nothing(tmp_path: Path, kind, caplog):
     settings = settings_in(tmp_path)
     with suppress(OSError), opened(kind) as out:

@@ -174,6 +174,7 @@ def _eventually(true: Callable[[], bool], seconds: float) -> bool:
     return true()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
 def test_hostile_messages_are_counted_and_change_no_row(tmp_path: Path):
     flooded(tmp_path, 450, 2)

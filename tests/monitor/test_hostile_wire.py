@@ -142,7 +142,12 @@ def test_a_block_beyond_floating_point_says_nothing(wrong: dict[str, float]):
 
 
 @pytest.mark.parametrize(
-    "factor", [pytest.param(0.0, marks=pytest.mark.slow), 1e-308, pytest.param(1e150, marks=pytest.mark.slow), 1e300]
+    "factor",
+    [
+        pytest.param(0.0, marks=pytest.mark.slow),
+        *(pytest.param(factor, marks=[pytest.mark.slow, pytest.mark.long]) for factor in (1e-308, 1e150)),
+        1e300,
+    ],
 )
 @pytest.mark.parametrize("names", [("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "u")], ids=["volumes", "pressures"])
 def test_what_is_shown_of_any_samples_can_be_stored(factor: float, names: tuple[str, ...]):

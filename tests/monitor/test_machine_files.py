@@ -82,6 +82,7 @@ def test_samples_that_leak_are_not_taught_whatever_is_said(tmp_path, commissione
     assert len(ss.read_machine(tmp_path / "press.toml").healthy) == 4
 
 
+@pytest.mark.slow
 def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(tmp_path, commissioned):
     file = tmp_path / "press.toml"
     service = alarmed(tmp_path, commissioned[3.0e-13])
@@ -108,6 +109,8 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
         again.with_healthy(healthy(alarm.onset_s + 3600.0, 21))
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_the_last_word_on_an_alarm_counts(tmp_path, commissioned):
     """An alarm that was valid and is invalid holds no teaching up: not of its samples, nor of later recordings."""
     service = alarmed(tmp_path, commissioned[3.0e-13])

@@ -24,6 +24,7 @@ from sealscope.monitor.settings import PageSettings
 from sealscope.monitor.sources.source_block import SourceBlock
 from sealscope.monitor.supervisor import BROKER, DATABASE, Supervisor
 
+from ..representatives import few
 from .plant import LINES, rows_of, served, settings_in, until
 
 REACHED = dict.fromkeys(
@@ -94,10 +95,13 @@ def metrics(page: TestClient) -> tuple[int, dict[str, dict[str, float]]]:
 
 @pytest.mark.parametrize(
     ("error", "reason"),
-    [
-        (OperationalError("select", {}, ConnectionError(REASON)), REASON),
-        (PoolTimeout("QueuePool limit"), "every connection to the database is in use"),
-    ],
+    few(
+        [
+            (OperationalError("select", {}, ConnectionError(REASON)), REASON),
+            (PoolTimeout("QueuePool limit"), "every connection to the database is in use"),
+        ],
+        1,
+    ),
 )
 def test_without_the_database_the_page_answers_503_in_words(service, monkeypatch, error, reason):
     page = TestClient(

@@ -310,6 +310,7 @@ def test_an_alarm_goes_through_its_life_and_survives_a_restart(tmp_path: Path):
     assert restarted()[0]["state"] == "closed"
 
 
+@pytest.mark.slow
 def test_silence_and_a_duty_that_is_not_known_have_delays_of_their_own(tmp_path: Path):
     def state(name: str, samples: Any, **delays: float) -> dict[str, Any]:
         database = str(tmp_path / f"{name}.db")

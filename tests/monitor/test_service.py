@@ -65,6 +65,7 @@ def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
     assert rows_of(settings.database) == undisturbed
 
 
+@pytest.mark.slow
 def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tmp_path):
     """The response's state comes back with the same bits, before its first fit and after."""
     pressed = simulate(command="5 sin(2t)", duration=75.0, seed=1).only(("p_A", "p_B", "u"))
@@ -112,7 +113,13 @@ def test_errors_of_the_database_change_no_row(undisturbed, tmp_path, monkeypatch
     assert service.actuators.counters["waits for the database"] > 5 / together
 
 
-@pytest.mark.parametrize("error", [ValueError("no such thing"), DataError("insert", {}, ValueError("NUL"))])
+@pytest.mark.parametrize(
+    "error",
+    [
+        pytest.param(ValueError("no such thing"), marks=[pytest.mark.slow, pytest.mark.long]),
+        DataError("insert", {}, ValueError("NUL")),
+    ],
+)
 def test_a_block_that_raises_an_error_is_dropped_and_the_others_go_on(tmp_path, monkeypatch, caplog, error):
     keep, bad = MonitorStore.insert_blocks, compute_digest(LINES.splitlines()[14])
 
@@ -229,6 +236,8 @@ def test_other_settings_begin_a_new_baseline(tmp_path):
     assert (state["watch"]["baseline_version"], state["watch"]["blocks"]) == (2, 44)
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_another_rig_under_the_same_name_begins_a_new_baseline(tmp_path, caplog):
     """What counts is what the file states, not its name: the same values elsewhere are the same machine."""
     settings = settings_in(tmp_path)
@@ -252,6 +261,8 @@ def test_another_rig_under_the_same_name_begins_a_new_baseline(tmp_path, caplog)
     assert "press 2: its rig or learn_hours are others than it learned with" in caplog.text
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_leak_is_not_over_because_the_detector_begins_anew(tmp_path):
     settings = settings_in(tmp_path)
     served(settings, LINES)

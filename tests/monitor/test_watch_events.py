@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sealscope.diagnosis.live.watch import Watch
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine, step
+from ..representatives import OTHERS
 
 #: When something else changes, and when a leak opens [s]; its conductance [m^3/(s Pa)].
 CHANGES, OPENS, END, LEAK = 130.0, 190.0, 250.0, 1.0e-12
@@ -76,6 +78,7 @@ SENSORS = {
     "noise of p_A": add_noise,
 }
 DUTIES = {"pause": pause, "ramp": ramp, "larger duty": larger}
+EVENTS = (*SENSORS, *DUTIES)
 
 
 @cache
@@ -86,19 +89,22 @@ def watched(kind: str, leaks: bool) -> Watch:
     return watch
 
 
-#: Kinds that differ from another one by their sign or chamber alone are slow.
-KINDS = [
-    pytest.param(kind, marks=pytest.mark.slow) if kind in ("scale of the position, larger", "zero of p_B") else kind
-    for kind in (*SENSORS, *DUTIES)
-]
+#: Kinds that differ from another one by their sign, chamber or shape alone.
+ALIKE = ("scale of the position, larger", "zero of p_B", "ramp", "larger duty", "zero of p_A")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def some_of(*quick: str) -> list[Any]:
+    """All kinds, of which a sensor and a duty are quick."""
+    marks = {kind: OTHERS if kind in ALIKE else pytest.mark.slow for kind in EVENTS} | dict.fromkeys(quick, ())
+    return [pytest.param(kind, marks=marks[kind]) for kind in EVENTS]
+
+
+@pytest.mark.parametrize("kind", some_of("scale of the position, smaller", "pause"))
 def test_what_is_no_leak_raises_no_alarm(kind: str):
     assert watched(kind, leaks=False).leak is None
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", some_of("zero of p_A", "larger duty"))
 def test_beside_it_a_leak_is_found(kind: str):
     leak = watched(kind, leaks=True).leak
     plain = watched("", leaks=True).leak
@@ -113,6 +119,8 @@ def test_what_explains_a_change_is_counted():
     assert any(reason.startswith("changes that are no leak") and "scale" in reason for reason in counters)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_restarts_while_a_change_is_weighed_continue_with_the_same_bits():
     recording = SENSORS["scale of the position, smaller"](recorded(leaks=True))
     watch, start = ss.watch("thesis", learn_hours=LEARN), 0

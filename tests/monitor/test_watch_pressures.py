@@ -86,11 +86,13 @@ def cut(seconds: float, size: int, stop: int) -> None:
     assert json.dumps(again.state()) == json.dumps(whole(seconds)[0].state())
 
 
-@pytest.mark.parametrize("stop", [20_000, pytest.param(47_000, marks=pytest.mark.slow)])  # before the first fit, after
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [20_000, pytest.param(47_000, marks=pytest.mark.long)])  # before the first fit, after
 def test_cuts_and_restarts_change_nothing(stop: int):
     cut(105.0, 7_001, stop)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @settings(max_examples=2, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(size=st.integers(1_000, 60_000), stop=st.integers(3_000, 350_000))
@@ -153,6 +155,8 @@ def test_another_rate_is_no_leak_and_hides_none(learned: str):
     assert low <= OPENS <= high
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_rate_too_slow_costs_its_blocks_only(learned: str):
     watch = Watch.from_state(json.loads(learned))
     _, slow = run(at_rate(part(500, 530), 125.0), 5_000, watch)
@@ -166,6 +170,8 @@ def test_a_rate_too_slow_costs_its_blocks_only(learned: str):
     assert estimates[-1].status == "learning"
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_not_resolved_is_not_said_to_stand_still():
     recording = ss.simulate(command="3 sin(4t)", duration=600.0, seed=1).only(CHANNELS)  # its fit leaves G unknown
     _, estimates = run(recording.between(0, 120), 10_000)

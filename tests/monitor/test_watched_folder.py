@@ -94,6 +94,8 @@ def test_a_machine_is_stated_by_its_own_word(commissioned, tmp_path):
         stream_settings(tmp_path, 'machine = "absent.toml"')
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commissioned, tmp_path):
     """Its logs have no time column, and its pump was guessed: 7.0 in place of 4.9 cm^3/rev."""
     settings = watching(tmp_path, commissioned)
@@ -137,6 +139,8 @@ def surfaces(service, out: str, diagnosis):
     return event, row
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_a_leak_from_the_first_sample_of_the_first_file_is_what_diagnose_says(commissioned, tmp_path):
     settings = watching(tmp_path, commissioned)
     worn = machine(9, G=step(0.0, LARGE, at=0.0), rate=100.0, duration=60.0)
@@ -151,6 +155,7 @@ def test_a_leak_from_the_first_sample_of_the_first_file_is_what_diagnose_says(co
     assert again.summaries()["press"] == service.summaries()["press"]
 
 
+@pytest.mark.slow
 def test_the_bound_of_a_healthy_recording_is_that_of_diagnose_and_ends_the_alarm(commissioned, tmp_path):
     settings = watching(tmp_path, commissioned)
     log(
@@ -172,7 +177,8 @@ def test_the_bound_of_a_healthy_recording_is_that_of_diagnose_and_ends_the_alarm
     )
 
 
-@pytest.mark.parametrize("mark", ["invalid", pytest.param("repaired", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mark", ["invalid", pytest.param("repaired", marks=pytest.mark.long)])
 def test_a_mark_that_ends_an_alarm_leaves_no_figures_and_the_next_recording_is_judged(commissioned, tmp_path, mark):
     (tmp_path / "press.toml").write_bytes(commissioned.read_bytes())
     (tmp_path / "press.healthy").write_bytes(commissioned.with_suffix(".healthy").read_bytes())
@@ -309,6 +315,8 @@ def test_files_are_taken_in_the_order_of_their_recordings(commissioned, tmp_path
     assert list(folder.blocks()) == []
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_recordings_of_a_day_without_a_time_of_day_follow_each_other(commissioned, tmp_path):
     folder, healthy = folder_of(tmp_path, commissioned), machine(4, rate=100.0, duration=20.0)
     for part in "abc":

@@ -185,8 +185,16 @@ HEAVY = {
 }
 
 
-@pytest.mark.parametrize("kind", HEAVY)
-@pytest.mark.parametrize("load", [ss.load_rig, pytest.param(ss.read_machine, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=[pytest.mark.slow, pytest.mark.long]) if kind in ("keys", "a long text") else kind
+        for kind in HEAVY
+    ],
+)
+@pytest.mark.parametrize(
+    "load", [ss.load_rig, pytest.param(ss.read_machine, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_a_hostile_file_takes_less_than_ten_times_its_size_in_memory(tmp_path: Path, kind: str, load) -> None:
     """The first error ends it, and what would become many objects is refused before it is parsed."""
     path = write(tmp_path, HEAVY[kind])

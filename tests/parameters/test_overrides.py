@@ -178,7 +178,7 @@ def test_every_number_has_a_range() -> None:
         assert low < high, name
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(name=st.sampled_from(NUMBERS), value=st.floats(width=64))
 def test_a_number_is_taken_exactly_or_refused_by_name(name: str, value: float) -> None:
     low, high = _range(name)
@@ -222,7 +222,7 @@ def test_every_word_of_a_choice_is_accepted(name: str) -> None:
 
 
 @example("", "0:\n0")
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(st.text(max_size=20), st.one_of(st.text(max_size=20), st.integers(), st.none(), st.lists(st.floats())))
 def test_anything_else_is_an_input_error(name: str, value: Any) -> None:
     for key in (name, "V_1"):

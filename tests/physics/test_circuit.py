@@ -120,6 +120,7 @@ def test_where_volumes_are_fixed_no_oil_is_lost(drive, amplitude, force, G, p_re
     assert np.abs(total - total[0]).max() <= 1e-9 * c.V
 
 
+@pytest.mark.slow
 def test_a_dead_headed_pump_turns_on_over_the_relief_valve(drive):
     """p_A - p_s = p_relief + Q/G once the piston stands at its cap."""
     rig = single_rod(**FIXED, p_relief="1 MPa", G_pump=0.0)

@@ -117,10 +117,9 @@ def test_a_cache_folder_that_cannot_be_written_is_no_error(copy, tmp_path):
     "whose",
     [
         "another user's",
-        "open to all",
         "kernels open to all",
-        "a link",
         "kernels a link",
+        *(pytest.param(whose, marks=pytest.mark.long) for whose in ("open to all", "a link")),
     ],
 )
 @pytest.mark.slow
@@ -297,6 +296,7 @@ print(float(recording["p_A"].sum()), int("numba.np.linalg" in sys.modules))
 """
 
 
+@pytest.mark.slow
 def test_code_from_the_cache_needs_nothing_that_compiles(tmp_path):
     """What numba declares for a compilation takes longer than the loading of all kernels."""
     environment = {**os.environ, "SEALSCOPE_CACHE_DIR": str(tmp_path / "cache")}

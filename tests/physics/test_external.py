@@ -81,8 +81,10 @@ def test_what_leaks_out_and_what_is_made_up_account_for_the_oil(check_rig, drive
     assert simpson(run["q_up"], x=run.t) == pytest.approx(made_up, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "throttled", [pytest.param(False, id="free", marks=pytest.mark.slow), pytest.param(True, id="throttled")]
+    "throttled",
+    [pytest.param(False, id="free", marks=[pytest.mark.slow, pytest.mark.long]), pytest.param(True, id="throttled")],
 )
 def test_the_make_up_holds_the_low_side_and_gives_off_its_own_pressure(check_rig, drive, throttled):
     rig = check_rig(throttled, G_ext_A=4e-13, **MADE_UP)

@@ -155,7 +155,11 @@ def test_karnopps_piston_stands_still_until_it_breaks_away():
     "throttled", [pytest.param(False, id="free"), pytest.param(True, id="throttled", marks=pytest.mark.long)]
 )
 @pytest.mark.parametrize(
-    "values", [{"friction.law": "karnopp", "v_th": 0.004}, {**LUGRE, "backward": 1.3}], ids=["karnopp", "lugre"]
+    "values",
+    [
+        pytest.param({"friction.law": "karnopp", "v_th": 0.004}, id="karnopp", marks=pytest.mark.long),
+        pytest.param({**LUGRE, "backward": 1.3}, id="lugre"),
+    ],
 )
 def test_other_laws_in_lanes_are_what_they_are_alone(check_rig, details_of, throttled, values):
     quiet = {f"sensors.{name}.{what}": 0.0 for name in ("p_A", "p_B") for what in ("noise", "drift")}

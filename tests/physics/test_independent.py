@@ -325,7 +325,7 @@ SIZES |= dict.fromkeys(("p_A", "p_B", "p_1", "p_2"), 1e4)
 
 
 #: Variants whose laws another one has, too.
-CONTAINED = ("free", "single-rod-eha, one side carries")
+CONTAINED = ("free", "throttled", "single-rod-eha, one side carries")
 
 
 @pytest.mark.slow

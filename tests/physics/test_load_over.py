@@ -38,6 +38,7 @@ def test_a_linear_table_is_a_spring_and_words_are_a_damper(check_rig, drive, tmp
             np.testing.assert_allclose(run[name], expected[name], rtol=0, atol=1e-11 * np.abs(expected[name]).max())
 
 
+@pytest.mark.slow
 def test_a_run_starts_in_equilibrium_with_a_preloaded_spring(check_rig):
     experiment = Experiment.of(
         rig=check_rig(**CHARGED),

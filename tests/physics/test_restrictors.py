@@ -47,7 +47,7 @@ def test_a_one_way_throttle_has_a_coefficient_for_each_direction():
     assert one_way_coefficient(-1.0, 2e-6, 1e-6) == 1e-6
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     total=st.floats(-1e8, 1e8).filter(lambda total: abs(total) > 1e-100),
     g=st.floats(-3.0, 14.0).map(lambda e: 10.0**e),

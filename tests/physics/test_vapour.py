@@ -59,7 +59,8 @@ def test_what_boiled_is_oil_again(separated):
     assert cavity.min() > -1e-3
 
 
-@pytest.mark.parametrize("air", [0.0, pytest.param(2e-5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("air", [0.0, pytest.param(2e-5, marks=[pytest.mark.slow, pytest.mark.long])])
 @settings(max_examples=4, deadline=None)
 @given(amplitude=st.floats(8.0, 11.0), G=st.floats(0.0, 1e-11))
 def test_the_mass_is_kept_through_cavities(drive, air, amplitude, G):

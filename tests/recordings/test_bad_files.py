@@ -178,7 +178,7 @@ def test_a_name_that_lies_is_read_by_content_and_said(tmp_path: Path) -> None:
     assert recording.history[0] == "name ends in .nc, content is text, comma separated, utf-8"
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(content=st.binary(max_size=300) | st.text(alphabet='t[s],p_A Pa\n0123.;\t-eN"#', max_size=200).map(str.encode))
 def test_any_bytes_are_a_recording_or_one_clear_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "log.csv"

@@ -70,7 +70,10 @@ def in_blocks(path: Path, size: int, large: bool = False, **given: object) -> tu
         return outcome(path, **given)
 
 
-@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow, pytest.mark.long]) if k % 3 else name for k, name in enumerate(TEXTS)],
+)
 def test_logs_of_loggers_in_the_smallest_blocks(name: str, tmp_path: Path) -> None:
     path = TEXTS[name].write(tmp_path)
     assert in_blocks(path, 1, map="auto") == outcome(path, map="auto")
@@ -80,7 +83,7 @@ def clocked(form: str, start: datetime, step: timedelta, count: int) -> list[str
     return [(start + k * step).strftime(STAMPS[form]) for k in range(count)]
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     form=st.sampled_from([*STAMPS, "seconds"]),
     day=st.datetimes(datetime(2024, 1, 1), datetime(2024, 12, 31)),

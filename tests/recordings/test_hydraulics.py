@@ -99,11 +99,12 @@ def test_what_no_machine_reads_is_named(kind: str) -> None:
     assert reason in (find_implausibility(make(machine())) or "")
 
 
-def test_real_rotary_strokes_pass() -> None:
+@pytest.mark.parametrize("every", [12, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
+def test_real_rotary_strokes_pass(every: int) -> None:
     files = sorted((REAL / "vtnsi_actuator").glob("act_*/*.txt"))
     if not files:
         pytest.skip("the real recordings are not here")
-    for path in files:
+    for path in files[::every]:
         assert find_implausibility(read(path, map={"p_A": "PG_1", "p_B": "PG_2"}, rate=1000)) is None
 
 

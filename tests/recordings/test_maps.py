@@ -34,7 +34,7 @@ def table(folder: Path, head: str, columns: np.ndarray = COLUMNS, name: str = "l
     return path
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(a=NUMBERS, b=NUMBERS, c=NUMBERS, unit=st.sampled_from([("bar", 1e5), ("kPa", 1e3), ("Pa", 1.0)]))
 def test_a_formula_is_the_affine_function_that_it_says(tmp_path: Path, a: float, b: float, c: float, unit) -> None:
     path = table(tmp_path, "t [s];ADC_1;ADC_2;ADC_3")

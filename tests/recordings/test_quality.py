@@ -194,7 +194,7 @@ def test_an_unconnected_sensor() -> None:
     assert "is the sensor connected?" in finding.text
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(st.data())
 def test_uniform_segments_are_maximal_sound_and_disjoint(data: st.DataObject) -> None:
     count = data.draw(st.integers(1, 60))

@@ -46,6 +46,8 @@ def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
     assert 0 < result["clipped"] < len(FILES)
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_what_is_not_connected_is_seen_as_hum() -> None:
     hums = sum(
         any(f.code == "mains_hum" and "60 Hz" in f.text for f in inspect(read(path, map={"p_A": "PG_3"}, rate=1000)))

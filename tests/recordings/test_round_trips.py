@@ -67,7 +67,7 @@ def test_marks_of_other_formats_within_our_own_are_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(recording=recordings())
 def test_exact(tmp_path: Path, suffix: str, recording: Recording) -> None:
     path = tmp_path / f"log.{suffix}"

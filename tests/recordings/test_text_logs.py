@@ -263,6 +263,7 @@ def test_what_stands_above_the_header_is_kept(tmp_path: Path) -> None:
     assert "1 line before the header not used" in recording.history
 
 
+@settings(max_examples=30)
 @given(st.lists(st.text(max_size=600), max_size=60), st.sampled_from([",", ";", "\t", " ", "|"]))
 def test_any_lines_above_the_header_give_short_printable_entries(lines: list[str], delimiter: str) -> None:
     about = parse_remarks(lines, delimiter)

@@ -44,7 +44,7 @@ def rms_of(details_of):
     ("volumes", "throttled"),
     [  # each pair is compiled of its own, a law in each of them is in one of the first two
         pytest.param("fixed", False, id="fixed-free"),
-        pytest.param("position", True, id="position-throttled"),
+        pytest.param("position", True, id="position-throttled", marks=pytest.mark.slow),
         pytest.param("position", False, id="position-free", marks=[pytest.mark.slow, pytest.mark.long]),
         pytest.param("fixed", True, id="fixed-throttled", marks=[pytest.mark.slow, pytest.mark.long]),
     ],
@@ -77,6 +77,7 @@ def test_each_run_is_what_it_is_by_itself(check_rig, rms_of, throttled, volumes)
     assert np.abs(changed.rms[0] / batch.rms[1] - 1.0).max() > 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_single_rods_run_side_by_side(rms_of):
     rig = load_rig("single-rod-eha").with_overrides({**FINE, "sensors.p_A.range_hi": 1e8})
@@ -127,6 +128,7 @@ def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself(rms_of):
     assert np.abs(result[0, 1] / result[0, 0] - 1.0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig, rms_of):
     rig = check_rig(True, volumes="position", p_charge="2 MPa", G_circ=2e-10, **QUIET)
     moves = [f"{what} from 2 s to 3.1 s within 0.2 s" for what in ("shut-off A to 0 %", "circulation")]
@@ -162,6 +164,7 @@ def test_loads_push_side_by_side_as_they_do_by_themselves(check_rig, rms_of):
     assert np.ptp(batch.rms[:, 0, 1, 2]) > 1.0
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig, rms_of):
     values = {"p_vap": "2 kPa", "p_charge": "0 Pa", "F_v": 6000.0, **QUIET, "sensors.p_A.range_lo": -2e5}

@@ -168,6 +168,8 @@ def test_strokes_lie_about_the_middle(command):
     assert np.ptp(x) > 0.05
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_strokes_behind_a_valve_lie_about_the_middle():
     rig, command = load_rig("servo-valve"), "8 sin(t)"
     x_0 = centred_start(rig, command, 14.0)

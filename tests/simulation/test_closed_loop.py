@@ -63,6 +63,8 @@ def test_a_sine_of_50_mm_is_followed_within_1_percent_and_a_step_is_held(rig, fo
         assert run["x"].max() < 0.103
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_without_feed_forward_and_integral_it_lags():
     """The check above sees what the controller is for."""
     experiment = Experiment.of(

@@ -120,21 +120,25 @@ def halves(result) -> tuple[np.ndarray, np.ndarray]:
     return t < 0.5 * t[-1] - 0.01, t > 0.5 * t[-1] + 0.5
 
 
-def test_until_its_onset_a_fault_changes_nothing_and_then_it_does():
-    for fault, values in (
-        ("pump leak x3", LEAKING_PUMP),
+@pytest.mark.parametrize(
+    ("fault", "values"),
+    [
         ("friction x1.3", {}),
-        ("rod seal A 0.001 L/min", {"check_valves": "present"}),
         ("duty amplitude x1.2", {}),
-    ):
-        healthy, faulty = pair(fault, values=values)
-        first, second = halves(healthy)
-        np.testing.assert_array_equal(healthy.recording["p_A"][first][:-20], faulty.recording["p_A"][first][:-20])
-        difference = np.abs(healthy.truth.outputs["p_A"] - faulty.truth.outputs["p_A"])
-        assert difference[first].max() < 1e-6, fault  # Pa; a faulty duty is another command, equal to rounding
-        assert difference[second].max() > 500.0, fault
+        pytest.param("pump leak x3", LEAKING_PUMP, marks=pytest.mark.slow),
+        pytest.param("rod seal A 0.001 L/min", {"check_valves": "present"}, marks=pytest.mark.slow),
+    ],
+)
+def test_until_its_onset_a_fault_changes_nothing_and_then_it_does(fault, values):
+    healthy, faulty = pair(fault, values=values)
+    first, second = halves(healthy)
+    np.testing.assert_array_equal(healthy.recording["p_A"][first][:-20], faulty.recording["p_A"][first][:-20])
+    difference = np.abs(healthy.truth.outputs["p_A"] - faulty.truth.outputs["p_A"])
+    assert difference[first].max() < 1e-6  # Pa; a faulty duty is another command, equal to rounding
+    assert difference[second].max() > 500.0
 
 
+@pytest.mark.slow
 def test_air_that_comes_later_is_not_there_before():
     healthy, faulty = pair("air 1 %")
     first, second = halves(healthy)

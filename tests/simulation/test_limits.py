@@ -19,10 +19,23 @@ def hold(volts: float):
     return lambda t: np.full_like(t, volts)
 
 
-@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
-@pytest.mark.parametrize("volumes", ["fixed", "position"])
 @pytest.mark.parametrize(
-    "side", [pytest.param(1.0, id="cap A-side out"), pytest.param(-1.0, id="cap B-side out", marks=pytest.mark.slow)]
+    ("volumes", "throttled"),
+    [
+        pytest.param("fixed", False, id="fixed-free"),
+        pytest.param("position", True, id="position-throttled", marks=pytest.mark.slow),
+        *(
+            pytest.param(volumes, throttled, marks=[pytest.mark.slow, pytest.mark.long])
+            for volumes, throttled in (("fixed", True), ("position", False))
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    "side",
+    [
+        pytest.param(1.0, id="cap A-side out"),
+        pytest.param(-1.0, id="cap B-side out", marks=[pytest.mark.slow, pytest.mark.long]),
+    ],
 )
 def test_both_caps_hold_the_piston(check_rig, drive, throttled, volumes, side):
     rig = check_rig(throttled, volumes=volumes, **FULL_CHARGE)

@@ -129,6 +129,8 @@ def test_leak_sizes_are_judged_by_the_conditions() -> None:
     assert "row 19" in result["claim-5.1.3"].why
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_the_drift_of_the_piston_is_laid_to_the_leak_only_where_the_control_drifts_on() -> None:
     of = evidence(None)
     assert every_claim(of)["claim-5.7.2"].verdict == "does not hold"
@@ -136,6 +138,7 @@ def test_the_drift_of_the_piston_is_laid_to_the_leak_only_where_the_control_drif
     assert every_claim(drifting_on)["claim-5.7.2"].verdict == "holds"
 
 
+@pytest.mark.slow
 def test_the_onset_must_be_near_in_every_test() -> None:
     of = evidence(None)
     assert every_claim(of)["claim-5.7.4"].verdict == "holds"
@@ -145,6 +148,8 @@ def test_the_onset_must_be_near_in_every_test() -> None:
     assert "9/10" in late.simulation
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_throttles_raise_the_range_where_they_do() -> None:
     assert every_claim(evidence(None))["claim-6.1.3"].verdict == "holds"
     flat = evidence(None)

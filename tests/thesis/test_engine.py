@@ -285,7 +285,7 @@ def test_a_killed_call_is_taken_up_where_it_stopped(fakes: Path, tmp_path: Path,
     assert {name for name, state in states(again).items() if state == "made"} == set(names) - finished
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_a_failure_is_told_and_the_others_go_on(fakes: Path, tmp_path: Path, jobs: int) -> None:
     items = (item("t-0", "broken"), item("t-1", "table"), item("t-2", "doubled", "t-0"), item("t-3", "doubled", "t-1"))
     outcome = reproduce(["all"], "out", items=items, jobs=jobs)
@@ -301,6 +301,8 @@ def test_what_cannot_be_stored_fails_alone(fakes: Path, tmp_path: Path) -> None:
     assert outcome["t-0"].reason.startswith("TypeError: ")
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_that_dies_takes_only_its_item(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "dies"), *(item(f"t-{number}", "table") for number in range(2, 6)))
     outcome = reproduce(["all"], "out", items=items, jobs=2)

@@ -128,6 +128,8 @@ def test_the_table_of_parameters_shows_every_fitted_value_with_its_interval() ->
     )
 
 
+@pytest.mark.long
+@pytest.mark.slow
 @needs_sheet
 def test_the_table_of_the_fit_has_every_condition_once(measured_sheet: DataSheet) -> None:
     summary, by_condition = fit_table(Kept(sheet=measured_sheet), ITEMS["calibration-fit"])

@@ -90,6 +90,7 @@ def test_the_mark_does_not_cover_the_legend() -> None:
     assert heights["curve 0"] - heights[UNRESOLVED.upper()] > 8
 
 
+@pytest.mark.slow
 def test_long_records_stay_small_and_keep_their_peaks() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(90_000) / 500
@@ -175,6 +176,8 @@ def test_symbols_are_set_as_symbols() -> None:
     assert typeset("plain words, 25 % closed") == "plain words, 25 % closed"
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_panels_are_laid_out_in_up_to_three_columns() -> None:
     assert [choose_grid(panels) for panels in (1, 5, 6, 8, 13)] == [(1, 1), (5, 1), (3, 2), (4, 2), (5, 3)]
     draw(Figure("fig-1.1", "Many", tuple(Panel("t [s]", f"y_{k}", (FigureCurve(T, T, "x"),)) for k in range(13))))

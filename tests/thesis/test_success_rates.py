@@ -72,6 +72,7 @@ def test_the_condition_tells_more_of_the_leak_than_the_features_do(measured_shee
     assert leave_one_out_r2(change_design(measured_sheet), leaks) == pytest.approx(0.45, abs=0.01)
 
 
+@pytest.mark.slow
 @needs_sheet
 def test_absolute_levels_of_both_chambers_tell_leak_from_none(measured_sheet: DataSheet) -> None:
     accuracy, auc = classify_without_baseline(measured_sheet, "test")

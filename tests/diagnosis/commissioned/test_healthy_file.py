@@ -259,6 +259,8 @@ def test_an_altered_summary_with_the_right_checksum_is_refused_in_one_line(pair,
     assert "\n" not in message
 
 
+@pytest.mark.slow
+@pytest.mark.long
 def test_a_file_of_summaries_takes_less_than_ten_times_its_size_in_memory(pair):
     """The worst that may be written: many short summaries of empty lists."""
     text, summaries = pair

@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
@@ -23,6 +21,7 @@ from sealscope.errors import InputError
 from sealscope.storage.atomic import remove_temporaries
 
 from ...refusals import refusal
+from ...representatives import OTHERS
 from ...wording import says
 
 
@@ -30,11 +29,14 @@ def figures(diagnosis: ss.Diagnosis) -> tuple:
     return diagnosis.verdict, diagnosis.score, diagnosis.leak_lpm, diagnosis.bound_lpm, diagnosis.cause
 
 
-@settings(max_examples=2, deadline=None)
-@given(
-    leak=st.sampled_from(["none", "0.002 L/min", "0.02 L/min", "0.05 L/min from 10 s"]),
-    channels=st.sampled_from([None, ("u", "p_A", "p_B")]),
-    seed=st.integers(10, 99),
+@pytest.mark.parametrize(
+    ("leak", "channels", "seed"),
+    [
+        ("0.02 L/min", None, 10),
+        pytest.param("0.05 L/min from 10 s", ("u", "p_A", "p_B"), 11, marks=pytest.mark.slow),
+        *(pytest.param(leak, None, 12, marks=OTHERS) for leak in ("none", "0.002 L/min", "0.05 L/min from 10 s")),
+        *(pytest.param(leak, ("u", "p_A", "p_B"), 13, marks=OTHERS) for leak in ("none", "0.002 L/min", "0.02 L/min")),
+    ],
 )
 def test_the_file_judges_as_the_recordings_do(healthy, file, by_pressures, leak, channels, seed):
     """All methods, with every digit, whichever channels the judged recording has."""
@@ -52,6 +54,7 @@ def figures_of(part) -> tuple:
     return part.detector, part.verdict, part.score, part.threshold
 
 
+@pytest.mark.slow
 def test_the_predicted_smallest_leak_is_what_is_found(machine):
     """Leaks of 1.3 times the size are found, of a third of it hardly ever."""
     smallest = machine.summary.smallest.lpm
@@ -79,6 +82,7 @@ def test_what_is_learnt_is_the_machine(machine):
     assert str(machine).count("\n") < 15
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_not_like_the_others_is_named(folder, tmp_path):
     leaking = tmp_path / "bad.nc"
     ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.1 L/min", seed=9), leaking)
@@ -204,6 +208,7 @@ def write_and_die(machine: ss.CommissionedMachine, path: Path, step: int) -> Non
     ss.write_machine(machine, path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills as POSIX does")
 def test_a_file_is_whole_at_whichever_access_its_writer_is_killed(machine, tmp_path):
     """After each kill the file and the one that it replaced are of one of the two machines."""
@@ -293,6 +298,8 @@ def test_another_actuator_is_named_and_is_no_leak(machine):
     assert "or the machine, changed (motion" in another.reason
 
 
+@pytest.mark.long
+@pytest.mark.slow
 def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
     """Marks grow a text up to the limit that all its readers have, within ten times its size in memory."""
     path = ss.write_machine(machine, tmp_path / "press.toml")

@@ -20,6 +20,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.commands import sampled_signal
 
+from ...representatives import few
 from ..balance_machine import machine, step
 
 SECONDS, ONSET = 40.0, 20.0
@@ -144,19 +145,20 @@ def check_healthy(name: str, kind: str) -> None:
     assert changed.verdict != "leak", changed.reason
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS, 4))
 def test_a_leak_of_a_machine_by_the_balance_stays(kind: str, two_methods: None) -> None:
     check_leak(BY_BALANCE, kind)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", few(KINDS, 4))
 def test_a_healthy_machine_by_the_balance_stays_healthy(kind: str, two_methods: None) -> None:
     check_healthy(BY_BALANCE, kind)
 
 
 #: Machines that differ from the first by their duty or their numbers alone take long.
 EACH = [
-    pytest.param(name, marks=pytest.mark.long) if name in ("thesis, slow", "calibrated") else name for name in MACHINES
+    pytest.param(name, marks=pytest.mark.long) if name in ("thesis, slow", "closed loop", "calibrated") else name
+    for name in MACHINES
 ]
 
 
