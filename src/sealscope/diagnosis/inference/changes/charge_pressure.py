@@ -34,6 +34,8 @@ from sealscope.recordings.recording import Array, Recording
 DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
 #: Quantile of a pressure that counts as its lowest value, and fraction of the lowest samples with which a fit begins.
 LOWEST, BEGIN = 0.02, 0.3
+#: Minimum fraction of the samples in which a chamber that is fed at the charge pressure is low.
+MIN_FRACTION = 0.1
 #: Maximum and minimum number of samples of a fit, and its number of iterations.
 MAX_SAMPLES, MIN_SAMPLES, ITERATIONS = 4000, 200, 15
 #: Weight of samples above the fit, over that of samples below.
@@ -70,7 +72,8 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     for p, low in zip(pressures, lowest, strict=True):
         near = CHANGES.charge.near
         is_low = np.isfinite(p) & np.isfinite(regressors).all(axis=1) & (p < low + near) & (low < min(lowest) + near)
-        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low))
+        is_fed = is_low.mean() > MIN_FRACTION
+        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_fed))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
 

@@ -1,7 +1,7 @@
 """Spectra of both chamber pressures in octaves, which a filter of one sensor or its line makes unlike.
 
 A low-pass filter takes more of one pressure the higher the frequency. With A_k, B_k the RMS of p_A and p_B in octave k,
-from periodograms of Hann windows (Welch), two numbers are compared with healthy recordings:
+from periodograms of Hann windows (Welch) of which a busy one counts, two numbers are compared with healthy recordings:
 
     ratio = mean over the upper two octaves of log(A_k / B_k),    tilt = ratio - the same mean over the lower two.
 
@@ -30,6 +30,8 @@ from sealscope.recordings.recording import Array, Recording
 SIDES, BESIDE = "sides", "p_A beside p_B"
 #: Minimum number of octaves, and number of those at either end that are averaged.
 MIN_OCTAVES, AVERAGED = 3, 2
+#: Quantile of the windows' powers that counts, and number of samples of the median that removes single wrong ones.
+BUSY, GLITCH = 0.85, 3
 #: Minimum power whose logarithm is taken [Pa^2].
 MIN_POWER = 1e-6
 
@@ -62,18 +64,23 @@ def compare_octaves(recording: Recording) -> Octaves | None:
 
 
 def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
-    """Compute the log RMS (k,) of values (n,) in the octaves between `edges` (k + 1,) [Hz].
+    """Compute the log RMS (k,) of values (n,) in the octaves between `edges` (k + 1,) [Hz], each in a busy window.
 
-    The spectrum is the mean over windows of `length` samples.
+    The spectra are those of half-overlapping windows of `length` samples; of each octave the quantile `BUSY` over the
+    windows counts, so that rests say nothing and a shock changes nothing. Single wrong samples are removed by a median
+    of three.
     """
-    starts = range(0, len(values) - length + 1, max(length // 2, 1))
-    power, taper = np.zeros(length // 2 + 1), np.hanning(length)
-    for start in starts:  # one at a time: all windows of a recording of hours would fill the memory
-        window = values[start : start + length]
-        power += np.abs(np.fft.rfft((window - window.mean()) * taper)) ** 2 / len(starts)
-    frequencies = np.fft.rfftfreq(length, 1.0 / rate)
+    from scipy.ndimage import median_filter
+
+    values = median_filter(values, GLITCH, mode="nearest")
+    frequencies, taper = np.fft.rfftfreq(length, 1.0 / rate), np.hanning(length)
     octave = np.searchsorted(edges, frequencies, side="right") - 1
-    return np.array([0.5 * np.log(power[octave == k].sum() + MIN_POWER) for k in range(len(edges) - 1)])
+    powers = []
+    for start in range(0, len(values) - length + 1, max(length // 2, 1)):
+        window = values[start : start + length]
+        power = np.abs(np.fft.rfft((window - window.mean()) * taper)) ** 2
+        powers.append([power[octave == k].sum() for k in range(len(edges) - 1)])
+    return np.asarray(0.5 * np.log(np.quantile(powers, BUSY, axis=0) + MIN_POWER))
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
