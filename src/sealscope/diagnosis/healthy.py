@@ -30,11 +30,11 @@ class SummarisedRecording:
         Duration [s].
     start_s : float or None
         Time of its first sample [s since 1970], None if unknown.
-    summaries : mapping of str to Summary
+    summaries : mapping of str to mapping
         Summary by each detector, by the detector's name.
     about : mapping
         Pressure, oil temperature, noise and problems of the recording, for display.
-    statistics : mapping of str to float or array
+    statistics : mapping of str to float or ndarray
         Surprisals -log(chance) of the changes within the recording, by name (`observation.healthy_surprisals`).
     """
 

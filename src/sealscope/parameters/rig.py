@@ -236,7 +236,7 @@ class Rig(Part):
 
     @property
     def circuit(self) -> HydraulicCircuit:
-        """Hydraulic circuit of the rig: valve-controlled if it has a servo valve, else pump-controlled."""
+        """Hydraulic circuit of the rig, valve-controlled if it has a servo valve and pump-controlled otherwise."""
         return VALVE_CIRCUIT if self.valve.spool == "present" else PUMP_CIRCUIT
 
     @property

@@ -194,7 +194,7 @@ class Recording:
 
     @property
     def remarks(self) -> dict[str, str]:
-        """Remarks in the header of the recording's file, such as the operator or the machine: name -> text."""
+        """Remarks in the header of the recording's file, such as the operator or the machine, by their names."""
         return clean_remarks(self.provenance)
 
     def unit_in_log(self, name: str) -> str | None:
@@ -219,7 +219,7 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are displayed: the unit of the log, or bar."""
+        """Unit in which pressures are displayed, the unit of the log or else bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 

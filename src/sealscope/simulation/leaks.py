@@ -94,8 +94,8 @@ class Leak:
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt|dp| with C
     [m^3/(s Pa^0.5)] (needle valve). The size at full opening is stated either as `coefficient` (G or C) or as `mean`
-    [m^3/s], the mean |Q| while the leak is open (`sizing.mean_while_open`), for which `sizing` then finds the
-    coefficient. `opening`: how far the leak is open over time, 0 to 1.
+    [m^3/s], the mean magnitude of Q while the leak is open (`sizing.mean_while_open`), for which `sizing` then finds
+    the coefficient. `opening` states how far the leak is open over time, 0 to 1.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"

@@ -154,7 +154,7 @@ class Watch:
 
     @property
     def method(self) -> str:
-        """Way of watching: "pressures" if channels without a position are in use, else "volumes"."""
+        """Way of watching, "pressures" if channels without a position are in use and "volumes" otherwise."""
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property

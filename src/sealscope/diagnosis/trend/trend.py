@@ -110,7 +110,7 @@ class Trend:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict: "leak", "no leak" or "cannot tell"."""
+        """The verdict, one of "leak", "no leak" and "cannot tell"."""
         return self.decision.verdict
 
     @property

@@ -43,9 +43,9 @@ class LeakCourse:
 
     Attributes
     ----------
-    t : array, (k,)
+    t : ndarray, shape (k,)
         Times of the estimates [s].
-    lpm, low, high : array, (k,)
+    lpm, low, high : ndarray, shape (k,)
         Flow at these times, and its 95 % interval [L/min].
     whole : bool
         True for the total flow past pump and piston, which is stated if no leak began. False for the increase of that
