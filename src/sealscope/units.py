@@ -352,9 +352,9 @@ def parse_quantity(
 ) -> float:
     """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5`` to a number in `si_unit`.
 
-    A number, and a text without a unit, are in `si_unit` already. Raises InputError if the text begins with no
-    number, for a unit of another dimension and, if `finite`, for an infinite number or NaN. The message states `name`
-    and the file or option `place`.
+    A number, or a text without a unit, is taken to be in `si_unit`. Raises InputError if the text does not begin with
+    a number, if the unit has another dimension or, with `finite`, if the number is infinite or NaN. The message names
+    the quantity (`name`) and the file or option (`place`).
     """
     where = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""

@@ -92,10 +92,11 @@ class _PythonLaw:
         self.law = CompiledLaw(address, self._memory, self)
 
     def _call_voltage(self, _memory: int, measured: int) -> float:
-        """Call the Python controller with the `Measured` at the address `measured`, and return its voltage [V].
+        """Call the Python controller, and return the voltage [V] that it sets.
 
-        The leakage flow that it compensates is stored in the memory, NaN if it reports none. If the controller raises
-        an exception, it is stored in `raised`, and NaN is returned.
+        `measured` is the address of the measured values, in the order of the fields of `Measured`. The leakage flow
+        that the controller compensates is stored in `self._memory[0]`, NaN if it reports none. If the controller
+        raises an exception, this is stored in `self.raised`, and the result is NaN.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)

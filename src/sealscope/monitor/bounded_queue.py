@@ -58,7 +58,10 @@ class BoundedQueue(Generic[_Item]):
             return True
 
     def pop(self, max_items: int, timeout: float) -> list[_Item]:
-        """Remove and return up to `max_items` items; wait up to `timeout` [s] for the first one."""
+        """Remove and return up to `max_items` items, waiting up to `timeout` [s] for the first one.
+
+        The list is empty if no item arrives in time.
+        """
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items), timeout)
             items = [self._items.popleft() for _ in range(min(max_items, len(self._items)))]

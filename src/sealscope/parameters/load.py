@@ -53,10 +53,11 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
     Parameters
     ----------
     rig : Rig, str or path-like, optional
-        Name of a packaged rig (`sealscope parameters` lists one), or path of a TOML file with value, unit and source
-        for each parameter; a Rig is returned as it is. A file may say ``[rig] extends = "thesis"`` (or the path of
-        another file) and then states only the values that differ; a table ``[map]`` names the columns of the machine's
-        logs (``p_A = "PG_1[psi]"``). The file of a commissioned machine is such a file, too.
+        Name of a packaged rig, or path of a TOML file with value, unit and source for each parameter; a Rig is
+        returned as it is. The command `sealscope parameters NAME` prints the parameters of a rig. A file may say
+        ``[rig] extends = "thesis"`` (or the path of another file) and then states only the values that differ; a
+        table ``[map]`` names the columns of the machine's logs (``p_A = "PG_1[psi]"``). The file of a commissioned
+        machine is such a file, too.
 
     Returns
     -------

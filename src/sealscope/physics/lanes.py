@@ -124,7 +124,7 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
             return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        """Build the LLVM instructions of one call, with plain numbers converted to lanes."""
+        """Build the LLVM instructions of one call, with single numbers first converted to lanes (vectors)."""
         lanes = _common_lanes_type(sig.args)
         assert lanes is not None
         pairs = zip(args, sig.args, strict=True)

@@ -224,7 +224,11 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
-    """Read a file that is no archive, in a subprocess unless its format is text."""
+    """Read a recording from a file that is not packed in an archive.
+
+    `kind`: format of the file. All formats but text are read in a subprocess, with limits on time, memory and disk
+    space.
+    """
     with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
         if kind in _SAFE_FORMATS:
             fields = _read_by_format(file, kind, request)

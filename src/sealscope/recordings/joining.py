@@ -32,8 +32,8 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    It is taken from the provenance, else from the name of the file, which is that in the provenance or `file`. A date
-    without a time of day stands for midnight.
+    It follows from the start in the provenance, else from the date in the name of the file, and from the first time
+    `t`. The name is that in the provenance, else `file`. A date without a time of day means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:

@@ -257,8 +257,9 @@ class Recording:
     def to_pandas(self) -> pandas.DataFrame:
         """Copy the recording to a data frame with the index ``t [s]`` and columns such as ``p_A [Pa]``.
 
-        Its ``attrs`` contain the units by column, the rate, the provenance and the history, which `from_pandas` reads.
-        Raises MissingExtra without pandas, and InputError if the provenance has values that JSON does not have.
+        The frame's ``attrs`` contain the units by column, the sampling rate, the provenance and the history;
+        `from_pandas` reads them. Raises MissingExtra if pandas is not installed, and InputError if JSON cannot
+        express a value of the provenance.
         """
         from sealscope.recordings.frames import to_pandas
 

@@ -83,7 +83,8 @@ def split_levels(
 def move_history(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
     """Move the last `history` of the `fill` used rows to the front of each buffer of one channel.
 
-    The channel's first buffer begins at row `start`, and each buffer has `capacity` rows.
+    The channel has one buffer of `capacity` rows for each of `levels` levels. The buffers follow each other, and the
+    first one begins at row `start`.
     """
     for level in range(levels):
         row = start + level * capacity

@@ -321,7 +321,12 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the changes of the machine's numbers or of an instrument's parameter that the drift causes."""
+        """Build the effects of the drift, each of which describes how one parameter changes over time.
+
+        A drift of an instrument has one effect, on the instrument's parameter. A drift of a machine's parameter has
+        an effect on each parameter of the model that is derived from it, proportional to a power of it. An absolute
+        drift is added to the values instead.
+        """
         breakpoints = self.shape.breakpoints()
 
         def build_effect(field: str, power: float) -> Effect:

@@ -83,7 +83,7 @@ class RunInputs:
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Take the command from `experiment`, and the leaks from `leaks`, whose coefficients are known."""
+        """Take the command from `experiment`, and the leaks from `leaks`; their coefficients must be known."""
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the voltage is that of the controller (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
@@ -114,10 +114,10 @@ class RunInputs:
         return G, C
 
     def _check_and_clip(self, u: Array, t: Array) -> Array:
-        """Check that the command `u` [V] at times `t` [s] stays within its limit during the run, and clip it after.
+        """Check that the command `u` [V] at the times `t` [s] stays within its limit, and return it clipped.
 
-        Raises InputError for a command beyond the limit. After the end of the run the command only lets the solver
-        continue as far as the anti-alias filter looks ahead.
+        Raises InputError if the command exceeds the limit within the run. Values after the end of the run are only
+        clipped: the solver continues beyond the end because the anti-alias filter looks ahead.
         """
         if np.abs(u).max(initial=0.0) <= self._limit:
             return u

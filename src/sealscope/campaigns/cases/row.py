@@ -132,7 +132,7 @@ class CaseRow(CaseInputs):
     statements: Mapping[str, Statement] = field(default_factory=dict)
 
     def score(self, detector: str) -> float | None:
-        """Return a detector's score; None if it cannot tell or there is no result."""
+        """Return the score of the detector with a given name; None if it stated no score or has no result."""
         return self.scores[detector][0] if detector in self.scores else None
 
     def as_dict(self) -> dict[str, Any]:

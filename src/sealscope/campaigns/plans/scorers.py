@@ -75,8 +75,8 @@ class SplitRms:
     def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
         """Compute the logarithms of the RMS from the mean squares of the details in both parts.
 
-        `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): samples of the parts
-        (`split_bounds`), whose numbers weight the mean over both.
+        `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): first sample and end
+        of each part (`split_bounds`). The mean over both parts is weighted by their numbers of samples.
         """
         log_rms = {}
         with np.errstate(divide="ignore"):

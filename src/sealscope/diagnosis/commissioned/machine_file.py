@@ -201,13 +201,12 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
-    """Write a machine's summaries, a backup of the present text file, then the new text file.
+    """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
 
-    An interruption at any time leaves a complete text with its summaries.
-
-    The summaries written are those of the machine and those that the present file or its backup names. Other
-    summaries in the present file are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the
-    new text could not be read back.
+    In this order an interruption at any time leaves a complete text with all its summaries. The file of summaries
+    contains those of the machine and those that the present text or its backup names. Other summaries in the present
+    file are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be
+    read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))

@@ -162,9 +162,9 @@ def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) 
 
 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
-    """Format the ranges over the healthy recordings of pump flow, pressure difference and oil temperature.
+    """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
 
-    Quantities that are not known are left out; the flow needs a machine of stated size.
+    Unknown quantities are left out. The flow is known only if the machine's sizes are stated.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]

@@ -68,7 +68,11 @@ def decide(
 
 
 def _evidence_without_leak(case: Case) -> Evidence:
-    """Make the verdict `no leak` or `cannot tell`, with the bound of a leak and the event that explains a change."""
+    """Make the evidence of a recording in which no test found a leak, with the verdict `no leak` or `cannot tell`.
+
+    The verdict is `no leak` if the upper bound of an undetected leak is small enough (`decide_without_leak`). The
+    evidence states this bound and, if something changed for another reason than a leak, the event that explains it.
+    """
     alarm, leak, other = next(iter(case.alarms), None), case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     verdict = decide_without_leak(*_bound_and_limit(case, bound))

@@ -496,10 +496,11 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
-    """Compute the blocks for the equations `balances`, as recorded and without the sensor offset of p_A - p_B.
+    """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
     `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the blocks; if it is large, the blocks are computed again about it.
+    estimated from the recorded blocks. If it is large, the blocks are computed again after subtracting it, and the
+    rest is removed.
     """
     columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
     blocks = remove_pressure_offset(plain, columns)

@@ -89,7 +89,10 @@ class Blocks:
         return Blocks(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     def pack(self) -> Blocks:
-        """Return the blocks with the upper triangles of `gram` only, (K, E, m (m + 1) / 2), for storage."""
+        """Return the blocks for storage, with the upper triangles of their symmetric Gram matrices only.
+
+        For K blocks, E equations and m columns, `gram` then has the shape (K, E, m (m + 1) / 2).
+        """
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
@@ -540,10 +543,11 @@ def offset_cost(offset: float) -> float:
 
 
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Estimate the sensor offset of p_A - p_B [Pa] in a recording, as a mean over the equations.
+    """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    Only changes of the leak between blocks show the offset; without them the estimate stays near the one that is
-    already removed from `blocks`.
+    `columns`: roles of the columns of `blocks` in each equation. The result includes the offset that is already
+    removed from `blocks`. Only changes of the leak between blocks show the offset; without them the estimate stays
+    near the removed offset.
     """
     fits = [
         _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))

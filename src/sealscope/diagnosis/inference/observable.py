@@ -212,10 +212,10 @@ class LeakMeasure(Protocol):
         """Return `flow` relative to the pump's flow and to the piston's area; None if these are unknown."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the total leakage of the recording; None if it is unknown.
+        """Return the total leakage in the recording, and the smallest detectable leak; None if neither is known.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would have been found had it begun within the
-        recording; None if unknown.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
+        None if that was not tested.
         """
 
     def history(self, onset_s: float | None) -> LeakCourse | None:

@@ -323,18 +323,25 @@ class StepSizes(NamedTuple):
 
 
 def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array, growth: float) -> StepSizes:
-    """Estimate the size of a step up of a coefficient at each onset, with the likeliest variance of its random walk.
+    """Estimate the size of a step up of a coefficient, for each of o possible onsets.
+
+    Apart from the step the coefficient follows a random walk, whose likeliest variance is used at each onset.
 
     Parameters
     ----------
     information : Information
         Likelihood of the coefficient in K blocks.
     onsets : array of int, shape (o,)
-        Indices of `StepTest.onsets`.
+        Indices of the onsets in `StepTest.onsets`.
     shape : array of float, shape (K,)
-        Change of the coefficient in each block by a unit step.
+        Factor on the step in each block, 1 for a step of the coefficient itself.
     growth : float
-        Relative growth of the step from its onset to the end of the recording.
+        Relative growth of the step from its onset to the end of the recording, 0 for a constant step.
+
+    Returns
+    -------
+    StepSizes
+        Log likelihood, size and standard error of the step at each onset, shape (o,) each.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None
@@ -455,9 +462,10 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, time: Array, vector: Array) -> _Whitened:
-        """Transform the readings of a coefficient in K blocks to independent ones, without its level and slope.
+        """Transform the estimates of a coefficient in K blocks to independent values, without its level and slope.
 
-        `time` (K,): middles of the blocks [s]; `vector` (K,): precision times coefficient, as in `Information`.
+        `time` (K,): middles of the blocks [s]; `vector` (K,): precision matrix times the estimates, as in
+        `Information`.
         """
         z = (self.vectors.T @ vector) / self.root
         z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # the prior on the slope is one more reading
@@ -542,10 +550,10 @@ def two_sided_step_test(information: Information) -> StepTest | None:
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return time, precision and vector of the blocks, with the prior on the level as an extra block.
+    """Return time (K,), precision (K, K) and vector (K,) of the blocks and of the level's prior, the first block.
 
-    The shapes are (K,), (K, K) and (K,). The extra block precedes the others, which makes K larger by one. Without
-    such a prior, or with fewer than `MIN_BLOCKS` blocks, there is none.
+    K includes the added block. No block is added without such a prior, or if there are fewer than `MIN_BLOCKS`
+    blocks.
     """
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:

@@ -107,7 +107,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 
 
 def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
-    """Compute the log odds that a leakage is about zero at rest rather than about equal to that in motion.
+    """Compute the log odds that the leakage at rest is about zero rather than about equal to the leakage in motion.
 
     `value`, `variance`: estimated leakage at rest and the variance of its error; `motion`: leakage in motion;
     `difference_variance`: variance of the error of `value` - `motion`.

@@ -222,7 +222,8 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
     """Test whether a duty lies between the limits `low` and `high`, extended by a margin.
 
-    The margin towards low pressures is larger, as a leak lowers the pressure difference.
+    A duty consists of the logarithms of the mean pressure difference and of the mean pump flow. The margin towards
+    low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
     min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)

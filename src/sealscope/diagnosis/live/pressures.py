@@ -159,10 +159,12 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
-        """Report a block that does not fit the model.
+        """Report a block that the model does not describe, and restart the fit after several such blocks.
 
-        After `lost` such blocks in succession (`priors.toml`) restart the fit. `restarts` tells whether later blocks
-        cannot be compared with those before this one.
+        `follower`: fit of the model; `end`: end of the block [s]; `is_settling`: True if the fit has not yet settled
+        after a start or a gap; `restarts`: True if this and later blocks cannot be compared with earlier ones. The
+        fit restarts after `lost` (a setting in `priors.toml`) such blocks in succession, or at once if its parameters
+        are not finite.
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():

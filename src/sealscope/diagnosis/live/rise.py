@@ -42,9 +42,9 @@ class LiveRise(NamedTuple):
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of the largest probability that a healthy machine scores this high.
+        """Logarithm of the probability that a healthy machine reaches this score or a higher one.
 
-        For a step it is Ville's bound.
+        For a step it is an upper bound by Ville's inequality, -score/2.
         """
         from scipy.special import log_ndtr
 
@@ -134,8 +134,9 @@ class LiveLeak:
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
     """Decide whether a watched machine leaks.
 
-    If there is no estimate of its `leak` yet, `lack` is the reason in one line. Other explanations of an increase are
-    not weighed here, but once, when its test raises an alarm (`explanation`).
+    `leak`: estimate of its leakage; if there is none yet, `lack` is the reason in one line. Other explanations of an
+    increase are not considered here. They are weighed only once, when the test raises an alarm (module
+    `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

@@ -89,10 +89,11 @@ class StepDetector:
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Process the estimate `g` of the block from `begin` to `end` [s], with its standard `deviation`.
+        """Process the estimate `g` of the coefficient in the next block.
 
-        Let e = g - level be the innovation of a walk's filter, S its variance, and f the effect of a unit step on it.
-        Then for each onset a += f e / S, b += f^2 / S and T += e^2 / S.
+        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e = g -
+        level be the innovation of the Kalman filter for a random walk, S its variance, and f the effect of a unit
+        step on it. Then for each walk and each possible onset, a += f e / S, b += f^2 / S and T += e^2 / S.
         """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
@@ -166,7 +167,11 @@ class StepDetector:
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
 
     def _log_likelihoods(self) -> Array:
-        """Compute the log likelihood of each walk q since each onset j without a step, (q, j), up to a constant."""
+        """Compute how likely each random walk q is by the estimates since each onset j, if no step occurred, (q, j).
+
+        The result is the logarithm of the walk's prior at the onset times the likelihood, up to a constant equal for
+        all q.
+        """
         n, log_T = self._onsets[:, 0], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
@@ -184,7 +189,10 @@ class StepDetector:
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate time and size of the coefficient's rise, averaged over random walks, onsets and prior sizes."""
+        """Estimate when the coefficient has risen and by how much.
+
+        Both are averages over the random walks, the onsets and the prior sizes, weighted by their probabilities.
+        """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_e)

@@ -195,6 +195,9 @@ def _make_observable(
 
 
 def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
-    """Select the log RMS (5 per chamber,) of the given chambers from a recording's summary."""
+    """Select the logarithms of the RMS of the given chambers' wavelet details from a recording's summary.
+
+    The result has five values for each chamber, one chamber after the other.
+    """
     levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
     return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

@@ -122,7 +122,7 @@ class Trend:
 
     @property
     def wear(self) -> Wear | None:
-        """Level, change and growth since the last repair; None if no recording states a level."""
+        """Level, change and growth of the leakage since the last repair; None if no recordings can be compared."""
         return self.episodes[-1].wear if self.episodes else None
 
     @property

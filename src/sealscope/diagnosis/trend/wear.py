@@ -111,9 +111,11 @@ class Levels:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation between recordings, from the prior and from the median step between neighbours.
+        """Standard deviation of the levels between recordings of a machine that does not change.
 
-        Their variances are averaged with the prior's degrees of freedom and the number of steps as weights.
+        It combines a prior and the data. The prior variance includes the mean square of the stated errors; that of
+        the data follows from the median change between neighbours in a group. The two are averaged, with the prior's
+        degrees of freedom and the number of such changes as weights.
         """
         prior = self.prior
         # the step of two neighbours has twice the variance of one

@@ -42,9 +42,10 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an event as a line unless its alarm is shelved; return True, or raise PartAway if that fails.
+        """Write an event as one line of JSON, unless its alarm is shelved, and return True.
 
-        The line is not buffered, because a buffer would keep lines that a full disk refuses.
+        Raises PartAway if the stream does not take the line; the next call then writes the rest. The line is not
+        buffered, because a buffer would keep lines that a full disk refuses.
         """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]

@@ -114,9 +114,10 @@ class SparkplugNode:
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands and mark the birth as due, or log that the broker refuses the connection.
+        """Subscribe to commands after a connection, and have the birth messages, which state all metrics, sent again.
 
-        The library paho calls this after an attempt to connect.
+        The library paho calls this after an attempt to connect. If the broker refuses the connection, that is only
+        logged.
         """
         if reason.is_failure:
             _log.error("the broker %s refuses the Sparkplug node: %s", self._broker.host, reason)
@@ -185,7 +186,10 @@ class SparkplugNode:
 
 @cache
 def _load_table(name: str) -> Mapping[str, Mapping[str, str]]:
-    """Load a table of `sparkplug_node.toml`: by name of a metric, its type, its unit and the path of its value."""
+    """Load a table of `sparkplug_node.toml`, which describes metrics by their names.
+
+    Each metric has a data type (`type`), the path of its value among the published data (`at`) and possibly a `unit`.
+    """
     file = files("sealscope.monitor.outputs") / "sparkplug_node.toml"
     table: dict[str, dict[str, str]] = tomllib.loads(file.read_text("utf-8"))[name]
     return table

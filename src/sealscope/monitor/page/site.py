@@ -174,7 +174,8 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         """Answer with a stream of server-sent events: one after each change, and the live curves of an actuator.
 
-        Query: `actuator`, without which there are no curves; `pressure` and `drawn`, which details are drawn.
+        Parameters of the query: `actuator`, the actuator's name, without which there are no curves; `pressure`, the
+        pressure whose wavelet details are drawn; `drawn`, the form in which they are drawn.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)

@@ -154,7 +154,10 @@ class SparkplugHost:
         return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]  # the parent level is included
 
     def request_all_births(self) -> None:
-        """Request a birth message of every node, because messages may have been missed before a connection."""
+        """Request from every node a birth message, which states all its metrics.
+
+        It is needed after a connection, because earlier messages may have been missed.
+        """
         for (group, node), state in self._nodes.items():
             state.is_complete = False
             self._request_birth(group, node)

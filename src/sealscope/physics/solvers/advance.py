@@ -44,10 +44,12 @@ def advance(
 ) -> None:
     """Integrate the state `y` (14,) in place over n steps of h [s], with outputs before each `every`-th step.
 
-    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `u`, `G`, `C` (n, nodes): command [V] and leakage
-    coefficients (`piston_leakage`) at the nodes of each step (`step_nodes`); `F` (n, nodes): load [N] in addition to
-    the rig's own, of shape (0, 0) if there is none; `rows` (n // every, 21): receives the outputs; `euler_integral`:
-    see `rk4_step`.
+    The inputs (n, nodes) hold a value for each of the times within a step that the method needs (`step_nodes`):
+    command `u` [V], leakage coefficients `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)] of the piston (`piston_leakage`),
+    and load `F` [N] in addition to the rig's own, of shape (0, 0) if there is none. `implicit` is `IMPLICIT` or
+    `EXPLICIT`, the integration method. `numbers` are the model's parameters. `rows` (n // every, 21) receives the
+    outputs. With `euler_integral` the explicit method changes the controller's integral only at the end of each step
+    (`rk4_step`).
     """
     z = state_of(y)
     for step in range(u.shape[0]):

@@ -134,7 +134,11 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find runs of equal values (n,); return their first indices (k,), and flags (k,) of those between two jumps."""
+    """Find the k runs of equal successive values in a channel (n,).
+
+    Returns the index of the first value of each run, and flags (k,) of the runs that both begin and end with a jump.
+    A jump is a change by more than `_MIN_JUMP` times the channel's resolution (`estimate_quantum`).
+    """
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _MIN_JUMP * estimate_quantum(values)
     return starts, np.r_[False, jumps] & np.r_[jumps, False]

@@ -69,10 +69,11 @@ def is_value(cell: str, decimal: str) -> bool:
 
 
 def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Parse cells to doubles (n,); also return the indices of the words, cells that are no numbers.
+    """Parse cells to an array of doubles (n,), and also return the indices of the cells that contain words.
 
-    Words and missing samples become NaN. `decimal`: decimal separator; `where`: function from the index of a cell to
-    its place, for messages. Raises InputError for an infinite number.
+    A word is neither a number nor a mark of a missing sample; both words and missing samples become NaN. `decimal`:
+    decimal separator; `where`: function that describes the place of the cell with a given index, for messages. Raises
+    InputError for an infinite number.
     """
     # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells

@@ -57,9 +57,10 @@ class Request:
 
     @property
     def infers_rate(self) -> bool:
-        """True if the times determine the sampling rate, even in a file of Sealscope's own that states it.
+        """True if the sampling rate is computed from the times, even if a file that Sealscope wrote states it.
 
-        A map may choose other times, and a data frame, which has no `file`, may lack rows.
+        This holds with a map, which may choose another column of times, and for a data frame, which may lack rows and
+        has no `file`.
         """
         return bool(self.map) or not self.file
 

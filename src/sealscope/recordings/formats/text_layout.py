@@ -192,7 +192,11 @@ def _parse_heading(
     """
 
     def split_names(line: str) -> list[str] | None:
-        """Split a line into names; None if its number of cells does not fit the samples, or all are values."""
+        """Split a heading line into the names of columns.
+
+        Return None if the number of names does not fit the number of columns, or if the line has values instead of
+        names.
+        """
         cells = _split_heading(line, delimiter, width)
         if cells and not cells[-1]:  # drop empty cells beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]

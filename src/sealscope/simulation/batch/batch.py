@@ -69,8 +69,8 @@ class Batch:
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
         """Compute the relative change of a wavelet detail's RMS from one segment to another, (runs,) [%].
 
-        It is the thesis's statistic of a leak. `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 or d3d4; `before`,
-        `after`: indices of the segments.
+        The thesis detects leaks by this change. `channel`: p_A or p_B; `detail`: d1, d2, d3, d4 or d3d4; `before`,
+        `after`: indices of the segments of the run to compare, by default the first and the last.
 
         Examples
         --------

@@ -55,7 +55,11 @@ class Member:
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The sets of model parameters in this run that limit the solver's step."""
+        """Sets of model parameters for which the solver's step must be short enough.
+
+        The parameters may change within the run. The sets are the parameters without any change, and those just
+        before and after each fast change, such as the switching of a valve.
+        """
         return step_limiting_parameters(self.effects, self.numbers)
 
 

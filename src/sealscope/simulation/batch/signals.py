@@ -29,10 +29,11 @@ INSTRUMENT_ROWS = 18
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressures [Pa] that are read back from the analog-digital converters of a group of runs.
+    """Compute the pressures [Pa] that analog-digital converters read in a group of runs.
 
-    The transducer saturates at its range, as in `instruments.digitize`. Its parameters are the rows of `sensor` from
-    row `row` on (`INSTRUMENT_ROWS` of them).
+    The transducer saturates at its range, as in `instruments.digitize`. `pressure`: pressures before conversion [Pa];
+    `sensor`: table of the parameters of the instruments; `row`: index of the first of the `INSTRUMENT_ROWS` rows
+    for this channel.
     """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)

@@ -47,9 +47,11 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    A row contains chamber, detail, mean change of the RMS in simulation and in measurement [%], geometric mean and
-    scatter of the simulated over the measured RMS without a leak, number of tests with a change of the same sign, and
-    correlation of the changes. All but the first three are None without a measured sheet.
+    The first four columns are the chamber, the detail, and the mean change of the detail's RMS due to the leak [%],
+    in the simulation and in the measurement. The next two are the geometric mean and the geometric standard deviation
+    of the ratio of the simulated RMS to the measured RMS, without a leak. The last two are the number of tests in
+    which both RMS change in the same direction, and the correlation of their logarithmic changes. All columns but the
+    first three are None without a measured sheet.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:

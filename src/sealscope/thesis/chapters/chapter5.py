@@ -55,7 +55,7 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C with this command and level of the leak, of which this test must be one."""
+        """The tests of Appendix C with this command and level of the leak; the printed test is one of them."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property

@@ -22,7 +22,7 @@ def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _claim_order(claim: Claim) -> tuple[int, ...]:
-    """Return the numbers by which claims are sorted: those of the claim's id, the abstract's claims being first."""
+    """Return the numbers in a claim's id as a key for sorting; claims of the abstract come first."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 

@@ -88,9 +88,10 @@ class SheetClaim:
     values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
 
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge the claim by the measured sheet, and state the findings on the measured and on the simulated sheet.
+        """Judge the claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
 
-        Without a measured sheet the claim cannot be tested. `id`: the claim's id; `kind`: as in `judge_claim`.
+        `id`: the claim's id; `kind`: key of the texts in `claims.toml` if the claim shares them with others, by
+        default `id`. Without a measured sheet the verdict is `cannot be tested`.
         """
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:

@@ -363,10 +363,11 @@ def _test_rows(
 
 
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge for each test of chapter 5 the claim that wavelet details of a chamber's pressure fall, or change.
+    """Judge the claims of chapter 5 that a leak lowers, or changes, wavelet details of a chamber's pressure.
 
-    On the measured sheet they must change by more than the noise. The simulated changes, and the changes that
-    drifting parameters alone can cause, are stated for comparison.
+    Each claim names a test and some details. The RMS of each detail must fall, or change, by more than the noise in
+    the measured data sheet; without this sheet the claim cannot be tested. For comparison, the texts state the
+    simulated changes, and the changes that drifting parameters alone can cause.
     """
     for number, (section, chamber, names, statement) in enumerate(load_texts("cases.toml")["curves"], start=1):
         test = TESTS[section]

@@ -116,7 +116,11 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the jobs of items whose needs are made, and report each item as in work when its job is taken."""
+            """Yield the job of each item in `ready`, i.e. of items that depend on no unfinished item.
+
+            A job consists of the item, the key of its inputs, and the products of the items it needs. When a job is
+            requested, its item is reported as in work.
+            """
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)

@@ -101,9 +101,11 @@ def _regressors(recording: Recording) -> Array:
 
 
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
-    """Fit the lower envelope of the samples `rows` of a pressure; return its drift [Pa/s] and the standard error.
+    """Estimate the drift [Pa/s] of the lower envelope of a pressure, and its standard error.
 
-    Both are NaN for too few samples.
+    `t` [s] and `pressure` [Pa], (n,): the samples; `regressors` (n, k): quantities that also change the pressure,
+    such as position and pump flow, which are fitted together with the drift; `rows`: indices of the samples to fit,
+    thinned out if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -125,10 +127,10 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
-    """Compute the standard error of the slope of a lower envelope from its scatter between the parts of a recording.
+    """Compute the standard error of a lower envelope's slope from its scatter between the n parts of a recording.
 
-    The robust weights hide a part that lies off the envelope as a whole. With the low quantile r_k of the residuals of
-    part k of n, at the mean time t_k:
+    The robust weights of the fit hide a part that lies off the envelope as a whole, but this error does not. With the
+    low quantile r_k of the residuals in part k, and the mean time t_k of that part, it is
 
         error^2 = sum (r_k - mean)^2 / (n - 2) / sum (t_k - mean)^2.
     """

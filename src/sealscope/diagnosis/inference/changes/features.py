@@ -92,9 +92,10 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test features for a step that only a change of a sensor causes; return the named tests.
+    """Test features of the pressures, such as their noise, for steps that only a change of a sensor causes.
 
-    The result is empty without both chamber pressures, or if a block has no samples.
+    Returns pairs of a feature's name and its test; features that cannot be tested are left out. The list is empty if
+    a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
     """
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []

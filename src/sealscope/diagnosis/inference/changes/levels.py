@@ -214,7 +214,12 @@ def _whitening_matrix(values: Array) -> Array:
 
 
 def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> LevelChange | None:
-    """Test whitened blocks (K, c) for a step in the subspace of `rows` (m, c); None without information."""
+    """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
+
+    `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
+    `time` (K,): times of the blocks [s]. Vectors and levels are whitened, as the module's docstring explains. Return
+    None if no direction of the subspace can be tested.
+    """
     basis, triangle = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
     components = [Information(time, np.eye(len(time)), whitened @ direction) for direction in basis.T]

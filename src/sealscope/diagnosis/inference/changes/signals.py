@@ -41,7 +41,10 @@ def _test_signals(recording: Recording) -> Observed:
 
 
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
-    """Collect the observables of all tests; a test that fails on overflowing values stops there."""
+    """Run all tests and collect the observables that they yield.
+
+    If numbers overflow or a matrix is singular, the test ends there; what it has yielded before is kept.
+    """
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):

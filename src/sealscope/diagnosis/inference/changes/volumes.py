@@ -121,7 +121,12 @@ def _step_hypotheses(
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
-    """Test whether a term's coefficient has a step test of its own."""
+    """Test whether the coefficient of a term of the volume balance is tested for a step by itself.
+
+    `roles`: roles of the balance's columns; `has_accumulator`: True if the recording shows the volume of an
+    accumulator. A term is not tested by itself if its coefficient changes only together with others, if it is zero
+    within a recording, or if another test covers it.
+    """
     if term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
     if term.name in (SPEED_LOSS, ORIFICE):

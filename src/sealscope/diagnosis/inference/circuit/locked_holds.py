@@ -122,9 +122,10 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 
 
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
-    """Divide `n_samples` into k readings that lengthen geometrically, and return their bounds, shape (k + 1,).
+    """Divide the samples of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
 
-    The first reading has `width` samples, each later one `GROWTH` times as many as the one before.
+    The samples of an interval are averaged later, to one reading. The first interval has `width` samples, and each
+    later one `GROWTH` times as many as the one before; the last one takes the rest.
     """
     edges = [0]
     while edges[-1] + max(round(width), 1) < n_samples:
@@ -284,9 +285,10 @@ class HeldChambers:
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
-        """Compute the flow of a laminar leak of unit conductance to the outside, from A (`is_A`) or else from B.
+        """Compute the flow of a laminar leak with a conductance of 1 from one chamber to the outside.
 
-        It is the gauge pressure of the side, or 0 while a check valve refills the chamber.
+        The chamber is A if `is_A` is True, else B. The flow is its gauge pressure, or 0 while a check valve refills
+        it.
         """
         pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(p) for p in pressures]
@@ -434,8 +436,8 @@ class HeldChambers:
     def _offset_grid(self) -> Array:
         """Candidates of the sensor offset of p_A - p_B [Pa], in ascending order.
 
-        They are a fixed grid, and the recorded difference at the end of each hold: if a leak has equalised the
-        pressures, that difference is the offset.
+        They are a fixed grid, and the recorded p_A - p_B at the end of each hold, i.e. of each time in which shut
+        valves hold the load. If a leak has equalised the pressures by then, this difference is the offset.
         """
         ends = [hold.mean(hold.p_A - hold.p_B)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))

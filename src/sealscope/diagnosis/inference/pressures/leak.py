@@ -156,10 +156,10 @@ class ResponseLeak:
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return a record of the total leakage, which pressures alone do not show, with the smallest detectable leak.
+        """Return the smallest detectable leak, in a record whose total leakage is None.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
-        None if that was not tested.
+        Pressures alone do not show the total leakage. `detectable_flow`: flow [m^3/s] of the smallest leak that would
+        be detected if it began within the recording; None if that was not tested.
         """
         pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
         return TotalLeakage(
@@ -171,9 +171,11 @@ class ResponseLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the growth of the leakage over time since an onset `onset_s` [s], in L/min with its 95 % interval.
+        """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before the onset.
 
-        Return None without an onset or a step test, or if the rig's file does not state the machine's sizes.
+        `onset_s`: onset of the leak [s], or None. The flow is midway between the flow through a laminar gap and
+        through an orifice. Return None without an onset or a step test, or if the rig's file does not state the
+        machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None

@@ -94,7 +94,7 @@ class Segment:
 
     @cached_property
     def _wave_gram_inverse(self) -> Array:
-        """Pseudo-inverse of the Gram matrix of the mains waves, (m, m)."""
+        """Pseudo-inverse of the Gram matrix of the m waves that are fitted to the mains hum, (m, m)."""
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
@@ -119,10 +119,11 @@ class Segment:
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
 
     def linearise(self, sets: Array) -> Linearisation:
-        """Linearise the model about the first of up to 5 parameter sets (m, p), and compute all sets' residuals.
+        """Linearise the residual of the model about the first of up to 5 parameter sets (m, p).
 
         The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
-        set and the derivatives of scale * response + offset by each parameter, in its unit.
+        set, and the derivatives of scale * response + offset by each parameter, in its unit. The result also has the
+        residual sum of squares of each set.
         """
         theta, n_sets, n_slopes = sets[0], len(sets), SPRING + 1
         # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
@@ -338,10 +339,10 @@ class Follower:
         self.covariance, self.last = self.covariance + np.diag(added), math.nan
 
     def next_segment(self, block: Recording) -> Segment:
-        """Return the samples of the next block, prepared for a fit.
+        """Prepare the samples of the next block for a fit.
 
-        At the start and after a gap the simulated stroke is centred, and the first samples have no weight, since the
-        drive settles.
+        At the start and after a gap, the simulation starts at a position that centres the stroke, and the first
+        samples have no weight because the drive is still settling.
         """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)

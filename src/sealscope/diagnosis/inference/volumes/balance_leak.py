@@ -121,7 +121,7 @@ class BalanceLeak:
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
-        """Rise of the leakage over healthy recordings, from the whole recording; None if there are none."""
+        """Leakage of the whole recording above that of the healthy recordings; None if there are none."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)

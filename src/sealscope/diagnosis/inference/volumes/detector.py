@@ -220,9 +220,10 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the roles of the columns in each balance of the machine.
+        """Determine for each volume balance which role each of its columns has, such as the leak or the left side.
 
-        `channels`: names of the recorded channels; `shut`: true if valves cut the pump off at rest.
+        `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
+        off at rest.
         """
         balances = equations(self.rig, channels)
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]

@@ -128,7 +128,7 @@ class RecordedBalance:
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
-        """Tests of each term's coefficient for a step within the recording, the highest score first."""
+        """Results of the tests for a step of each coefficient within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         return volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio
