@@ -8,9 +8,10 @@ near its lowest values are fitted by
     p = level + k x + r_+ max(q, 0) + r_- min(q, 0) + drift t,
 
 with the position x, whose rod volume moves oil into the accumulator, and the flow q of the pump, which drops pressure
-in lines and check valves (without a pump signal, the speed of the piston). The fit is robust (Cauchy weights) and gives
-samples above it less weight than those below: where valves shut a chamber off, its pressure lies above the charge
-pressure. Standard errors are cluster-robust. Called for healthy and judged recordings by `healthy_levels`.
+in lines and check valves; without the pump's angle or speed there is no fit, as behind a valve. The fit is robust
+(Cauchy weights) and gives samples above it less weight than those below: where valves shut a chamber off, its
+pressure lies above the charge pressure. Standard errors are cluster-robust. Called for healthy and judged recordings
+by `healthy_levels`.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from sealscope.recordings.recording import Array, Recording
 
 #: `Observable.data` of all drifts, rival descriptions of one another; names of those of low pressures.
 DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
+#: Channels of a pump that feeds the cylinder directly; behind a valve neither chamber is at a charge pressure.
+PUMP = ("theta", "omega")
 #: Quantile of a pressure that counts as its lowest value, and fraction of the lowest samples with which a fit begins.
 LOWEST, BEGIN = 0.02, 0.3
 #: Minimum fraction of the samples in which a chamber that is fed at the charge pressure is low.
@@ -62,10 +65,14 @@ class LowDrifts(NamedTuple):
 
 @np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
-    """Estimate the drifts of the low values of both pressures; None without both, or if neither can be fitted."""
-    if len(recording) < MIN_SAMPLES or not {"p_A", "p_B"} <= set(recording.channels):
+    """Estimate the drifts of the low values of both pressures; None without both.
+
+    The result is also None without the pump's angle or speed, or if neither pressure can be fitted.
+    """
+    source = flow_source(recording.channels)
+    if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
-    regressors = _regressors(recording)
+    regressors = _regressors(recording, source)
     pressures = [_average(recording[name], recording.rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
     drifts = list[float]()
@@ -84,20 +91,19 @@ def _average(values: Array, rate: float) -> Array:
     return np.asarray(uniform_filter1d(values, max(1, round(CHANGES.charge.seconds * rate))))
 
 
-def _regressors(recording: Recording) -> Array:
-    """Compute the columns (n, 3 or fewer) of the fit: position, and flow of the pump in either direction."""
-    position = _average(recording["x"], recording.rate) if "x" in recording else None
-    source = flow_source(recording.channels)
-    if source is None:
-        flow = None if position is None else np.gradient(position)
-    else:
-        flow = _average(recording[source], recording.rate)
-        flow = np.gradient(flow) if source == "theta" else flow
-    columns = [] if position is None else [position - np.nanmean(position)]
-    if flow is not None:
-        flow = flow / max(float(np.nanmax(np.abs(flow))), TINY)
-        columns += [np.maximum(flow, 0.0), np.minimum(flow, 0.0)]
-    return np.column_stack(columns) if columns else np.zeros((len(recording), 0))
+def _regressors(recording: Recording, source: str) -> Array:
+    """Compute the columns (n, 2 or 3) of the fit: the position, if recorded, and the pump's flow in either direction.
+
+    `source`: channel of the pump, its angle or its speed.
+    """
+    drive = _average(recording[source], recording.rate)
+    flow = np.gradient(drive) if source == "theta" else drive
+    flow = flow / max(float(np.nanmax(np.abs(flow))), TINY)
+    columns = [np.maximum(flow, 0.0), np.minimum(flow, 0.0)]
+    if "x" in recording:
+        position = _average(recording["x"], recording.rate)
+        columns.append(position - np.nanmean(position))
+    return np.column_stack(columns)
 
 
 def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
