@@ -85,6 +85,16 @@ def test_a_healthy_recording_shows_no_drift_and_a_rise_is_no_loss_of_oil() -> No
     assert rising["drift of low p_A"].chance < 1e-4
 
 
+def test_missing_samples_cost_nothing_but_themselves() -> None:
+    recording = record(fall=300.0, seed=26)
+    p_B = recording["p_B"].copy()
+    p_B[500:520] = np.nan
+    gap = Recording(T, {**recording.channels, "p_B": p_B}, dict(recording.units), recording.rate)
+    whole, broken = drifts(recording).estimate("B"), drifts(gap).estimate("B")
+    assert whole is not None and broken is not None
+    assert broken.value == pytest.approx(whole.value, rel=0.05)
+
+
 def test_a_chamber_that_always_carries_the_load_is_left_out() -> None:
     recording = record(fall=300.0, seed=25)
     loaded = Recording(T, {**recording.channels, "p_A": recording["p_A"] + 50e5}, dict(recording.units), recording.rate)

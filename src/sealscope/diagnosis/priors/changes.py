@@ -62,6 +62,7 @@ class OctavePriors(PriorTable):
 
     - `lowest`, `highest` [Hz]: limits of the frequencies that are compared.
     - `share`: highest frequency over the sampling rate.
+    - `busy`: quantile of the windows' powers that counts.
     - `seconds` [s]: length of a window.
     - `error`: standard error of the ratio of a recording.
     - `scatter`: standard deviation of the ratio between days.
@@ -71,6 +72,7 @@ class OctavePriors(PriorTable):
     lowest: float
     highest: float
     share: float
+    busy: float
     seconds: float
     error: float
     scatter: float
@@ -91,10 +93,14 @@ class FilteredPriors(PriorTable):
 class ChargePriors(PriorTable):
     """Drifts of the low values of the pressures.
 
-    `near` [Pa]: range above the lowest value; `seconds` [s]: averaging time; `scatter` [Pa/s]: standard deviation
-    between days, believed as if it came from `recordings` recordings.
+    - `share`: smallest fraction of the samples in which a chamber fed at the charge pressure is low.
+    - `near` [Pa]: range of the low values above the lowest one.
+    - `seconds` [s]: averaging time.
+    - `scatter` [Pa/s]: standard deviation of the drift between days.
+    - `recordings`: number of recordings that the prior on the scatter counts for.
     """
 
+    share: float
     near: float
     seconds: float
     scatter: float

@@ -37,8 +37,6 @@ DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
 PUMP = ("theta", "omega")
 #: Quantile of a pressure that counts as its lowest value, and fraction of the lowest samples with which a fit begins.
 LOWEST, BEGIN = 0.02, 0.3
-#: Minimum fraction of the samples in which a chamber that is fed at the charge pressure is low.
-MIN_FRACTION = 0.1
 #: Maximum and minimum number of samples of a fit, and its number of iterations.
 MAX_SAMPLES, MIN_SAMPLES, ITERATIONS = 4000, 200, 15
 #: Weight of samples above the fit, over that of samples below.
@@ -79,16 +77,24 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     for p, low in zip(pressures, lowest, strict=True):
         near = CHANGES.charge.near
         is_low = np.isfinite(p) & np.isfinite(regressors).all(axis=1) & (p < low + near) & (low < min(lowest) + near)
-        is_fed = is_low.mean() > MIN_FRACTION
+        is_fed = is_low.mean() > CHANGES.charge.share
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_fed))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
 
 def _average(values: Array, rate: float) -> Array:
-    """Average values (n,) over a fixed time around each sample, which removes the ripple of the pump."""
+    """Average the known values (n,) over a fixed time around each sample, which removes the ripple of the pump.
+
+    The result is NaN where no value within that time is known.
+    """
     from scipy.ndimage import uniform_filter1d
 
-    return np.asarray(uniform_filter1d(values, max(1, round(CHANGES.charge.seconds * rate))))
+    size, is_known = max(1, round(CHANGES.charge.seconds * rate)), np.isfinite(values)
+    if is_known.all():
+        return np.asarray(uniform_filter1d(values, size))
+    fraction = uniform_filter1d(is_known.astype(float), size)
+    average = uniform_filter1d(np.where(is_known, values, 0.0), size)
+    return np.where(fraction * size > 0.5, average / np.maximum(fraction, TINY), np.nan)
 
 
 def _regressors(recording: Recording, source: str) -> Array:

@@ -5,7 +5,7 @@ changes in proportion. A drift of one pressure alone over the recording is a dri
 pressure changes both alike. Both are fitted over the samples in which the piston moves (`motion_fit`), and a second
 time over the low values of each pressure, by which oil that leaves the circuit is told (`charge_pressure`). A filter
 of one sensor makes the spectra of the pressures unlike (`pressure_bands`). The scatter of these numbers between
-healthy recordings is their null (`differences`). Called for recordings with both chamber pressures and a motion.
+healthy recordings is their null (`differences`). Called for recordings with both chamber pressures.
 """
 
 from __future__ import annotations
@@ -16,7 +16,12 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.changes.charge_pressure import LowDrifts, compare_low_drifts, estimate_low_drifts
+from sealscope.diagnosis.inference.changes.charge_pressure import (
+    DRIFT,
+    LowDrifts,
+    compare_low_drifts,
+    estimate_low_drifts,
+)
 from sealscope.diagnosis.inference.changes.motion_fit import TIME, fit_difference, fit_robustly, select_motion
 from sealscope.diagnosis.inference.changes.pressure_bands import Octaves, compare_octaves, compare_spectra
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
@@ -45,7 +50,7 @@ class HealthyLevels:
     def learn(self, recording: Recording) -> Summary | None:
         """Estimate friction, drifts of p_A and p_B [Pa] and the ratio of their spectra, once for a recording.
 
-        Return None without a channel or enough motion.
+        The result lacks what the channels or too little motion do not allow; it is None if nothing can be estimated.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
@@ -67,7 +72,7 @@ class HealthyLevels:
         prior, entries = CHANGES.healthy, [*summaries, judged]  # the judged one is the last
         drift_A, drift_B = (np.array([float(entry[name]) for entry in entries]) for name in ("drift_A", "drift_B"))
         drifts = [
-            compare_with_healthy(name, "drift", float(drift[-1]), drift[:-1].tolist(), prior.drift)
+            compare_with_healthy(name, DRIFT, float(drift[-1]), drift[:-1].tolist(), prior.drift)
             for name, drift in zip(DRIFTS, (drift_A, drift_B, drift_A - drift_B), strict=True)
         ]
         if None not in drifts:
@@ -125,7 +130,7 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra; None without a channel or enough motion."""
+    """Estimate friction, drifts and spectra, as far as the recording allows; None if it allows none."""
     motion, fit = select_motion(recording), fit_difference(recording)
     levels = dict[str, float]()
     if motion is not None and fit is not None:

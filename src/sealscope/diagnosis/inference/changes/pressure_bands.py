@@ -30,8 +30,8 @@ from sealscope.recordings.recording import Array, Recording
 SIDES, BESIDE = "sides", "p_A beside p_B"
 #: Minimum number of octaves, and number of those at either end that are averaged.
 MIN_OCTAVES, AVERAGED = 3, 2
-#: Quantile of the windows' powers that counts, and number of samples of the median that removes single wrong ones.
-BUSY, GLITCH = 0.85, 3
+#: Number of samples of the median that removes single wrong ones.
+GLITCH = 3
 #: Minimum power whose logarithm is taken [Pa^2].
 MIN_POWER = 1e-6
 
@@ -66,9 +66,9 @@ def compare_octaves(recording: Recording) -> Octaves | None:
 def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
     """Compute the log RMS (k,) of values (n,) in the octaves between `edges` (k + 1,) [Hz], each in a busy window.
 
-    The spectra are those of half-overlapping windows of `length` samples; of each octave the quantile `BUSY` over the
-    windows counts, so that rests say nothing and a shock changes nothing. Single wrong samples are removed by a median
-    of three.
+    The spectra are those of half-overlapping windows of `length` samples. Of each octave a high quantile over the
+    windows counts (`busy` in `priors.toml`), to which neither rests nor a single shock contribute. Single wrong samples
+    are removed by a median of three.
     """
     from scipy.ndimage import median_filter
 
@@ -80,7 +80,7 @@ def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Ar
         window = values[start : start + length]
         power = np.abs(np.fft.rfft((window - window.mean()) * taper)) ** 2
         powers.append([power[octave == k].sum() for k in range(len(edges) - 1)])
-    return np.asarray(0.5 * np.log(np.quantile(powers, BUSY, axis=0) + MIN_POWER))
+    return np.asarray(0.5 * np.log(np.quantile(powers, CHANGES.octaves.busy, axis=0) + MIN_POWER))
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
