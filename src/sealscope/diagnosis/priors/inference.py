@@ -207,6 +207,7 @@ class HeldOilPriors(PriorTable):
     - `loaded`: log odds from which a pressure difference is surely a load.
     - `independent`: number of independent readings of one side in a hold.
     - `misfit`: fraction of the compressed volume that the terms do not describe.
+    - `gain`: relative difference between the gains of two pressure sensors.
     - `charge`: variation of the charge pressure over the smallest pressure of either side.
     - `air`: volume fraction of free air in the oil.
     """
@@ -225,6 +226,7 @@ class HeldOilPriors(PriorTable):
     loaded: float
     independent: float
     misfit: float
+    gain: float
     charge: float
     air: float
 

@@ -83,6 +83,21 @@ class LockedHold(NamedTuple):
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
+    def own_offset(self, offset: float) -> tuple[float, float]:
+        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given that of the recording, `offset` [Pa].
+
+        The two differ where the gains of the sensors do, with the standard deviation s = gain x pressure. The
+        difference d at the end of the hold is either the own offset, if a leak has equalised the pressures, or that
+        of a load, which may be any up to the pressures themselves. The more probable of the two is assumed. Returns
+        the own offset, and ((own - `offset`) / s)^2, its cost as -2 log of a relative probability density.
+        """
+        last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
+        pressure, deviation = float(last.max()), INFERENCE.held_oil.gain * float(last.max())
+        difference = float(last[0] - last[1])
+        cost = ((difference - offset) / deviation) ** 2
+        is_equalised = -0.5 * cost - np.log(deviation * np.sqrt(2.0 * np.pi)) > -np.log(pressure)
+        return (difference, cost) if is_equalised else (offset, 0.0)
+
     def steepest_time(self) -> float:
         """Find the time [s] at which the largest change of p_A - p_B in the hold begins.
 
@@ -280,8 +295,11 @@ class HeldChambers:
         return np.asarray(p > self.charge * (1.0 + INFERENCE.held_oil.charge))
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute the flow of a leak past the piston, sign(dp) |dp|^`exponent` of dp = p_A - p_B - `offset` [Pa]."""
-        differences = [hold.p_A - hold.p_B - offset for hold in self.holds]
+        """Compute the flow of a leak past the piston, sign(dp) |dp|^`exponent` of dp = p_A - p_B - z.
+
+        The offset z of a hold is near `offset` [Pa], as `LockedHold.own_offset` states it.
+        """
+        differences = [hold.p_A - hold.p_B - hold.own_offset(offset)[0] for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
 
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
@@ -338,7 +356,11 @@ class HeldChambers:
         includes the prior on the offset.
         """
         fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
-        return fit._replace(likelihood=fit.likelihood - 0.5 * offset_cost(offset))
+        return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
+
+    def _offset_cost(self, offset: float) -> float:
+        """Compute -2 log of the prior density of the sensor offset [Pa] and of those of the holds near it."""
+        return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
         """Estimate the leaks of the recording as `HeldLeaks` (6,), with the leak past the piston since `onset` [s].
@@ -459,7 +481,7 @@ class HeldChambers:
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(offset))
         onset = int(posteriors.argmax())
-        return onset, float(posteriors[onset]) - 0.5 * offset_cost(offset)
+        return onset, float(posteriors[onset]) - 0.5 * self._offset_cost(offset)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:

@@ -195,13 +195,17 @@ class RecordedBalance:
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        With equal pressures nothing flows through a leak, so such a hold would not show it. In the comparison all
-        loads up to the largest pressure difference of the recording are equally probable.
+        The pressures count from the time at which the pump stops, since a large leak equalises them while the valves
+        still shut. With equal pressures from then on nothing flows through a leak, so such a hold would not show it.
+        In the comparison all loads up to the largest pressure difference of the recording are equally probable.
         """
-        prior = INFERENCE.zero
-        pressure = float(np.abs(hold.mean(hold.p_A - hold.p_B)).max())
-        log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
+        prior, oil, t = INFERENCE.zero, INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
+        stopped, shut = np.searchsorted(t, hold.t[0] - np.array([oil.equalises + oil.settles, 0.0]))
+        pressure = float(
+            np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), np.nanmedian(difference[stopped : shut + 1])])
+        )
+        log_offset_density = -0.5 * offset_cost(pressure) - float(np.log(prior.pressure * np.sqrt(2.0 * np.pi)))
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
         log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
         return log_load_density - log_offset_density > INFERENCE.held_oil.loaded
