@@ -25,6 +25,7 @@ __all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 
 def __getattr__(name: str) -> Any:
+    """Load an exported name of the package when it is first used; a deprecated name warns."""
     if name == "__version__":
         from importlib.metadata import version
 
@@ -41,4 +42,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
+    """List the exported names of the package."""
     return __all__

@@ -41,7 +41,7 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate `function` to raise InputError for wrong arguments; its signature and docstring stay.
+    """Wrap `function` to raise InputError for wrong arguments, with its signature and docstring preserved.
 
     The error for an unknown keyword suggests the nearest known one: ``simulate has no argument 'comand'; did you mean
     'command'?``. Missing and surplus arguments raise InputError too. Errors of the function itself pass unchanged.
@@ -75,7 +75,8 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     """Declare an argument of a function as a dataclass field with a default value and documentation.
 
     `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number, empty
-    for other values. The field's metadata contain them under these names, with the unit appended to the text.
+    for other values. They are stored in the field's metadata under these names, with the unit appended to the text.
+    The decorator `take_fields_of` makes the function's signature and docstring from such fields.
     """
     return field(
         default=default, metadata={"kind": kind, "text": f"{text} [{unit}]." if unit else f"{text}.", "unit": unit}
@@ -96,7 +97,7 @@ def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Cal
     section = "\n".join(["Parameters", "----------", *lines, "", ""])
 
     def decorate(function: Callable[[V], R]) -> Callable[P, R]:
-        """Replace the dataclass argument of `function` by its fields."""
+        """Replace the only parameter of `function`, a dataclass, by one parameter for each of its fields."""
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:

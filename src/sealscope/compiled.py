@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 
 def is_known_version(version: str) -> bool:
-    """Test whether `KNOWN_VERSIONS` includes a numba version, such as "0.61.2".
+    """Return True if a numba version, such as "0.61.2", is within the range `KNOWN_VERSIONS`.
 
     In these versions numba has the private names that `numba_private` uses.
     """
@@ -82,7 +82,7 @@ def _compiler() -> ModuleType:
 def source_hash(root: Path) -> str:
     """Compute a hash over the Python and TOML files of all packages with compiled code, as hexadecimal digits.
 
-    `root`: folder that contains the packages.
+    `root`: folder that contains these packages.
     """
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
@@ -122,9 +122,9 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a private directory of this user, and no link.
+    """Raise PermissionError unless `folder` is a directory that belongs to this user alone, and not a link.
 
-    `forbidden`: permission bits that must not be set, such as 0o022, with which others can write. On Windows all
+    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows all
     folders pass.
     """
     status = folder.lstat()
@@ -195,8 +195,8 @@ def kernel(function: _F, fastmath: Any = False) -> _F:
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
     """Compile a law, a function that other compiled functions call.
 
-    `fastmath`: as for `kernel`; `inlined`: insert its code in place of each call. The function is returned unchanged
-    if numba's compilation is disabled.
+    `fastmath`: False, or the deviations from IEEE 754 that are allowed, as for `kernel`; `inlined`: insert its code
+    in place of each call. The function is returned unchanged if numba's compilation is disabled.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -204,15 +204,15 @@ def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
 
 
 def law(function: _F) -> _F:
-    """Compile a small function, such as a formula of physics, for inlining in the kernels that call it.
+    """Compile a small function, such as a formula of physics, for use in other compiled functions.
 
-    A call from Python runs the uncompiled function.
+    Its code is inserted in place of each call. A call from Python runs the uncompiled function.
     """
     return _compile_law(function, False)
 
 
 def large_law(function: _F) -> _F:
-    """Compile a function for calls from kernels that is too large to be inlined in them.
+    """Compile a large function for use in other compiled functions, which call it instead of containing its code.
 
     A call from Python runs compiled code, too.
     """
@@ -220,10 +220,10 @@ def large_law(function: _F) -> _F:
 
 
 def contracted(function: _F) -> _F:
-    """Compile a law, as `law` does, whose products and sums may be contracted to fused multiply-adds.
+    """Compile a small function for use in other compiled functions, with fused multiply-adds allowed.
 
-    Divisions may become products with the reciprocal. The last digits of the results depend on the processor, but not
-    on how the data are split into blocks or lanes (`physics.lanes`).
+    Besides, divisions may become products with the reciprocal. The last digits of the results then depend on the
+    processor, but not on the division of the data into blocks or lanes (`physics.lanes`).
     """
     return _compile_law(function, {"contract", "arcp"})
 
@@ -237,6 +237,7 @@ class Entry:
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 
     def __init__(self, function: Callable[..., Any]) -> None:
+        """Prepare the compilation of a function of two arrays of doubles, which returns a double."""
         self._address = _compiler().compile_at_address(function, self._SIGNATURE, cache_directory())
 
     @cached_property
@@ -259,7 +260,10 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     """
 
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instructions that call the function at the address."""
+        """Emit the LLVM instructions that call the function at the address.
+
+        Numba passes the arguments; `values` are the addresses of the function, its memory and its sample.
+        """
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()
         function = builder.inttoptr(values[0], llvm.FunctionType(double, [pointer, pointer]).as_pointer())
@@ -276,7 +280,10 @@ def address_of(context: Any, pointer: Any) -> Any:
     """
 
     def emit_conversion(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        """Emit the LLVM instruction that converts the pointer to a 64-bit integer."""
+        """Emit the LLVM instruction that converts the pointer to a 64-bit integer.
+
+        Numba passes the arguments; the only item of `values` is the pointer.
+        """
         return builder.ptrtoint(values[0], target.get_value_type(numba.int64))
 
     return numba.int64(pointer), emit_conversion
@@ -285,8 +292,8 @@ def address_of(context: Any, pointer: Any) -> Any:
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:
     """Build the NumPy dtype of a record of doubles.
 
-    `numbers`: names of the fields that are single doubles. `parts`: name of a field -> shape of an array of doubles,
-    or dtype of a nested record.
+    `numbers`: names of the fields that are single doubles; they come first. `parts`: by name of a further field, the
+    shape of its array of doubles, or the dtype of a nested record.
     """
     shaped = [(name, part) if isinstance(part, np.dtype) else (name, "f8", part) for name, part in parts.items()]
     return np.dtype([*((name, "f8") for name in numbers), *shaped])
@@ -312,10 +319,16 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
 
     @intrinsic  # type: ignore[misc]
     def cast_pointer(context: Any, pointer: Any) -> Any:
-        """Cast a pointer to doubles to a pointer to the record."""
+        """Cast a pointer to doubles to a pointer to the record, in compiled code only.
+
+        Numba passes `context`.
+        """
 
         def emit_cast(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            """Emit the LLVM instruction that casts the pointer."""
+            """Emit the LLVM instruction that casts the pointer.
+
+            Numba passes the arguments; the only item of `values` is the pointer.
+            """
             return builder.bitcast(values[0], target.get_value_type(kind))
 
         return kind(pointer), emit_cast

@@ -19,12 +19,13 @@ def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTE
 
 
 class SealscopeError(Exception):
-    """Base of every error that Sealscope raises on purpose; its text is one printable line.
+    """Base of every error that Sealscope raises on purpose; its text is one line.
 
     Line breaks become blanks, and the middle of a very long text is omitted.
     """
 
     def __init__(self, message: object = "") -> None:
+        """Format the message as one line, and omit the middle of a very long one."""
         line = " ".join(str(message).splitlines())
         if len(line) > _MAX_BEGINNING + _MAX_END:
             line = f"{line[:_MAX_BEGINNING]} ... {line[-_MAX_END:]}"

@@ -55,8 +55,8 @@ _simulation_lock = Lock()
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
     """Build a source of samples for each actuator whose settings contain `simulate`.
 
-    `say`: called with a message when a simulation begins, and when its time is over. Raises InputError if the
-    settings of an actuator do not describe a valid experiment.
+    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError
+    if the settings of an actuator do not describe a valid experiment.
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
@@ -68,8 +68,8 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
     """Build the experiment that simulates an actuator.
 
-    Raises InputError, with the actuator's name, for invalid settings, or if the experiment has more than
-    `MAX_IDENTITIES` blocks.
+    Raises InputError, with the actuator's name, for invalid settings. So it does for an experiment of more than
+    `MAX_IDENTITIES` blocks of 1 s, the most that the monitor's database can recognise as stored.
     """
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
@@ -81,7 +81,7 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 
 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
-    """Build a source that simulates an actuator and delivers its samples in blocks of 1 s.
+    """Build a source that simulates an actuator and submits its samples to the monitor in blocks of 1 s.
 
     The blocks arrive at `settings.speed` times real time; those that the monitor has already stored are left out.
     `name`: the actuator's name; `say`: function that prints a message.
@@ -113,7 +113,7 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
         say(f"{name}: the simulated time is over")
 
     def block_identity(number: int) -> str:
-        """Return the text by which the store recognises a block: the experiment's key and the number of the block."""
+        """Return the text by which the store recognises a block: the experiment's key and the block's number."""
         return f"simulated {experiment.key()} {number}"
 
     return play

@@ -46,21 +46,28 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
     _name = "sealscope_settled_laws"
 
     def __init__(self) -> None:
+        """Create the compiler pass, as numba requires."""
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace each `len` of an argument of fixed size by a constant in the code of `state`.
+        """Replace each `len` of an argument of fixed size by a constant.
 
-        Returns True if there was one.
+        `state`: numba's state of the compilation, with the code to change. Returns True if the code was changed.
         """
         code, changed = state.func_ir, False
 
         def find_definition(variable: Any) -> Any:
-            """Find the expression that defines a variable; None if it is not unique."""
+            """Find the expression that defines a variable in numba's intermediate code.
+
+            Returns None if there is not exactly one.
+            """
             return guard(get_definition, code, variable)
 
         def type_of(source: Any) -> Any:
-            """Find the numba type of an argument or of its attribute; None for other expressions."""
+            """Find the numba type of an argument of the compiled function, or of an attribute of an argument.
+
+            `source`: expression in numba's intermediate code. Returns None for other expressions.
+            """
             if isinstance(source, ir.Arg):
                 return state.args[source.index]
             owner = find_definition(source.value) if getattr(source, "op", None) == "getattr" else None
@@ -70,7 +77,11 @@ class ConstantLengths(FunctionPass):  # type: ignore[misc]
             return kind.typeof(source.attr) if isinstance(kind, types.Record) and source.attr in kind.fields else None
 
         def find_length(value: Any) -> int | None:
-            """Find the value of a call of `len`; None for other expressions and for unknown lengths."""
+            """Find the number that a call of `len` returns.
+
+            `value`: expression in numba's intermediate code. Returns None if it is no such call, or if the length is
+            not known.
+            """
             if getattr(value, "op", None) != "call" or len(value.args) != 1:
                 return None
             if getattr(find_definition(value.func), "value", None) is not len:
@@ -107,7 +118,7 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _FullCompil
 
 
 def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Compile a function that Python calls, when it is first called.
+    """Prepare a function that Python calls for compilation at its first call.
 
     `fastmath`: as for `numba.njit`; `folder` is not used, as nothing is cached here.
     """

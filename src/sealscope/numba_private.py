@@ -79,10 +79,10 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
     """Cache of numba in which an unreadable or unwritable file is a cache miss."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the compiled code of a signature; None if there is none or its file is damaged.
+        """Load the compiled code of a function for the argument types `sig`; None if it is missing or damaged.
 
-        Loaded code needs numba's reference counting, which is set up here. The rest of numba's set-up takes longer
-        than loading, and is left to the next compilation.
+        Loaded code needs numba's reference counting, which is set up here for `target_context`. The rest of numba's
+        set-up takes longer than loading, and is left to the next compilation.
         """
         try:
             rtsys.initialize(target_context)
@@ -95,7 +95,10 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save the compiled code of a signature; an error, such as a full disk, is only logged."""
+        """Save the compiled code `data` of a function for the argument types `sig`.
+
+        An error, such as a full disk, is only logged.
+        """
         try:
             super().save_overload(sig, data)
         except Exception as error:
@@ -156,10 +159,10 @@ def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | N
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Code of a law, i.e. a function that kernels call, for linking with these, without machine code.
+    """Compiled code of a function that only other compiled functions call, without machine code of its own.
 
-    Machine code is not needed, as a law is never called by its address. The law is optimised here once, not within
-    each kernel, so that all kernels compute identical results.
+    It is linked into these functions as LLVM code; it is never called by its address. It is optimised here once, not
+    within each of them, so that all compute identical results.
     """
 
     def _finalize_final_module(self) -> None:
@@ -168,10 +171,16 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _LawCompiler(_ShortCompiler):
-    """Compiler of laws, which generates no machine code and takes a fifth of the time of a kernel."""
+    """Compiler of functions that only other compiled functions call.
+
+    It generates no machine code, and takes a fifth of the time that compiling for Python takes.
+    """
 
     def define_pipelines(self) -> list[Any]:
-        """Turn off the generation of machine code, and return the passes in `_PASSES` as the only pipeline."""
+        """Build the list of numba's pipelines, which has one entry: the passes in `_PASSES`.
+
+        The generation of machine code is turned off.
+        """
         self.state.flags.no_compile = True
         self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
@@ -187,19 +196,22 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
     folder: Path | None = None
 
     def add_overload(self, cres: Any) -> None:
-        """Register compiled code for other compiled functions, without an entry point for Python."""
+        """Register compiled code for use in other compiled functions, without an entry point for Python.
+
+        `cres`: numba's result of the compilation.
+        """
         name = object()  # stands for the missing machine code
         self.targetctx.insert_user_function(name, cres.fndesc, [cres.library])
         self.overloads[tuple(cres.signature.args)] = cres._replace(entry_point=name)
 
     @cached_property
     def _for_python(self) -> Any:
-        """Function that runs when Python calls the law: uncompiled for a small law, else a kernel."""
+        """Function that runs when Python calls this one: uncompiled if small, else compiled anew for Python."""
         inlined = self.targetoptions["forceinline"]
         return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Run the law for a call from Python."""
+        """Run the function for a call from Python: uncompiled if small, else compiled anew for Python."""
         return self._for_python(*arguments, **named)
 
 

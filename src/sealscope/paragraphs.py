@@ -31,7 +31,8 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
     """Format rows (label, text) as paragraphs, with the labels in a first column `columns` characters wide.
 
-    Rows without a text are omitted. `width`: longest line in characters.
+    Rows without a text are omitted. `width`: longest line in characters. Returns the paragraphs, which may have
+    several lines each.
     """
     return [paragraph(text, f"  {label}".ljust(columns), columns, width) for label, text in rows if text]
 

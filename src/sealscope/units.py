@@ -52,7 +52,7 @@ class Unit(NamedTuple):
     offset: Fraction = Fraction(0)
 
     def times(self, other: Unit, power: Fraction) -> Unit:
-        """Multiply this unit by `other` to the power `power`; the result has no offset.
+        """Multiply this unit by `other` raised to `power`; the result has no offset.
 
         Raises ValueError if the factor exceeds the range of doubles.
         """
@@ -71,7 +71,8 @@ class Unit(NamedTuple):
 def _build_unit(row: Mapping[str, Any]) -> Unit:
     """Build the Unit of a row of `units.toml`.
 
-    The keys of a row are base units with their powers, and, if needed, `factor`, `pi` (power of pi) and `offset`.
+    The keys of a row are base units with their powers, and, if needed, `factor`, `pi` (power of pi) and `offset`,
+    which is added to a value before the multiplication.
     """
     powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
     factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
@@ -151,7 +152,7 @@ def _parse_name(name: str) -> Unit:
 def _tokenize(text: str) -> list[str]:
     """Split the text of a unit into names, powers such as `^2`, brackets and slashes.
 
-    Raises ValueError for other text.
+    Raises ValueError for a text that contains anything else.
     """
     tokens, position = [], 0
     while position < len(text):
@@ -244,7 +245,7 @@ def _describe_dimension(si_unit: str) -> str:
 
 
 def same_dimension(unit: str, other: str) -> bool:
-    """Test whether values can be converted between two units; False also if one is not a unit."""
+    """Return True if values can be converted between two units; False also if one is not a unit."""
     try:
         return parse_unit(unit).powers == parse_unit(other).powers
     except InputError:
@@ -252,7 +253,7 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Test whether a unit consists of units known without pint, such as `bar`, `psig` and `cm3/s`.
+    """Return True if a unit is known without pint, alone or as a quotient, such as `bar`, `psig` and `cm3/s`.
 
     Pint knows thousands of names, many of them ordinary words, such as `rod`, which is 5 m.
     """
@@ -275,9 +276,10 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the conversion from `unit` to `si_unit` as `_conversion` does, with a complete error message.
+    """Compute the exact conversion from `unit` to `si_unit`: (factor, power of pi, first offset, second offset).
 
-    The InputError states `name`, the expected dimension and, if it is not None, the file or option `place`.
+    They are those of `_conversion`. If the dimensions differ, raises an InputError that states `name`, the expected
+    dimension and, if it is not None, the file or option `place`.
     """
     try:
         return _conversion(unit, si_unit)
@@ -289,7 +291,7 @@ def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _
 def _convert_exactly(value: Fraction, conversion: _Conversion) -> float:
     """Convert one number exactly and round it once; infinite if it exceeds the range of doubles.
 
-    `conversion`: as from `_conversion`.
+    `conversion`: (factor, power of pi, first offset, second offset), as from `_conversion`.
     """
     factor, pi_power, offset_before, offset_after = conversion
     exact = (value + offset_before) * factor
@@ -342,7 +344,11 @@ def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., plac
 def from_si(
     values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
 ) -> Array | float:
-    """Convert `values` in `si_unit` to doubles in `unit`, the inverse of `to_si`, with the same errors."""
+    """Convert `values` (any shape, or one number) in `si_unit` to doubles in `unit`.
+
+    This is the inverse of `to_si`, with the same precision. Raises InputError if `unit` has another dimension; the
+    message states `name`, the unit, the expected dimension and the file `place`.
+    """
     _find_conversion(unit, si_unit, name, place)
     return to_si(values, si_unit, unit, name=name, place=place)
 

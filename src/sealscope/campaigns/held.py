@@ -88,7 +88,10 @@ class PlannedHold(NamedTuple):
 
 
 def has_shut_off(rig: Rig) -> bool:
-    """Return True if a rig's parameters state, not only assume, valves that shut the cylinder off from its pump."""
+    """Return True if a rig has valves that shut the cylinder off from its pump.
+
+    The openings of the valves must be stated parameters; assumed ones do not count.
+    """
     sources = [rig.entry(name).source for name in ("line.open_A", "line.open_B")]
     return rig.line.orifices == "present" and not any(source.startswith(("absent", "assumed")) for source in sources)
 
@@ -98,10 +101,10 @@ def plan_hold(
 ) -> PlannedHold:
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
-    In a locked hold, valves shut the cylinder off from its pump. If none of `HOLD_DURATIONS` suffices, the longest is
-    planned; if `find` is None, a hold of `DEFAULT_DURATION` is. `flow` [m^3/s]: mean flow of the pump under the usual
-    duty; `false_alarm`: probability of the verdict `leak` without a leak; `detection`: probability of this verdict
-    with the leak. Raises InputError if the load is not > 0.
+    In a locked hold, valves shut the cylinder off from its pump. If no duration in `HOLD_DURATIONS` suffices, the
+    longest is planned. If `find` is None, a hold of `DEFAULT_DURATION` is planned. `flow` [m^3/s]: mean flow of the
+    pump under the usual duty; `false_alarm`: probability of the verdict `leak` without a leak; `detection`:
+    probability of this verdict with the leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -114,13 +117,15 @@ def plan_hold(
 class _HoldDraws:
     """Simulated locked holds of one duration, by which the smallest leak that they detect is found.
 
-    `duration` [s]; the other arguments are those of `plan_hold`.
+    In a locked hold, valves shut the cylinder off from its pump. `load` [N]: load that the cylinder holds; `flow`
+    [m^3/s]: mean flow of the pump under the usual duty; `duration` [s]; `false_alarm`: probability of the verdict
+    `leak` without a leak; `detection`: probability of this verdict with the leak.
     """
 
     def __init__(
         self, rig: Rig, load: float, flow: float, duration: float, false_alarm: float, detection: float
     ) -> None:
-        """Set the pressures of the hold, and the limits on false alarms and missed leaks.
+        """Set the pressures of the locked hold, and the limits on false alarms and missed leaks.
 
         Chamber B is at the charge pressure; chamber A is higher by the load over its piston area.
         """
@@ -172,10 +177,11 @@ def _decay_per_conductance(rig: Rig) -> float:
 
 
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
-    """Simulate a locked hold with a leak past the piston and with sensor noise; judge it like a hold of a recording.
+    """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
 
     `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty; `seed`: of
-    the noise. Returns the sums that a recording would have, of which only the leak measured in the hold is set.
+    the noise. Returns the summary of a recording with this hold. It has the leak measured in the hold, the flow and
+    the pressure difference; its Gram matrix is 0.
     """
     random, cylinder, sensors = np.random.default_rng(seed), rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE

@@ -46,7 +46,7 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """The duty of a planned recording: its voltage command and its load.
+    """The duty of a planned recording, that is its voltage command and its load.
 
     Both are texts, such as '3 sin(4t)', in volts, and '2 kN'; "" means no load.
     """
@@ -106,11 +106,11 @@ class RecordingPlan(NamedTuple):
         return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Convert a conductance [m^3/(s Pa)] to the flow at the usual pressure [L/min]; return None for inf."""
+        """Convert a leakage conductance [m^3/(s Pa)] to the leak flow [L/min] at the usual pressure; None for inf."""
         return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the plan to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
+        """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
 
         def leak_dict(leak: DetectableLeak) -> dict[str, Any]:
             """Convert the smallest leaks of one duty to JSON values; infinite numbers become None."""
@@ -137,7 +137,7 @@ class RecordingPlan(NamedTuple):
         }
 
     def text(self) -> str:
-        """Format the plan as lines of text, the answer first."""
+        """Format the planned recording as lines of text, with the best duty and its smallest leak first."""
         best, separating = self.for_detection, self.for_separation
         at_pressure = f"at {self.usual_pressure / 1e6:.2g} MPa"
         target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {at_pressure}: "
@@ -163,7 +163,7 @@ class RecordingPlan(NamedTuple):
         return "\n".join(lines)
 
     def _format_flow(self, conductance: float) -> str:
-        """Format the flow of a conductance at the usual pressure, or '-' if it is infinite."""
+        """Format the leak flow [L/min] of a conductance [m^3/(s Pa)] at the usual pressure; '-' if it is infinite."""
         flow = self.lpm(conductance)
         return "-" if flow is None else f"{flow:.2g} L/min"
 
@@ -187,8 +187,8 @@ def detectable_leak(
     """Compute the smallest leak that is detected in recordings of a duty and of `duration` [s].
 
     The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
-    leak; `detection`: probability of an alarm with it. If a simulation or its balance fails, the smallest leak is
-    inf, with the reason in `note`.
+    leak; `detection`: probability of an alarm with it. If a simulation fails, or the volume balance of its recording,
+    the smallest leak is inf, with the reason in `note`.
     """
     steps = []
     try:
@@ -202,7 +202,7 @@ def detectable_leak(
 
 
 class _DetectableSteps(NamedTuple):
-    """The smallest steps of the leak that are detected in one recording.
+    """The smallest sudden increases (steps) of the leakage conductance that are detected in one recording.
 
     `step` [m^3/(s Pa)]: smallest step that is detected; `separable` [m^3/(s Pa)]: smallest step that can also be told
     from a step of the pump's leakage; `pressure` [Pa]: mean |p_A - p_B|; `flow` [m^3/s]: mean flow of the pump.
@@ -215,10 +215,11 @@ class _DetectableSteps(NamedTuple):
 
 
 def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detection: float) -> _DetectableSteps:
-    """Compute the smallest steps of the leak that would be detected, from a leak-free recording.
+    """Compute from a leak-free recording the smallest sudden increase (step) of the leak that would be detected.
 
-    `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it. Raises
-    InputError if the volume balance cannot be computed from the recording.
+    Also computes the smallest step that can be told from a leak of the pump. `false_alarm`: probability of an alarm
+    without a leak; `detection`: probability of an alarm with it. Raises InputError if the volume balance cannot be
+    computed from the recording.
     """
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
@@ -238,8 +239,9 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    Both steps are in the middle of the recording. The factor is inf if the balance has no term for the pump's
-    leakage, or if the two steps cannot be told apart.
+    `blocks`: parts of the recording, reduced to Gram matrices of the balance's columns; `columns`: for each equation,
+    the indices of the columns with leak and pump. Both steps are in the middle of the recording. The factor is inf if
+    the balance has several equations or no column for the pump's leakage, or if the two steps cannot be told apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:

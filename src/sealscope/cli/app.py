@@ -75,8 +75,8 @@ def _root(
 def normalise_arguments(words: Sequence[str]) -> list[str]:
     """Rearrange the words of a call to the form that typer understands.
 
-    `-v` comes first, wherever it stood; each baseline gets an option `--baseline` of its own; and `monitor FILE`
-    becomes `monitor run FILE`.
+    `-v` comes first, wherever it stood; `--baseline` is repeated before each baseline; and `monitor FILE` becomes
+    `monitor run FILE`. Raises InputError if no file follows `--baseline`.
     """
     end = list(words).index("--") if "--" in words else len(words)  # behind it there are no options
     verbose = [word for word in words[:end] if word in ("-v", "--verbose")]
@@ -89,9 +89,10 @@ def normalise_arguments(words: Sequence[str]) -> list[str]:
 def spread_baselines(words: Sequence[str]) -> list[str]:
     """Repeat the option `--baseline` before each of the files after it, as typer requires.
 
-    In this way `--baseline FILE...` accepts wildcards. All words after `--baseline` up to the next option are
-    baselines. If no other FILE would be left, only the first word after `--baseline` is a baseline, and the others
-    are the files to diagnose. Raises InputError if no file follows `--baseline`.
+    In this way `--baseline FILE...` of the commands diagnose and report accepts wildcards; the words of other
+    commands stay unchanged. All words after `--baseline` up to the next option are baselines. If no other FILE would
+    be left, only the first word after `--baseline` is a baseline, and the others are the files to diagnose. Raises
+    InputError if no file follows `--baseline`.
     """
     if "--baseline" not in words or words[0] not in ("diagnose", "report"):
         return list(words)
@@ -119,7 +120,7 @@ def spread_baselines(words: Sequence[str]) -> list[str]:
 
 @cache
 def _click_command() -> Any:
-    """Build the click command of the app, once."""
+    """Build the click command of the whole command line; later calls return the same object."""
     return typer.main.get_command(app)
 
 
@@ -163,14 +164,18 @@ def main() -> None:
 
 @contextmanager
 def _repeating_lost_interrupts() -> Iterator[None]:
-    """Send an interrupt again if Python ignored it, for example in a finalizer of the compiler.
+    """Repeat an interrupt (Ctrl-C) that Python ignored, within the `with` block.
 
-    Valid within the `with` block.
+    Python ignores exceptions in code that cannot pass them on, such as a finalizer of the compiler.
     """
     original_hook = sys.unraisablehook
 
     def repeat_interrupt(unraisable: Any) -> None:
-        """Send SIGINT to this process again if the ignored exception was a KeyboardInterrupt."""
+        """Send SIGINT to this process again if the ignored exception was a KeyboardInterrupt.
+
+        `unraisable`: description of the exception, as Python passes it to `sys.unraisablehook`. Other exceptions are
+        handled as before.
+        """
         if unraisable.exc_type is not KeyboardInterrupt:
             original_hook(unraisable)
             return

@@ -99,7 +99,7 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
 
 @campaign.command()
 def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = None) -> None:
-    """Judge the rows stored so far, and write tables and page."""
+    """Judge the records of a plan that are done so far, and write the tables and the page."""
     from sealscope.campaigns.plans.reader import load_plan
 
     loaded = load_plan(plan)
@@ -161,10 +161,10 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
 
 
 def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Judge the records of a campaign.
+    """Judge the detectors of a campaign by its records, and return the result.
 
-    A simulated plan is judged by the rows stored in `folder`, others by the recordings in the folder `data`. Raises
-    InputError if the recordings are needed and `data` is None or no folder.
+    A simulated plan is judged by the results stored in `folder`, others by the recordings in the folder `data`.
+    Raises InputError if the recordings are needed and `data` is None or no folder.
     """
     from sealscope.campaigns.plans.model import SimulatedPlan
     from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign

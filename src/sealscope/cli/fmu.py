@@ -32,10 +32,10 @@ def fmu(
     sensor: Annotated[str | None, Option(help=_SENSOR)] = None,
     rate: Annotated[str | None, Option(help="Sampling rate of the soft sensor (500 Hz).")] = None,
 ) -> None:
-    """Write a rig as an FMU for co-simulation, or a soft sensor of its leakage; no Python in it.
+    """Write a rig, or a soft sensor of its leakage, as an FMU for co-simulation that runs without Python.
 
-    The rig has the inputs command, leak and load, and every parameter can be tuned. The soft sensor takes readings and
-    gives the leakage in m^3/s with its 95 % interval.
+    The rig has the inputs command, leak and load, and every parameter can be tuned. The soft sensor takes the
+    readings of other sensors and gives the leakage in m^3/s with its 95 % interval.
     """
     from sealscope.fmu.build import ERROR, write_fmu, write_sensor_fmu
     from sealscope.units import parse_quantity

@@ -37,7 +37,7 @@ def commission(
         typer.Option("--since", metavar="DATE", help="With --add: forget recordings before DATE, as after a repair."),
     ] = None,
 ) -> None:
-    """Learn a machine once from healthy recordings: its terms, sensors, scatter, and the smallest leak it will show.
+    """Learn a machine once from healthy recordings: its model terms, sensors, scatter and smallest detectable leak.
 
     `diagnose`, `trend`, `report` and `monitor` use the file with --machine.
     """
@@ -61,7 +61,11 @@ def commission(
         paths = recordings_in(files)
 
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the files to the healthy recordings of a machine; after a repair, forget those before it."""
+            """Add the files to the healthy recordings of a machine, and return the changed machine.
+
+            If `--since` states the date of a repair, it is noted in the machine, and recordings before it are
+            dropped.
+            """
             if repair is not None:
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair, onset_s=repair)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))

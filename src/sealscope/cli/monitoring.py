@@ -27,7 +27,7 @@ FileOption = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The 
 
 @monitor.command()
 def init(output: FileOption = Path("monitor.toml")) -> None:
-    """Write a commented file of settings."""
+    """Write a commented file of settings for the monitor."""
     from sealscope.monitor.settings import template
 
     if output.exists():
@@ -42,7 +42,7 @@ def run(
     file: Annotated[Path, Argument(metavar="FILE", help="Settings, as `sealscope monitor init` writes them.")],
     once: Annotated[bool, Option("--once", help="End when standard input and folders hold nothing new.")] = False,
 ) -> None:
-    """Watch the actuators of FILE: blocks in, alarms as JSON lines on standard output."""
+    """Watch the actuators of FILE: read blocks of samples, and print alarms as JSON lines on standard output."""
     if not logging.getLogger("sealscope").handlers:
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     from sealscope.monitor.supervisor import LimitedLines
@@ -59,7 +59,7 @@ def demo(
     port: Annotated[int, Option(min=0, max=65535, help="Port of the page.")] = 8765,
     speed: Annotated[float, Option(min=0.1, max=1000.0, help="Times real time.")] = 20.0,
 ) -> None:
-    """Watch three simulated actuators at 20 times real time; one begins to leak after two simulated minutes."""
+    """Watch three simulated actuators, by default at 20 times real time; one leaks after two simulated minutes."""
     import tempfile
 
     from sealscope.live_simulation import DEMO
@@ -92,7 +92,7 @@ def export(
 
 @monitor.command()
 def dashboard(file: FileOption = Path("grafana.json")) -> None:
-    """Write a dashboard that Grafana imports, for the metrics of the page's /metrics."""
+    """Write a Grafana dashboard for the metrics that the monitor's page offers under /metrics."""
     import json
 
     from sealscope.monitor.outputs.grafana import dashboard as grafana

@@ -40,7 +40,10 @@ _log = logging.getLogger(__name__)
 
 
 def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Build a function for the shell that completes a partly typed name; `names`: function that returns all names."""
+    """Build a function for the shell that completes a partly typed name.
+
+    `names`: function that returns all names.
+    """
 
     def complete(incomplete: str) -> list[str]:
         """List the names that begin with the typed text; typer requires the name `incomplete`."""
@@ -136,12 +139,12 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 
 @dataclass(frozen=True)
 class StatedMachine:
-    """The machine that the options of a call describe, and how its files are read.
+    """The machine that the options of a call describe, and the way to read its files.
 
     `commissioned`: the machine of the option `--machine`, which determines everything else; None without this option.
     `channel_map`, `rate`: choice of columns and sampling rate [Hz] for reading files. `rig`: what is known or assumed
-    of the machine; `limit`: leak to be repaired, as text; `baseline`: leak-free recordings. These are None or () if
-    not given.
+    of the machine; `limit`: leak to be repaired, as text; `baseline`: leak-free recordings. What is not given
+    is None, {} or ().
     """
 
     commissioned: CommissionedMachine | None = None
@@ -163,9 +166,10 @@ class StatedMachine:
         limit: LimitOption = None,
         baseline: BaselineOption = None,
     ) -> StatedMachine:
-        """Build the machine from the options of a call, whose types define the help texts.
+        """Build the machine from the options of a command.
 
-        Raises InputError for an invalid option, and for one that must not stand beside `--machine`.
+        The types of the parameters declare the command-line options and their help texts. Raises InputError for an
+        invalid option, and for any other option together with `--machine`.
         """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
@@ -191,12 +195,15 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """Channel map in the rig's file; empty if there is none, or if `--map` replaces it."""
+        """Channel map in the rig's file, which states the column of each channel.
+
+        It is empty if there is none, or if `--map` replaces it.
+        """
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
     def has_map(self) -> bool:
-        """True if the options of the call, or the file of its rig, state a channel map."""
+        """True if the options of the call, or the file of its rig, state the columns of channels (a channel map)."""
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
@@ -222,7 +229,10 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read a file with the channel map of the call, or else of the rig."""
+        """Read the recording in a file with the channel map of the call, or else of the rig's file.
+
+        The rig's map is applied only to files that have its columns.
+        """
         if not self._rig_map:
             from sealscope.recordings import read
 
@@ -251,8 +261,8 @@ class StatedMachine:
     ) -> Diagnosis:
         """Diagnose a recording of this machine.
 
-        `baseline`: healthy recordings, or empty; `file`: name of the recording in the diagnosis; `false_alarm`:
-        probability of the verdict `leak` on a leak-free recording.
+        `baseline`: healthy recordings, or empty; a commissioned machine has its own instead. `file`: name of the
+        recording in the diagnosis; `false_alarm`: probability of the verdict `leak` on a leak-free recording.
         """
         from dataclasses import replace
 
@@ -276,7 +286,10 @@ def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callabl
 
 
 def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`."""
+    """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`.
+
+    The argument `drifts` is left out, as it cannot be written as text.
+    """
     special_options = {
         "rig": RigOption,
         "set": SetOption,
@@ -297,7 +310,11 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
 
 
 def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> Experiment:
-    """Build the experiment of a call from its options; `set`: overrides; `arguments`: those of `Experiment.of`."""
+    """Build the simulated experiment of a call from the values of its options.
+
+    `rig`: name or file of the rig; `set`: values that replace its parameters, as `NAME=VALUE[unit]`; `arguments`:
+    further arguments of `Experiment.of`.
+    """
     from sealscope.simulation.experiment import Experiment
 
     return Experiment.of(rig=load_rig_with(rig, set), **arguments)
@@ -355,7 +372,10 @@ def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacemen
 
 
 def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
-    """Load a rig by its name or file, and replace the values that `--set` states."""
+    """Load a rig by its name or file, and replace the parameters that the options `--set` state.
+
+    `overrides`: texts `NAME=VALUE[unit]`, None for none.
+    """
     from sealscope.parameters import load_rig, parse_overrides
 
     rig = load_rig(name)
@@ -363,10 +383,10 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
 
 
 def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
-    """Parse the `--map` options to a channel map: channel -> column.
+    """Parse the `--map` options to a channel map, which states the column of each channel.
 
-    With `auto` the remaining channels are found by the names of the columns. Raises InputError for a channel that is
-    given twice.
+    With `auto` the remaining channels are found by the names of the columns; if it is the only option, the result is
+    "auto". Without options the map is empty. Raises InputError for a channel that is given twice.
     """
     from sealscope.recordings import split_map_option
     from sealscope.recordings.formats.columns import REST
@@ -381,12 +401,12 @@ def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
 
 
 def is_verbose(context: Context) -> bool:
-    """Test whether the call has the option `-v`."""
+    """Return True if the call has the option `-v`."""
     return bool(context.find_root().params.get("verbose"))
 
 
 def say(text: str) -> None:
-    """Print lines on standard output, with control characters escaped."""
+    """Print lines on standard output, with control characters replaced."""
     echo(printable(text, "\n"))
 
 
@@ -399,7 +419,7 @@ def say_wrapped(text: str, head: str = "") -> None:
 
 
 def complain(message: object) -> None:
-    """Print one line on standard error."""
+    """Print an error or a warning as one line on standard error."""
     echo(f"sealscope: {printable(str(message))}", err=True)
 
 
@@ -423,7 +443,7 @@ def attempt(file: Path, work: Callable[[], T]) -> T | None:
 def check_folder(file: Path) -> None:
     """Check before a long run that the folder of the file to write exists; raise InputError otherwise.
 
-    Temporary files that calls left when they were killed while writing this file are removed.
+    Temporary files are removed that earlier calls left when they were stopped while writing this file.
     """
     from sealscope.storage import atomic
 
@@ -441,7 +461,10 @@ def write_text(file: Path, text: str) -> None:
 
 
 def say_jobs(jobs: int | None) -> None:
-    """Warn on standard error if fewer processes will be started than `--jobs` asks for."""
+    """Warn on standard error if fewer processes will be started than `--jobs` asks for.
+
+    `jobs`: number of that option, None if it is not given.
+    """
     from sealscope.campaigns.execution.workers import process_count
 
     if jobs is not None and jobs > (n_processes := process_count(jobs)):
@@ -452,8 +475,8 @@ def say_jobs(jobs: int | None) -> None:
 def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
     """Show progress bars on standard error within the `with` block; yield a function of (task, fraction done).
 
-    `noun`: name of the things that are counted, for a single bar; by default each task has a bar. If standard error
-    is no terminal, a line is printed once a minute if `noun` is given, and else nothing.
+    Each task has a bar of its own, unless `noun` is given: the name of the things that a single bar counts. If
+    standard error is no terminal, a line is printed once a minute if `noun` is given, and else nothing.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -467,7 +490,7 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
         tasks: dict[str, Any] = {}
 
         def update(task: str, fraction: float) -> None:
-            """Set the bar of a task, or the only bar, to a fraction of its length."""
+            """Show the completed fraction (0 to 1) of a task in its progress bar, or in the only bar."""
             key = noun or task
             if key not in tasks:
                 tasks[key] = bar.add_task(task, total=1.0)
@@ -477,12 +500,15 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
 
 
 def _minute_reporter() -> Callable[[str, float], None]:
-    """Build a function of (task, fraction) that prints the task and the time left once a minute."""
+    """Build a function of (task, fraction done) that prints the task and the time left once a minute."""
     start = last_print = time.monotonic()
     start_fraction: float | None = None
 
     def update(task: str, fraction: float) -> None:
-        """Print the task and the time left, unless a line was printed within the last minute."""
+        """Print the task and the time left, unless a line was printed within the last minute.
+
+        `fraction` (0 to 1): completed part of the task, from which the time left is estimated.
+        """
         nonlocal last_print, start_fraction
         now = time.monotonic()
         if start_fraction is None:
@@ -497,9 +523,9 @@ def _minute_reporter() -> Callable[[str, float], None]:
 
 @contextmanager
 def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show how many things are done and the time left, on standard error; yield a function of (done, total, note).
+    """Show the number of things done and the time left, on standard error; yield a function of (done, total, note).
 
-    `noun`: name of the things, in the plural.
+    `noun`: name of the things, in the plural; `note`: further text to show, "" for none.
     """
     with progress(noun) as show:
         yield lambda done, total, note: show(
@@ -508,7 +534,7 @@ def counted_progress(noun: str) -> Iterator[Callable[[int, int, str], None]]:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration [s] in hours, minutes or seconds, whichever suits it."""
+    """Format a duration [s]: in hours above 90 minutes, in minutes above 90 seconds, else in seconds."""
     if seconds > 5400:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.0f} min" if seconds > 90 else f"{seconds:.0f} s"

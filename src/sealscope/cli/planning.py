@@ -26,9 +26,10 @@ def plan(
     overrides: opt.SetOption = None,
     output: Annotated[Literal["text", "json"], Option("--format", help="Text, or one JSON object.")] = "text",
 ) -> None:
-    """Plan the recording that finds a leak: command, load and duration, and whether it tells piston from pump.
+    """Plan the recording that finds a leak: its command, load and duration.
 
-    The plan uses simulated leak-free recordings and the statistical test of diagnose.
+    The plan also says whether the recording tells a leak of the piston from one of the pump. It uses simulated
+    leak-free recordings and the statistical test of diagnose.
     """
     from sealscope.campaigns.smallest import PlannedDuty, plan_recording
     from sealscope.diagnosis.commissioned.machine_file import read_machine

@@ -25,7 +25,7 @@ def new(
         Path | None, Option("--output", "-o", help="Folder to make; by default the name with dashes.")
     ] = None,
 ) -> None:
-    """Write a package with a detector of your own: code that runs, its tests, and a plan that judges it."""
+    """Write a package with a detector of your own: code that runs, its tests, and a campaign plan to evaluate it."""
     from sealscope.storage.folders import make_folder
 
     if not re.fullmatch(r"[a-z][a-z0-9]*( [a-z0-9]+){0,5}", name) or len(name) > 60:

@@ -101,10 +101,11 @@ def diagnose(
 def _diagnose_in_parallel(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
-    """Diagnose each file in one of several processes; yield (messages for standard error, diagnoses) of each file.
+    """Diagnose files in parallel processes, and yield the results in the order of the files.
 
-    `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. On a single core
-    all files are diagnosed in this process, and one pair is yielded.
+    `work`: function that yields the dated diagnoses of some files, with None for an unreadable file. Each result is a
+    pair: messages for standard error, and the dated diagnoses of one file. On a single core all files are diagnosed
+    in this process, and one pair is yielded for all.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -121,8 +122,8 @@ def _diagnose_in_parallel(
 def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) -> str:
     """Format a diagnosis for printing.
 
-    `form`: "jsonl", a JSON object; "whole", all methods; "short"; "line", the first line of short; or "table", one
-    line with the start of the recording, `start_s` [s since 1970] or None.
+    `form`: "jsonl", a JSON object; "short", a short text; "whole", a text with all methods; "line", the first line of
+    the short text; or "table", a line with the start of the recording, `start_s` [s since 1970], None if unknown.
     """
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
@@ -135,7 +136,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
-    """Test whether a word of `--fail-on` applies to a diagnosis.
+    """Return True if a word of `--fail-on` applies to a diagnosis.
 
     `reason`: the word, either a verdict or a level of severity, which the leak must reach or exceed.
     """
@@ -144,7 +145,7 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
-    """Test whether files are recordings of one machine over time.
+    """Return True if files are recordings of one machine over time.
 
     There must be at least `_MIN_SERIES_FILES`, their names may differ only in numbers, and all `starts` [s since
     1970] must be known and at least an hour apart.
@@ -157,7 +158,7 @@ def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bo
 
 
 def _reads_standard_input(files: Iterable[Path]) -> bool:
-    """Test whether standard input, `-`, is among the files; raise InputError if it is there more than once."""
+    """Return True if standard input, `-`, is among the files; raise InputError if it is there more than once."""
     count = sum(file == opt.STANDARD_INPUT for file in files)
     if count > 1:
         raise InputError(f"standard input (-) must be given once, got it {count} times")
@@ -195,7 +196,7 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield (start [s since 1970] or None, diagnosis) of each recording, or None for an unreadable file.
+    """Yield (start [s since 1970] or None, diagnosis) of each recording, or None for an unreadable file or baseline.
 
     `options`: further arguments of `_iter_diagnoses`.
     """
@@ -204,7 +205,11 @@ def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dat
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Find the start of a diagnosed recording [s since 1970]; None if standard input states no date."""
+    """Find the time of the first sample of a diagnosed recording [s since 1970].
+
+    It is taken from the recording, the name of its file, or the time of the file's last change. None if a recording
+    from standard input states no date.
+    """
     from sealscope.recordings.joining import file_seconds, start_seconds
 
     path = Path(result.diagnosis.file)
@@ -214,7 +219,10 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Run `work` on files; return its messages for standard error as text, and the list of its results."""
+    """Diagnose files by the function `work`, and collect its messages for standard error.
+
+    Returns the messages as text, and the list of the dated diagnoses, with None for an unreadable file.
+    """
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses

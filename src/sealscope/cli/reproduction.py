@@ -14,7 +14,7 @@ from sealscope.errors import InputError
 
 
 def _item_names() -> list[str]:
-    """List the names of all that can be reproduced, for completion: items, chapters and `all`."""
+    """List, for completion, all names that `reproduce` accepts: items (tables and figures), chapters and `all`."""
     from sealscope.thesis.engine.items import load_items
 
     items = load_items()
@@ -72,9 +72,10 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print the items whose ids match `patterns`, and mark those that need the thesis's missing data sheet.
+    """Print the tables and figures whose ids match `patterns`.
 
-    `sheet`: folder of the data sheet, or None for the default one.
+    Those that need the thesis's missing data sheet are marked. `sheet`: folder of the data sheet, None for the
+    default one.
     """
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet

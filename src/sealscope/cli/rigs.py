@@ -87,12 +87,18 @@ def new(
 
 
 def _ask_size(label: str, unit: str) -> str:
-    """Ask the user for a size at the terminal; return the answer as text."""
+    """Ask the user for a size at the terminal; return the answer as text.
+
+    `label`: name of the size, which is shown with its default `unit`.
+    """
     return str(prompt(f"{label} [{unit}]"))
 
 
 def _parse_size(text: str, si_unit: str, default_unit: str, option: str) -> float:
-    """Parse the text of an option to a number in `si_unit`; without a unit it is in `default_unit`."""
+    """Parse the text of an option to a number in `si_unit`; without a unit it is in `default_unit`.
+
+    `option`: name of the option for the error message. Raises InputError for any other text.
+    """
     from sealscope.units import parse_quantity
 
     with suppress(ValueError):  # a text with a unit is no number

@@ -92,7 +92,10 @@ def trend(
 
 
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
-    """Count the first recordings, in the order of their dates, that the machine's file states as healthy."""
+    """Count the recordings from the earliest on, until one is not stated as healthy in the machine's file.
+
+    Copies of a recording count once. Recordings without a date count as the earliest.
+    """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)
     # a set, as a folder may have copies of a recording
@@ -100,7 +103,10 @@ def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) 
 
 
 def _check_output(output: Path, files: Sequence[Path]) -> None:
-    """Raise InputError if a trend cannot be written to `output`, or would replace a recording."""
+    """Raise InputError if a trend cannot be written to `output`, or would replace one of its recordings.
+
+    `files`: the recordings.
+    """
     from sealscope.reporting.template import parse_page_path
 
     if output.suffix.lower() not in (".json", ".csv"):

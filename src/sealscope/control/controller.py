@@ -57,7 +57,11 @@ class Started:
         self._addresses = law.memory.ctypes.data, self._measured.ctypes.data
 
     def __call__(self, measured: Measured) -> float:
-        """Compute the voltage [V] for the next sample; its state is updated, so call it once a sample."""
+        """Compute the controller's voltage [V] from the measurements of its next sample.
+
+        Each call advances the controller's state, so it must be called exactly once a sample. An exception of a
+        controller in Python is raised again.
+        """
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))
         reraise_python_error(self._law)
@@ -112,7 +116,8 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run and return its control law.
 
-    The law is machine code if the controller has a method `compiled` that provides it; else it calls Python.
+    The law is machine code if the controller has a method `compiled` that provides it. Otherwise it calls the
+    Python function that `start` returns.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law
@@ -173,5 +178,9 @@ class Controller(Protocol):
         ...
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
+        """Start a run of the controller, and return its control law.
+
+        The law is a function that computes the voltage [V] of a sample from its `Measured`: time, target and
+        measurements. It is called once a sample.
+        """
         ...

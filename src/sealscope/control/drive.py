@@ -34,9 +34,10 @@ DRIVE = record_dtype(
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
     """Compute the voltage u [V] at which a drive delivers a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    `m`: a record `DRIVE`. For a servo valve (Q_N > 0) the equation of `ValveDrive` is solved for u, which is then
-    increased to pass the overlap of the edges. For a pump the equation of `Drive` gives the commanded speed
-    u omega_per_volt; its factor s/(s + corner) is a high-pass filter, which each call advances by one sample.
+    `m`: a record `DRIVE`, the parameters and the filter state of the drive. For a servo valve (Q_N > 0) the
+    equation of `ValveDrive` is solved for u, which is then increased to pass the overlap of the edges. For a pump
+    the equation of `Drive` gives the commanded speed u omega_per_volt. Its factor s/(s + corner) is a high-pass
+    filter, which each call advances by one sample.
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
@@ -61,10 +62,10 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that attributes of `source` are finite numbers in their range; raise InputError otherwise.
+    """Check that attributes of an object are finite numbers in their range; raise InputError otherwise.
 
-    `positive`: names of the attributes that must be > 0; `not_negative`: names of those that must be >= 0; `what`:
-    name of the object in the error message.
+    `source`: the object; `positive`: names of the attributes that must be > 0; `not_negative`: names of those that
+    must be >= 0; `what`: name of the object in the error message.
     """
     for name in (*positive, *not_negative):
         value = getattr(source, name)
@@ -77,9 +78,10 @@ class _Invertible(ABC):
 
     @abstractmethod
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` that `drive_voltage` takes, for a controller sampled at `rate` [Hz].
+        """Make the drive's parameters for a controller sampled at `rate` [Hz], as `drive_voltage` takes them.
 
-        `dead_volts` [V]: largest voltage that is added to pass the overlap of a servo valve's edges.
+        Returns a record (1,) `DRIVE`. `dead_volts` [V]: largest voltage that is added to pass the overlap of a
+        servo valve's edges.
         """
 
     def inverse(self, rate: float) -> Callable[[float, float], float]:
@@ -128,16 +130,16 @@ class Drive(_Invertible):
 
     @property
     def lag(self) -> float:
-        """Time constant [s] of the speed loop; infinite if the loop has no integral term."""
+        """Time constant [s] of the motor's speed loop; infinite if the loop has no integral term."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
     def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
-        """Compute the drive's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
+        """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
-        The class's equation, solved for omega, is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), where
-        y is omega_d + droop dp after a first-order lag with the time constant `lag`. With `settling` = 0 the run
-        begins at standstill under the first dp. Otherwise the command is periodic with a period of `settling`
-        samples, and the run begins as if it had been repeated for ever.
+        The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), with the commanded speed
+        omega_d. y is omega_d + droop dp after a first-order lag with the time constant `lag`. With `settling` = 0
+        the run begins at standstill under the first dp. Otherwise the command is periodic with a period of
+        `settling` samples, and the run begins as if it had been repeated for ever.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -150,18 +152,22 @@ class Drive(_Invertible):
         return np.asarray(self.displacement * omega)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` that `drive_voltage` takes, for a controller sampled at `rate` [Hz].
+        """Make the parameters of the pump's drive for a controller, as `drive_voltage` takes them.
 
-        `dead_volts` is ignored: only a servo valve has an overlap.
+        Returns a record (1,) `DRIVE`. `rate` [Hz]: sampling rate of the controller. `dead_volts` is ignored: only a
+        servo valve has an overlap.
         """
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
 
     def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] that maintains a constant `flow` [m^3/s], with the motor at its commanded speed."""
+        """Compute the voltage [V] at which the pump delivers a constant `flow` [m^3/s].
+
+        The motor turns at its commanded speed.
+        """
         return flow / self.displacement / self.omega_per_volt
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the flow [m^3/s] at a constant voltage `u` [V] without load."""
+        """Compute the pump's flow [m^3/s] at a constant voltage `u` [V] without load."""
         return u * self.omega_per_volt * self.displacement
 
 
@@ -193,18 +199,19 @@ class ValveDrive(_Invertible):
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the record (1,) `DRIVE` that `drive_voltage` takes; `rate` is ignored.
+        """Make the parameters of the servo valve, as `drive_voltage` takes them; `rate` is ignored.
 
-        `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges.
+        Returns a record (1,) `DRIVE`. `dead_volts` [V]: largest voltage that is added to pass the overlap of the
+        valve's edges.
         """
         return make_record(DRIVE, self, dead_volts=dead_volts)
 
     def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] that maintains a constant `flow` [m^3/s] without load."""
+        """Compute the voltage [V] at which the servo valve delivers a constant `flow` [m^3/s] without load."""
         return self.inverse(1.0)(flow, 0.0)
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the flow [m^3/s] at a constant voltage `u` [V] without load."""
+        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""
         return u / self.steady_voltage(1.0)
 
 

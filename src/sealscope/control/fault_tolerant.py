@@ -46,7 +46,8 @@ _memory_at = record_view(_MEMORY)
 def _tolerant_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: the inner controller's, plus a voltage for the estimated leakage flow.
 
-    `memory`, `sample`: addresses of a record `_MEMORY` and of the numbers of a `Measured`.
+    It is called as machine code. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the
+    numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
@@ -143,7 +144,7 @@ class FaultTolerant:
         return self.inner.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
+        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:

@@ -34,7 +34,8 @@ _memory_at = record_view(_MEMORY)
 def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample, the sum of feedback and feed-forward by the equations of `Flatness`.
 
-    `memory`, `sample`: addresses of a record `_MEMORY` and of the numbers of a `Measured`.
+    It is called as machine code. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the
+    numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
@@ -116,7 +117,7 @@ class Flatness:
         return self.feedback.delay
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
+        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:

@@ -48,14 +48,15 @@ OBSERVER = record_dtype(
 def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> None:
     """Update the estimate of the leakage between the chambers with one sample of the measurements.
 
-    `m`: record `OBSERVER`; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`, `p_B` [Pa]: pressures.
+    `m`: record `OBSERVER`, the memory of the estimate; `theta` [rad]: angle of the pump; `x` [m]: position; `p_A`,
+    `p_B` [Pa]: pressures.
 
-    A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
-    seconds. The balance is that of the chamber with the higher pressure, because a check valve may feed the other
-    one. For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt;
-    for B the signs are opposite. Here dtheta and dx are the rotation and the travel in the block, and dtheta_in is
-    the rotation that pumps oil into that chamber, which compresses it from the other chamber's pressure. The filter
-    also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
+    A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of
+    `BLOCK` seconds. The balance is that of the chamber with the higher pressure, because a check valve may feed the
+    other one. For chamber A, D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A -
+    p_B) dt; for B the signs are opposite. Here dtheta and dx are the rotation and the travel in the block, and
+    dtheta_in is the rotation that pumps oil into that chamber, which compresses it from the other chamber's
+    pressure. The filter also estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means
     if m.count == 0.0:
@@ -79,11 +80,13 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 
 @law
 def _update_with_block(m: Any, dp_sum: float) -> None:
-    """Update the Kalman filter of `update_observer` with the block that ends now.
+    """Update the Kalman filter of a leak observer with the block of samples that ends now.
 
-    `m`: record `OBSERVER`; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples. The block is left out if the
-    pressure difference is small, changes its sign, or is too low to shut a check valve. It is also left out if it is
-    an outlier, unless the block before was an outlier of the same sign: then a leak may have opened.
+    `m`: record `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples.
+
+    The block is left out if the pressure difference is small, changes its sign, or is too low to shut a check
+    valve. It is also left out if it is an outlier, unless the block before was an outlier of the same sign: then a
+    leak may have opened.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
@@ -135,9 +138,9 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return an observer's leakage conductance [m^3/(s Pa)], its standard error, and the number of blocks used.
+    """Return an observer's estimate of the leakage conductance, its standard error, and the number of blocks used.
 
-    `m`: record `OBSERVER`.
+    Estimate and error are in m^3/(s Pa). `m`: record `OBSERVER`, the memory of the observer.
     """
     return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 

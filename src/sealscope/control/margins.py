@@ -79,8 +79,8 @@ def open_loop(
 ) -> tuple[NDArray[np.complex128], bool]:
     """Compute the open-loop response L (n,) of a rig and its controller at frequencies `f` (n,) [Hz].
 
-    The second result is True if the rig is stable without the controller. `speed` [m/s], `load` [N]: see `margins`,
-    which also gives the formula of L.
+    The second result is True if the rig is stable without the controller. `speed` [m/s] of the piston and `load`
+    [N] are as in `margins`, which also gives the formula of L.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -155,10 +155,11 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
 
 def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
-    """Compute the controller's voltage response to a unit impulse of each measurement at standstill.
+    """Compute the response of a controller's voltage to a unit impulse of each measurement, with the piston at rest.
 
-    `state` (14,): the controller measures its pressures except for the impulse. Returns pairs of the measurement's
-    index in the state and the response (n,) [V per SI unit of the measurement]; responses that are zero are left out.
+    The impulse lasts one sample. `state` (14,): state of the rig, whose pressures the controller measures
+    otherwise. Returns pairs of the measurement's index in the state and the response (n,) [V per SI unit of the
+    measurement]. Responses that are zero are left out.
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
@@ -166,7 +167,10 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the voltages (n,) [V] from an impulse on, which lasts one sample; `impulse`: its measurements."""
+        """Compute the controller's voltages (n,) [V] after one sample with other measurements, from this sample on.
+
+        `impulse`: the measurements of this sample. All other samples have the measurements at standstill.
+        """
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second
             voltage(standstill)
@@ -219,6 +223,9 @@ def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, dam
 
 
 def _crossings(values: Array) -> Array:
-    """Find where `values` (n,) cross zero; return fractional indices (m,), interpolated linearly."""
+    """Find the places where `values` (n,) change their sign, as fractional indices (m,).
+
+    Between two values, the place is interpolated linearly.
+    """
     k = np.flatnonzero(np.diff(values > 0.0))
     return k + values[k] / (values[k] - values[k + 1])

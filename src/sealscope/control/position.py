@@ -30,7 +30,8 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by the PI law of `PositionPI`, limited to the range of the converter.
 
-    `m`: a record `FOLLOWING`, whose integral and average pressure difference are updated; `measured`: a `Measured`.
+    `m`: a record `FOLLOWING` of the law's parameters and state; its integral and its average pressure difference
+    are updated. `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
@@ -102,7 +103,7 @@ class PositionPI:
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]
 
     def start(self) -> Callable[[Measured], float]:
-        """Start a run and return the function that computes the voltage [V] from each `Measured`."""
+        """Start a run, and return the function that computes the voltage [V] from the `Measured` of each sample."""
         return Started(self.compiled())
 
     def compiled(self) -> CompiledLaw:
@@ -110,7 +111,10 @@ class PositionPI:
         return CompiledLaw(_position_law.address, self.make_memory().view(np.float64))
 
     def make_memory(self) -> Any:
-        """Make the parameters and the initial state of `following_voltage`, a record (1,) `FOLLOWING`."""
+        """Make the parameters and the initial state of the control law, as `following_voltage` takes them.
+
+        Returns a record (1,) `FOLLOWING`.
+        """
         T = 1.0 / self.rate
         return make_record(
             FOLLOWING,

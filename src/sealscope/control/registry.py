@@ -40,7 +40,7 @@ GROUP = "sealscope.controllers"
 
 @cache
 def _installed() -> Mapping[str, EntryPoint]:
-    """Find the entry points of the controllers that installed distributions provide, by the controller's name."""
+    """Find the controllers that installed distributions provide, as entry points by the controller's name."""
     return {point.name: point for point in entry_points(group=GROUP)}
 
 
@@ -100,7 +100,7 @@ def controller_named(name: str, rig: Rig) -> Controller:
 def find_controller_source(name: str) -> Path | None:
     """Find the source file of a user's or an installed controller without importing it.
 
-    Returns None for a built-in controller. Raises InputError if the file does not exist.
+    Returns None for a built-in controller. Raises InputError if there is no such file.
     """
     if name in CONTROLLERS:
         return None

@@ -44,9 +44,9 @@ def as_sizes(values: npt.ArrayLike, what: str = "leak sizes") -> Array:
 
 
 def as_flags(values: npt.ArrayLike, n: int, what: str) -> npt.NDArray[np.bool_]:
-    """Convert `values`, True/False or 1/0, to an array of `n` booleans.
+    """Convert `values`, True/False or 1/0, to an array (n,) of booleans.
 
-    Raises InputError for other values or another number of them. `what` names the values in the message.
+    Raises InputError for other values or if there are not `n` of them. `what` names the values in the message.
     """
     array = as_numbers(np.asarray(values, dtype=np.float64), what)
     if array.size != n:

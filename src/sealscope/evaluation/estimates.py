@@ -101,9 +101,10 @@ def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEs
 def _interval_coverage(
     low: npt.ArrayLike | None, high: npt.ArrayLike | None, truth: Array, confidence: float
 ) -> Proportion:
-    """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value `truth` (n,).
+    """Compute the proportion of stated intervals, from `low` to `high`, that contain the true value.
 
-    Records whose `low` or `high` is nan have no interval; None stands for no intervals at all.
+    All arrays are (n,), one value per record. A record whose `low` or `high` is nan has no interval and is not
+    counted; None stands for no intervals at all. `confidence` is that of the proportion's interval.
     """
     low, high = _as_matching(low, truth.size, "lower limits"), _as_matching(high, truth.size, "upper limits")
     has_interval = ~(np.isnan(low) | np.isnan(high))

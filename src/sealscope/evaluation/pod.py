@@ -23,10 +23,9 @@ _MAX_SPANS = 1e4
 
 @dataclass(frozen=True)
 class SizeDetection:
-    """Detection of leaks of one `size`.
+    """Proportion of detected leaks among the tested leaks of one `size`.
 
-    `proportion` is the proportion of detected leaks with a two-sided interval, `lower` its one-sided lower confidence
-    bound.
+    `proportion` has a two-sided confidence interval; `lower` is the one-sided lower confidence bound.
     """
 
     size: float
@@ -37,8 +36,8 @@ class SizeDetection:
 def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
     """Compute the proportion of detected leaks of each size, in the order of rising size, with confidence bounds.
 
-    `leaks` (n,) are the sizes in any unit, and `hits` (n,) tell whether each leak was detected. The bounds are those
-    of Clopper and Pearson. Raises InputError for a size that is not positive.
+    `leaks` (n,) are the sizes in any unit; `hits` (n,) are True for the detected leaks. The bounds are those of
+    Clopper and Pearson. Raises InputError for a size that is not positive.
     """
     sizes = as_sizes(leaks)
     is_hit = as_flags(hits, sizes.size, "hits")
@@ -53,10 +52,10 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
     """Find the smallest tested size from which on all tested sizes are proven to be detected.
 
-    `detection` is the probability of detection to be proven. A size is proven if the lower confidence bound of its
-    proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 % confidence: this is a90/95
-    without a model. The confidence applies to each size separately. Returns infinity if no size is proven. Source:
-    Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    `rows`: results for each size; `detection`: the probability of detection to be proven. A size is proven if the
+    lower confidence bound of its proportion is at least `detection`. For example, 29 hits of 29 prove 90 % at 95 %
+    confidence: this is a90/95 without a model. The confidence applies to each size separately. Returns infinity if no
+    size is proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
     as_probability(detection, "the probability of detection")
     proven = math.inf
@@ -87,7 +86,7 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: boo
     """Compute the log-likelihood of `k` hits in `n` trials at m sizes with the log odds `eta` of a hit, all (m,).
 
     It is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information is
-    added as a penalty.
+    added as a penalty, for which `design` (m, 2) has the columns 1 and logarithm of size.
     """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
@@ -105,7 +104,10 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
     from scipy.special import expit
 
     def loss(beta: Array) -> tuple[float, Array]:
-        """Compute the negative log-likelihood of the coefficients `beta`, and its gradient."""
+        """Compute the negative log-likelihood of the logistic curve, and its gradient (2,).
+
+        `beta` (2,): intercept and slope of the curve.
+        """
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
@@ -119,7 +121,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Test whether hits and misses overlap in at most one size, so that the likelihood has no finite maximum.
+    """Return True if hits and misses overlap in at most one size, so that the likelihood has no finite maximum.
 
     `n` and `k` (m,) are trials and hits at rising sizes.
     """
@@ -137,14 +139,14 @@ class HitMiss:
     ----------
     intercept, slope : float
         Coefficients of the curve.
-    covariance : array, (2, 2)
+    covariance : ndarray, shape (2, 2)
         Covariance of intercept and slope.
     estimator : {"maximum likelihood", "firth"}
         Method of the fit: Firth's penalised likelihood if hits and misses are separated by size, else maximum
         likelihood.
     log_likelihood, null : float
         Log-likelihood of the fit and of the best curve with slope 0, including the penalty if there is one.
-    size, tested, hits : array, (m,)
+    size, tested, hits : ndarray, shape (m,)
         Tested sizes, and at each the number of leaks and of hits.
     """
 
@@ -159,7 +161,10 @@ class HitMiss:
     hits: Array
 
     def detection(self, size: npt.ArrayLike) -> Array:
-        """Compute the probability of detection at each size."""
+        """Compute the probability of detection (k,) that the fitted curve gives for the sizes `size` (k,).
+
+        Raises InputError for a size that is not positive.
+        """
         from scipy.special import expit
 
         return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
@@ -167,7 +172,8 @@ class HitMiss:
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
         """Compute a two-sided confidence interval (low, high) of the probability of detection at each size.
 
-        The interval is Wald's on log odds, and holds at each size separately.
+        `size` (k,): positive sizes; low and high are (k,). The interval is Wald's on log odds, and holds at each size
+        separately.
         """
         from scipy.special import expit, ndtri
 
@@ -187,12 +193,13 @@ class HitMiss:
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
 
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
-        """Compute the one-sided upper confidence bound of `size_at(detection)`, by default a90/95.
+        """Compute the one-sided upper confidence bound of the size detected with the probability `detection`.
 
-        The bound is the largest size whose profile log-likelihood is within ``z_c^2/2`` of the maximum (chi square
-        with one degree of freedom), infinite if there is none. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and
-        Iles, Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are
-        wider.
+        By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
+        maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). It is infinite if
+        all larger sizes are within it, too. Raises InputError unless `confidence` is from 0.5 to below 1. Source:
+        MIL-HDBK-1823A (2009), appendix G. Cheng and Iles, Technometrics 25 (1983) 77-86, doi
+        10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
@@ -205,7 +212,10 @@ class HitMiss:
             return math.inf
 
         def excess_drop(log_size: float) -> float:
-            """Compute how far the profile log-likelihood at a size is below the maximum, minus the allowed drop."""
+            """Compute the drop of the profile log-likelihood from its maximum to a size, minus the allowed drop.
+
+            `log_size`: natural logarithm of the size. The result is 0 at the bound.
+            """
             return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
         # bracket the root with growing steps from the estimate upwards
@@ -235,16 +245,19 @@ class HitMiss:
         return self.size_bound()
 
     def _profile_log_likelihood(self, log_odds: float, log_size: float) -> float:
-        """Compute the largest log-likelihood of all logistic curves that pass through `log_odds` at `log_size`."""
+        """Compute the largest log-likelihood of all logistic curves that pass through one given point.
+
+        `log_odds`: log odds of detection at the point; `log_size`: natural logarithm of its size.
+        """
         from scipy.optimize import minimize_scalar
 
         x = _log_sizes(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            """Compute the negative log-likelihood of the curve with a slope; 1e300 if it is infinite.
+            """Compute the negative log-likelihood of the curve with this slope through the given point.
 
-            The search cannot use an infinite value.
+            It is 1e300 instead of infinity, which the search for the minimum cannot use.
             """
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
@@ -267,10 +280,10 @@ def _exp_size(log_size: float) -> float:
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks` (n,) are positive sizes in any unit, and `hits` (n,) tell whether each leak was detected. The fit is by
-    maximum likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's
-    penalised likelihood is used (`HitMiss.estimator`), also for the bound. The curve goes to 0 for small leaks, as it
-    does not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
+    `leaks` (n,) are positive sizes in any unit; `hits` (n,) are True for the detected leaks. The fit is by maximum
+    likelihood. If hits and misses are separated by size, the likelihood has no finite maximum, and Firth's penalised
+    likelihood is used (`HitMiss.estimator`), also for the bound. The curve goes to 0 for small leaks, as it does not
+    include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
     MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
     Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """

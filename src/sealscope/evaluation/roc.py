@@ -19,11 +19,11 @@ class Roc:
 
     Attributes
     ----------
-    threshold : array, (k,)
+    threshold : ndarray, shape (k,)
         Thresholds; an alarm is raised if the score is at least the threshold.
-    false_alarm, detection : array, (k,)
+    false_alarm, detection : ndarray, shape (k,)
         Fractions of the leak-free and of the leaky scores that raise an alarm.
-    low, high : array, (k,)
+    low, high : ndarray, shape (k,)
         Simultaneous confidence band of the detection at each false-alarm probability.
     """
 
@@ -55,15 +55,16 @@ def _as_scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, A
 
 
 def _count_exceeding(scores: Array, thresholds: Array) -> Array:
-    """Count for each threshold (k,) the scores that are at least as large."""
+    """Count for each threshold (k,) the scores (n,) that are equal or larger."""
     return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
 
 
 def kolmogorov_margin(n: int, confidence: float) -> float:
     """Compute the half width of a confidence band around the empirical distribution of `n` samples.
 
-    The half width is ``sqrt(ln(2/alpha) / (2n))`` with alpha = 1 - confidence; it is valid for any n and any
-    distribution. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi 10.1214/aop/1176990746.
+    The half width is ``sqrt(ln(2/alpha) / (2n))`` with alpha = 1 - confidence. The band contains the whole true
+    distribution with at least the probability `confidence`, for any n and any distribution. Source: Massart, Ann.
+    Probab. 18 (1990) 1269-1283, doi 10.1214/aop/1176990746.
     """
     return math.sqrt(math.log(2.0 / (1.0 - as_probability(confidence, "confidence"))) / (2.0 * n))
 
@@ -71,10 +72,11 @@ def kolmogorov_margin(n: int, confidence: float) -> float:
 def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Roc:
     """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
-    Equal scores of both kinds give slanted steps. The band contains the whole true curve with the probability
-    `confidence`. It is the envelope of the points moved by the margins of `kolmogorov_margin`, d for false alarms and
-    e for detection, each at sqrt(confidence). Raises InputError unless there are scores of both kinds. Source:
-    Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
+    If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole
+    true curve with the probability `confidence`. It is the envelope of the curve's points, each moved by +-d in false
+    alarms and by +-e in detections. Here d and e are the `kolmogorov_margin` of the leak-free and of the leaky
+    scores, both at the confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups.
+    Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)
     as_probability(confidence, "confidence")
@@ -89,10 +91,10 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
-    """Compute for each score the fraction of the other group's scores from which it differs in the right direction.
+    """Compute for each score the fraction of correctly ordered pairs that it forms with the other group's scores.
 
-    The right direction is that leaky scores are the higher ones; equal scores count half. Returns the fractions for
-    the leak-free scores (n,) and for the leaky scores (m,).
+    A pair is ordered correctly if the leaky score is the higher one; equal scores count half. Returns the fractions
+    for the leak-free scores (n,) and for the leaky scores (m,).
     """
     a, b = np.sort(leak_free), np.sort(leaky)
     below = (np.searchsorted(a, leaky, "left") + np.searchsorted(a, leaky, "right")) / (2.0 * a.size)
@@ -113,7 +115,7 @@ def _newcombe_interval(value: float, leak_free: int, leaky: int, z: float) -> tu
     mean_number = (leak_free + leaky) / 2.0
 
     def excess(t: float) -> float:
-        """Compute (t - A)^2 - (z SE(t))^2, which is 0 at the ends of the interval."""
+        """Compute (t - A)^2 - (z SE(t))^2 for an area t, which is 0 at the ends of the interval."""
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (leak_free * leaky)
 
@@ -127,9 +129,9 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
 
     `leak_free` are scores a (n,) and `leaky` scores b (m,), which are high for leaks. The area is ``sum of (b > a) +
     (b = a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1. If
-    the scores are completely separated, that has no width, and Newcombe's interval is used (`method`). Raises
-    InputError for fewer than 2 records of a kind. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988)
-    837-845, doi 10.2307/2531595, eq. (5)-(8).
+    the scores are completely separated, DeLong's interval has no width, and Newcombe's is used instead (`method`).
+    Raises InputError for fewer than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics
+    44 (1988) 837-845, doi 10.2307/2531595, eq. (5)-(8).
     """
     from scipy.special import ndtri
 

@@ -51,7 +51,7 @@ class Confusion:
     ----------
     rows, columns : tuple of str
         Names of the true faults and of the verdicts.
-    counts : array, (rows, columns)
+    counts : ndarray, shape (rows, columns)
         Number of records with this fault and this verdict.
     shares : tuple of tuple of Proportion
         Fraction of the records of each row with this verdict.

@@ -67,9 +67,10 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
 
 
 def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
-    """Compute the largest rank, counted from the highest of `n` leak-free scores, whose score may be the threshold.
+    """Find the rank of the leak-free score to set as the threshold, counted from the highest of `n` scores.
 
-    `promise` and `confidence` are those of `quantile_threshold`. Returns 0 if there are too few scores.
+    It is the largest rank that keeps the probability `false_alarm`, on average or as a bound with `confidence`, as
+    for `quantile_threshold`. Returns 0 if there are too few scores.
     """
     from scipy.special import betainc
 
@@ -84,12 +85,12 @@ def quantile_threshold(
 ) -> Threshold:
     """Compute the lowest threshold that keeps a false-alarm probability p, from scores of leak-free records.
 
-    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold has the rank
-    ``floor(p (n + 1))``, so that the next record's score exceeds it with a probability of at most p (split
-    conformal). With "bound", it has the largest rank whose true false-alarm probability is at most p with the
-    probability `confidence` (tolerance limit). Both are exact for independent records of any continuous distribution.
-    Raises InputError with the number needed if there are too few records. Source: Wilks (1941), doi
-    10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
+    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold is the score
+    of the rank ``floor(p (n + 1))`` from the highest; the next leak-free record exceeds it with a probability of at
+    most p (split conformal). With "bound", it has the largest rank whose true false-alarm probability is at most p
+    with the probability `confidence` (tolerance limit). Both are exact for independent records of any continuous
+    distribution. Raises InputError if there are too few records; the message states the number needed. Source: Wilks
+    (1941), doi 10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
     """
     from scipy.special import betaincinv
 

@@ -108,10 +108,10 @@ def fmi_headers() -> Path:
 
 
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
-    """Choose the solver's step [s] with which the rms error of the pressures is at most `error` [Pa].
+    """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    `integrate_run` chooses a step in a run of 4 s from mid-stroke under each of `STEP_COMMANDS`. Returns the shortest
-    of these steps [s], and the largest error [Pa] that these runs estimate.
+    A run of 4 s from mid-stroke is integrated under each of `STEP_COMMANDS`. Returns the shortest step [s] of these
+    runs, and the largest error [Pa] that they estimate.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -142,7 +142,10 @@ class MockUp(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Hash (32 hex digits) of the FMU's code and variables, by which its library recognises its description."""
+        """Hash of the FMU's description, code and variables (32 hex digits).
+
+        By this hash the FMU's compiled library recognises its XML description.
+        """
         texts = [self.summary, str(self.variable_list), *self.modules.values()]
         return hashlib.sha256("".join(texts).encode()).hexdigest()[:32]
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Return the jinja2 environment that loads the templates of an FMU: of its XML description and its C header."""
+    """Return the jinja2 environment with the templates of an FMU's files: XML description and C header."""
     import jinja2
 
     return jinja2.Environment(

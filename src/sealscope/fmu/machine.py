@@ -71,14 +71,20 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 @law
 def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
-    """Compute an input a + b t at the nodes of an explicit Runge-Kutta step of h [s] that begins at t [s]."""
+    """Compute an input of the rig at the three times (nodes) that an explicit Runge-Kutta step needs.
+
+    The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
+    """
     n = RK4_NODES
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Compute an input a + b t at the nodes of an implicit-explicit step of h [s] that begins at t [s]."""
+    """Compute an input of the rig at the six times (nodes) that an implicit-explicit Runge-Kutta step needs.
+
+    The step begins at t [s] and lasts h [s]. At the time s [s] the input is a + b s.
+    """
     n = IMEX_NODES
     first = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     return first[0], first[1], first[2], a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
@@ -101,9 +107,9 @@ class RigChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:
-        """Choose the equations and the solver for a rig.
+        """Choose the equations and the solver to compile for a rig's FMU.
 
-        Load and external leakage are always included, because they are inputs of every FMU.
+        The equations of load and external leakage are always included, because both are inputs of every FMU.
         """
         laws = tuple(rig_numbers(rig)._replace(open_circuit=(True,), pushed=(True,)))[len(NUMBERS) :]
         implicit, euler = choose_method(rig, "auto") == "imex", rig.motor.integrator == "euler"
@@ -146,7 +152,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute the model's parameters from the FMU's values v (n,) and the external leakage among its inputs."""
+        """Compute the model's parameters from the FMU's parameter values v (n,) and from its inputs.
+
+        The inputs contain conductances of external leakage, which are added to those of the rig.
+        """
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
@@ -160,7 +169,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the outputs to `results`, and after them the electric, hydraulic and mechanical power [W]."""
+        """Write the outputs of the rig to `results`, and after them the electric, hydraulic and mechanical power [W].
+
+        Returns 0.
+        """
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -174,7 +186,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z by a step h [s] from the time t [s], with inputs a + b t and model parameters p."""
+            """Return the state of the rig after a step of h [s] from the state z at the time t [s].
+
+            The inputs are a + b t, and `p` are the model's parameters.
+            """
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
             return imex_step(z, h, u, G, C, F, p)
@@ -183,7 +198,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z by a step h [s] from the time t [s], with inputs a + b t and model parameters p."""
+            """Return the state of the rig after a step of h [s] from the state z at the time t [s].
+
+            The inputs are a + b t, and `p` are the model's parameters.
+            """
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
@@ -219,8 +237,8 @@ def rig_code(choice: RigChoice) -> Mapping[str, str]:
 def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
     """Compile functions of an FMU to LLVM code; return the text of each by its name.
 
-    `functions`: Python functions by name, with the arguments `ARGUMENTS`. In the code, the symbol of a function is
-    ``sealscope_NAME``.
+    `functions`: Python functions by name, whose arguments have the types `ARGUMENTS`. In the code, the symbol of a
+    function is ``sealscope_NAME``.
     """
     modules = {}
     for name, function in functions.items():

@@ -199,10 +199,11 @@ def _build_input_table(
 def _run_unit(
     path: Path, t: Array, input_table: Array, outputs: list[str], duration: float, progress: Progress | None
 ) -> Any:
-    """Run the FMU with a table of inputs; return its outputs at the communication points `t` [s], by variable name.
+    """Run the FMU with a table of inputs, and return its outputs at the communication points `t` [s].
 
-    `outputs`: names of the variables to record; `duration` [s]: length of the recording, to which the progress
-    refers. Raises SimulationFailed if the FMU fails or ends early.
+    Returns a structured array with a field for each variable in `outputs`, and the time. `duration` [s]: length of
+    the recording, of which `progress` gets the completed fraction. Raises SimulationFailed if the FMU fails or ends
+    early.
     """
     import fmpy
 

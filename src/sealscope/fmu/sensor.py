@@ -135,7 +135,7 @@ class SensorChoice(NamedTuple):
 
     @classmethod
     def from_rig(cls, rig: Rig, rate: float) -> SensorChoice:
-        """Choose the settings for a rig and a sampling rate [Hz].
+        """Choose the settings of a soft sensor for a rig and a sampling rate [Hz].
 
         Raises InputError if the volume balance of the rig has other terms than `COLUMNS`.
         """
@@ -160,22 +160,28 @@ class _Lengths(NamedTuple):
 
     @classmethod
     def from_rate(cls, rate: float) -> _Lengths:
-        """Compute the lengths for a sampling rate [Hz], rounded to whole samples and strides."""
+        """Compute a soft sensor's numbers of samples and strides for a sampling rate [Hz].
+
+        They are rounded to whole ones.
+        """
         return cls(stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate)))
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory, a record of doubles: the scalars `_SCALARS`, and the arrays below.
+    """Build the layout of a soft sensor's memory.
+
+    The memory is a record of doubles with the scalars `_SCALARS` and the following arrays.
 
     Samples: `ring` has the last samples, a column each; `increments` those of all terms over one sample interval.
 
-    Rows of the weak form: `unfinished` has the `SPAN` rows to which the present interval adds; `rows` the finished
-    rows of the open blocks, that is the blocks not yet weighted; `ends` the index past the last row of each open
-    block; `gram` their Gram matrices. `pressure_sums` has the sums of the last blocks (`_SUM`, `_NUMBER`);
-    `slow_sums` the sums over earlier blocks for the coefficients that are not fitted to each block (`weigh_rows`).
+    Rows of the volume balance, each of which is a weighted integral over `SPAN` strides: `unfinished` has the
+    `SPAN` rows to which the present interval adds; `rows` the finished rows of the open blocks, that is the blocks
+    not yet weighted; `ends` the index past the last row of each open block; `gram` their Gram matrices.
+    `pressure_sums` has the sums of the last blocks (`_SUM`, `_NUMBER`); `slow_sums` the sums over earlier blocks
+    for the coefficients that are not fitted to each block (`weigh_rows`).
 
-    Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes (`_BLOCK_ROWS`,
-    `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
+    Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes
+    (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
 
     Results: `history` has those of the last blocks (`_G` ... `_PRESSURE`); `model` is a `Coefficients`; `workspace`
     is a `Workspace`.
@@ -205,8 +211,8 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
-    Their arguments are those of `fmu.machine.build_functions`; the state `y` is a memory of the layout
-    `memory_layout`.
+    Their arguments are those of the functions in `fmu.machine.build_functions`; the state `y` is a memory of the
+    layout `memory_layout`.
     """
     from scipy.special import stdtrit
 
@@ -226,9 +232,10 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Add the samples of the next `span` [s], in which the inputs change linearly by their `slopes` (per second).
+        """Add the samples of the next `span` [s] to the sensor's memory `y`.
 
-        `y`: the sensor's memory; `steps` is ignored. Returns 0.
+        The leakage of each block that they complete is estimated. The inputs change linearly by their `slopes` (per
+        second); `steps` is ignored. Returns 0.
         """
         m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
         first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
@@ -255,7 +262,10 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
 
 
 def _build_sample_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function that adds a sample of the channels `INPUTS` to a soft sensor's memory."""
+    """Build the compiled function that adds one sample of the measurements to a soft sensor's memory.
+
+    The measurements are those of the channels `INPUTS`. `choice`: settings of the sensor.
+    """
     (n_stride, block_strides, half), rate = _Lengths.from_rate(choice.rate), choice.rate
     n_support, n_block = SPAN * n_stride, n_stride * block_strides
     # phi = peak (1 - s^2)^4; the first value of `test_function` is at the middle of the first interval
@@ -350,9 +360,10 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Find the sign of the angle with which the pump's flow rises with p_A - p_B, and store it in `m.angle_sign`.
+    """Find the sign of the pump's angle, and store it in `m.angle_sign`.
 
-    It is found from the first `n_rows` rows of the sensor's memory m.
+    With this sign the pump's flow rises with p_A - p_B. It is found from the first `n_rows` rows of the volume
+    balance in the sensor's memory m.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -367,8 +378,9 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
     """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
     An estimate at standstill is left out if it is imprecise. `m`: the sensor's memory; `size_error`: relative
-    standard error due to the size of the machine; `n_rows`, `pressure` [Pa]: number of rows and mean abs(p_A - p_B)
-    of the block; `is_learned`: True if the other coefficients are updated with the block.
+    standard error due to the size of the machine; `n_rows`, `pressure` [Pa]: number of rows of the volume balance
+    in the block, and its mean abs(p_A - p_B); `is_learned`: True if the other coefficients are updated with the
+    block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -389,10 +401,11 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 
 @large_law
 def _fit_to_waiting(m: Any, size_error: float) -> None:
-    """Fit the coefficients of the balance to the first `LEARNED` blocks together, and append their estimates.
+    """Fit the coefficients of the volume balance to the first `LEARNED` blocks, and append the leakage of each.
 
-    `m`: the sensor's memory, whose waiting blocks these are; the median of their precisions becomes the usual
-    precision. `size_error`: relative standard error due to the size of the machine.
+    `m`: the sensor's memory, in which these blocks wait. The median of the precisions of their estimates becomes
+    the usual precision, to which later estimates are compared. `size_error`: relative standard error of the leakage
+    due to the size of the machine.
     """
     model = m.model
     for k in range(LEARNED):
@@ -412,9 +425,9 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard all fitted coefficients and estimates in the sensor's memory m.
+    """Discard all fitted coefficients and estimates in the sensor's memory m, because the machine begins to move.
 
-    This is done when the machine begins to move: estimates from a standstill cannot be compared with later ones.
+    Estimates from a standstill cannot be compared with later ones.
     """
     model = m.model
     model.sums[:, :] = 0.0
@@ -427,9 +440,9 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    The first `LEARNED` blocks wait until all of them can be fitted together. After `N_WAKING` successive blocks with
-    far larger motion than before, all is discarded and begins again. The other arguments are those of
-    `_append_conductance`.
+    `m`: the sensor's memory. From the first motion on, `LEARNED` blocks wait until all of them can be fitted
+    together. After `N_WAKING` successive blocks with far larger motion than before, all is discarded and begins
+    again. The other arguments are those of `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:
@@ -454,16 +467,19 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
 
 def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
-    """Build the compiled function that weights the rows of the newest blocks and estimates their leakage."""
+    """Build the compiled function that weights the rows of the volume balance in the newest blocks of a soft sensor.
+
+    The function also estimates the leakage of these blocks. `choice`: settings of the sensor.
+    """
     column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
 
     @large_law
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
-        """Weight the rows of the open blocks, that is the blocks not yet weighted, and estimate the leakage of each.
+        """Weight the rows of the volume balance in all open blocks, and estimate the leakage of each block.
 
-        The first `SUPPORT` blocks are weighted together, later ones one by one as they end. `m`: the sensor's memory;
-        `rows`: rows of the open blocks; `ends`: index past the last row of each, where that of the newest is set
-        here; `block`: number of the newest block.
+        A block is open if it is not yet weighted. The first `SUPPORT` blocks are weighted together, later ones one
+        by one as they end. `m`: the sensor's memory; `rows`: rows of the open blocks; `ends`: index past the last
+        row of each, where that of the newest is set here; `block`: number of the newest block.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -498,7 +514,10 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
 
 @large_law
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
-    """Compute the mean of a column of `history` (blocks, 5) over n blocks, the last of which is block `newest`."""
+    """Compute the mean of one result of a soft sensor over n blocks, the last of which is block `newest`.
+
+    `history` (blocks, 5): results of the last blocks; `column`: index of the result.
+    """
     total = 0.0
     for k in range(n):
         total += history[(newest - k) % WINDOW, column] / n
@@ -509,8 +528,8 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of n blocks, the last of which is block `newest`.
 
-    This is the larger of the sample variance between the blocks and the mean of their variances, divided by n.
-    `history` (blocks, 5): results of the last blocks.
+    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of
+    the variances that the fit gives these estimates. `history` (blocks, 5): results of the last blocks.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
@@ -523,8 +542,8 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
     `m`: the sensor's memory; `size_error`: relative standard error due to the size of the machine; `quantiles`:
-    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`, 0 while there are
-    too few blocks.
+    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of
+    blocks and the misfit are always written; the other outputs are 0 while there are too few blocks.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1

@@ -59,7 +59,7 @@ def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
 
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
-    """Yield the output variables of an FMU, without those of a servo valve.
+    """Yield the output variables of an FMU; those of a servo valve are left out.
 
     `rows`: unit and description of each, by name.
     """
@@ -69,9 +69,10 @@ def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Make the FMU variable of a rig's parameter `name`; return None if the rig lacks the part that it describes.
+    """Make the FMU variable of the rig's parameter `name`, such as "pump.q_b".
 
-    `name`: dotted name, such as "pump.q_b".
+    Returns None if the rig lacks the part that the parameter describes. `variability`: "tunable" if the variable
+    can be changed during a run, else "fixed".
     """
     value, field = float(attrgetter(name)(rig)), dict(iter_fields(Rig))[name]
     reference, description = REFERENCES["value"] + VALUES.index(name), str(field.title or name)

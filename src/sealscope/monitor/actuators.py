@@ -52,10 +52,10 @@ _MIN_OIL_KELVIN, _MAX_OIL_KELVIN = 173.15, 573.15
 
 
 class AlarmEvent(NamedTuple):
-    """A change of an alarm.
+    """A change of an actuator's alarm.
 
-    `alarm`: the alarm after the change; `kind`: name of the event, such as "raised" or "returned"
-    (`AlarmJudge.update`); `t` [s]: time of the change.
+    `alarm`: the alarm after the change; `kind`: name of the event, such as "raised" or "returned" (the leak has
+    ended); `t` [s]: time of the change.
     """
 
     alarm: Alarm
@@ -154,13 +154,18 @@ class _Actuator:
                 del self.alarm_samples[0]
 
     def state(self) -> dict[str, Any]:
-        """Convert the parts of the state that a checkpoint stores to plain values."""
+        """Convert the state of the actuator, as far as a checkpoint in the database stores it, to plain values.
+
+        These are the states of its detector and alarm, the last estimate, the oil temperature, the time of the last
+        judged block, and the verdict on the last recording.
+        """
         return save_attributes(self, ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the watch, the last estimate, the oil temperature and the verdict from a checkpoint's plain values.
+        """Restore the state of the actuator, except its alarm, from the plain values of a checkpoint.
 
-        The alarm (`judge`) is not restored here.
+        These are the state of its detector, the last estimate, the oil temperature, the time of the last judged
+        block, and the verdict on the last recording.
         """
         self.watch = Watch.from_state(state["watch"])
         self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
@@ -234,7 +239,7 @@ def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
 
 
 class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
-    """Raised if the database has one of the blocks already."""
+    """Raised if the database already has one of the blocks of samples that are to be stored."""
 
 
 class WatchedActuators:
@@ -256,7 +261,7 @@ class WatchedActuators:
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
         """Restore an actuator from the database, or create it if it is new.
 
-        Its watch starts anew if the rig or the learning time changed since the checkpoint.
+        Its detector (`watch`) starts anew if the rig or the learning time changed since the last checkpoint.
         """
         name = settings.name
         machine = load_watched(settings.rig)
@@ -276,10 +281,11 @@ class WatchedActuators:
         return actuator
 
     def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint, and judge the samples since then again.
+        """Restore an actuator from its checkpoint in the database, and judge the samples since then again.
 
-        The watch starts anew if the state has another version, or was learned with another rig or learning time.
-        Returns True if a new checkpoint must be saved, because of this or because the settings changed.
+        Its detector (`watch`) starts anew if another version saved the state, or if it learned with another rig or
+        learning time. Returns True if a new checkpoint must be saved, because the detector starts anew or the
+        settings changed.
         """
         settings, fresh, state, name = actuator.settings, actuator.watch, stored.state, actuator.settings.name
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
@@ -379,7 +385,7 @@ class WatchedActuators:
         return self._actuators[name]
 
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
-        """Judge the samples of an actuator's block, and add the results to the rows that will be stored."""
+        """Judge the samples of an actuator's block, and add the results to the database rows that will be stored."""
         settings, follows, verdict = actuator.settings, block.follows, block.verdict
         name = settings.name
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
@@ -397,7 +403,7 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored.
 
-        Also add the numbers of the last block and the last estimate that are too old and will be deleted.
+        Also add the running numbers up to which the actuator's blocks and estimates are too old and will be deleted.
         """
         settings = actuator.settings
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state())

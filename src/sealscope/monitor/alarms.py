@@ -87,7 +87,10 @@ class Alarm:
 
     @property
     def status_word(self) -> int:
-        """Status of the actuator as a sum of bits: 1 active warning, 2 active error, 4 new alarm, not shelved."""
+        """Status of the actuator as a sum of bits.
+
+        The bits are 1 for an active warning, 2 for an active error, and 4 for a new alarm that is not shelved.
+        """
         level = 0 if not self.active else ERROR_BIT if self.level == "error" else WARNING_BIT
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
@@ -179,7 +182,7 @@ class AlarmJudge:
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise an alarm and return it; an open alarm whose cause had ended is raised again under its id.
+        """Raise an alarm and return it; if an alarm is open whose leak had ended, it is raised again under its id.
 
         `findings`: fields of the alarm besides id, actuator, state and shelving.
         """
@@ -192,12 +195,15 @@ class AlarmJudge:
     def update_from_verdict(
         self, verdict: RecordingVerdict, earlier: RecordingVerdict | None, baseline: int, settings: WatchSettings
     ) -> tuple[Alarm, str] | None:
-        """Update the alarm with the verdict on a whole recording; return the alarm and the event, like `update`.
+        """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
         A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the verdict on
         the recording before is a leak as well. The verdict `no leak`, or a leak below the warning threshold, ends the
         alarm. `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy
         baseline.
+
+        The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or ""
+        for none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -272,7 +278,7 @@ class AlarmJudge:
         return self._set_alarm(replace(alarm, updated_s=t, **by_mark[mark]))
 
     def state(self) -> dict[str, Any]:
-        """Convert the attributes to plain values, from which `restore` can rebuild this AlarmJudge."""
+        """Convert the alarm and its counters to plain values, from which `restore` can rebuild this object."""
         return save_attributes(self, vars(self))
 
 

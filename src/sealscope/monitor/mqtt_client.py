@@ -76,7 +76,7 @@ class MqttLink:
         self.is_open = True
 
     def check_thread(self) -> None:
-        """Close the connection and raise RuntimeError if its thread has ended, such as after a malformed packet."""
+        """Close the connection and raise RuntimeError if its thread has ended, as after a malformed packet."""
         if getattr(self.client, "_thread", self) is None:  # private, as paho has no public attribute for it
             self.close()
             raise RuntimeError("the thread of the connection to the broker has ended")

@@ -236,9 +236,10 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events to standard output.
+        """Write new events of alarms to standard output.
 
-        If they can be read, an outage of the database is over, unless it still refuses to store blocks.
+        If the events can be read, an outage of the database is ended, unless the database still refuses to store
+        blocks.
         """
         self._lines.deliver()
         if not self._is_database_blocked:  # else reading works, but writing does not

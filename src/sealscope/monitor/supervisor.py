@@ -32,11 +32,14 @@ _Work = Callable[[], object]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """Raised by a part that lacks something it needs, such as a folder; the outage is logged without a traceback."""
+    """Raised by a part of the monitor that lacks something it needs, such as a folder.
+
+    The outage that this begins is logged without a traceback.
+    """
 
 
 class SupervisedPart:
-    """A part of a monitor or a service that it uses, with its outages and the pause after an error.
+    """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
     `since` [s since 1970]: start of the present outage, None if there is none; `reason`: its reason; `count`: number
     of outages so far; `seconds` [s]: total length of those that have ended. Several threads may report outages, but
@@ -51,7 +54,7 @@ class SupervisedPart:
         self._lock = threading.Lock()
 
     def begin_outage(self, reason: object) -> None:
-        """Begin an outage and log it; if there is one already, do nothing, and its first reason stays."""
+        """Begin an outage of the part and log it; if there is one already, it continues with its first reason."""
         with self._lock:
             if self.since is not None:
                 return
@@ -61,7 +64,10 @@ class SupervisedPart:
         self._supervisor.on_change()
 
     def end_outage(self) -> None:
-        """End the outage, if there is one, and log that; the next pause after an error is again the shortest."""
+        """End the outage of the part, if there is one, and log that.
+
+        The pause after the next error is again the shortest.
+        """
         with self._lock:
             self._pause = 0.0
             if self.since is None:
@@ -84,8 +90,8 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins an outage and a pause, which is twice as long as the one before. `at_once`: True to run it
-        even during a pause.
+        An error begins an outage and a pause, which is twice as long as the one before, up to a limit. An error of
+        the database begins the outage of the database instead. `at_once`: True to run it even during a pause.
         """
         if self.pause_s and not at_once:
             return False

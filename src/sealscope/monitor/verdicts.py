@@ -104,9 +104,9 @@ class RecordingVerdict:
 
     @property
     def decides(self) -> bool:
-        """True if the condition of the machine follows from this verdict or its mark, False if from single blocks.
+        """True if the condition of the machine follows from this verdict, False if it follows from single blocks.
 
-        The verdict `cannot tell` without a mark does not decide.
+        The verdicts `leak` and `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
         """
         return self.leaks or self.clears or self.mark != ""
 

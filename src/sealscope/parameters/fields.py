@@ -27,7 +27,7 @@ def quantity(name: str, unit: str, *, absent: float | None = None, **bounds: flo
 
 
 def choice(name: str, *, absent: str | None = None) -> Any:
-    """Declare a parameter that selects one of several named options, such as a friction law.
+    """Declare a parameter that has one of several named options, such as the law of friction.
 
     `name`: the parameter in words; the options are in the field's annotation, a Literal. `absent`: the option for a
     rig whose file does not state the parameter, or None if every rig must state it.
@@ -36,22 +36,22 @@ def choice(name: str, *, absent: str | None = None) -> Any:
 
 
 def unit_of(field: FieldInfo) -> str:
-    """Return the SI unit of a declared parameter ("" for a choice)."""
+    """Return the SI unit of a declared parameter: "1" if it has no unit, "" if it is a choice and no number."""
     extra = field.json_schema_extra
     return str(extra["unit"]) if isinstance(extra, dict) else ""
 
 
 def absent_of(field: FieldInfo) -> float | str | None:
-    """Return the value that stands for the absence of a parameter's part or effect from the model.
+    """Return the value of a parameter for a rig whose file does not state it; None if every rig must state it.
 
-    A rig whose file does not state the parameter has this value; None if every rig must state it.
+    With this value the part or effect that the parameter describes is absent from the model.
     """
     extra = field.json_schema_extra
     return extra["absent"] if isinstance(extra, dict) else None  # type: ignore[return-value]
 
 
 def choices_of(field: FieldInfo) -> tuple[str, ...]:
-    """Return the allowed values of a choice, () for a number."""
+    """Return the options of a parameter that is a choice, () for a number."""
     annotation = field.annotation
     return get_args(annotation) if get_origin(annotation) is typing.Literal else ()
 
@@ -64,7 +64,7 @@ def with_unit(number: float, unit: str) -> str:
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
     """Format the first of pydantic's errors on `model` as "SYMBOL must be ..., got ...".
 
-    A bound is followed by the parameter's unit.
+    The parameter's unit follows a bound.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
@@ -86,7 +86,7 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Validate the parameters `values` by name; raise InputError for the first broken rule."""
+        """Make the group of parameters from their values by name; raise InputError for the first broken rule."""
         try:
             super().__init__(**values)
         except ValidationError as error:
@@ -94,7 +94,7 @@ class Part(BaseModel):
             raise (PartsDisagreeError if is_joint_rule else InputError)(format_broken_rule(error, type(self))) from None
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Copy the part unchanged.
+        """Return an unchanged copy of this group of parameters.
 
         Raises InputError if `update` is given, because pydantic would not validate its values.
         """
@@ -104,7 +104,11 @@ class Part(BaseModel):
 
 
 def iter_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield the dotted name and the declaration of every parameter of `model` and its parts, in order."""
+    """Yield the dotted name and the declaration of every parameter of a model, in order.
+
+    `model`: a rig or a group of its parameters, whose groups are searched, too; `prefix`: beginning of the dotted
+    names.
+    """
     for symbol, field in model.model_fields.items():
         annotation = field.annotation
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):

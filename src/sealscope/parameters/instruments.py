@@ -33,7 +33,10 @@ class PressureTransducer(Part):
 
     @model_validator(mode="after")
     def _check_range(self) -> Self:
-        """Check that the range is not empty; raise ValueError otherwise."""
+        """Check that the range of the transducer is not empty, and return the transducer unchanged.
+
+        Raises ValueError otherwise, as pydantic requires.
+        """
         if self.range_lo >= self.range_hi:
             raise ValueError(f"range_lo must be < range_hi = {with_unit(self.range_hi, 'Pa')}, got {self.range_lo}")
         return self
@@ -91,7 +94,10 @@ class Daq(Part):
 
     @model_validator(mode="after")
     def _check_output_volts(self) -> Self:
-        """Check that the transducers' outputs are within the input range; raise ValueError otherwise."""
+        """Check that the transducers' outputs are within the board's input range, and return the board unchanged.
+
+        Raises ValueError otherwise, as pydantic requires.
+        """
         lo, hi = self.sensor_volts_lo, self.sensor_volts_hi
         if lo >= hi:
             raise ValueError(f"sensor_volts_lo must be < sensor_volts_hi = {with_unit(hi, 'V')}, got {lo}")
@@ -103,5 +109,5 @@ class Daq(Part):
 
     @property
     def step(self) -> float:
-        """Voltage of one step of the conversion [V]: 2 range / 2^bits."""
+        """Voltage [V] of one step of the analog-digital conversion: 2 range / 2^bits."""
         return 2.0 * self.range / 2.0**self.bits

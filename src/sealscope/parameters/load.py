@@ -55,9 +55,9 @@ def load_rig(rig: Rig | str | os.PathLike[str] = "thesis") -> Rig:
     rig : Rig, str or path-like, optional
         Name of a packaged rig, or path of a TOML file with value, unit and source for each parameter; a Rig is
         returned as it is. The command `sealscope parameters NAME` prints the parameters of a rig. A file may say
-        ``[rig] extends = "thesis"`` (or the path of another file) and then states only the values that differ; a
-        table ``[map]`` names the columns of the machine's logs (``p_A = "PG_1[psi]"``). The file of a commissioned
-        machine is such a file, too.
+        ``[rig] extends = "thesis"`` (or the path of another file) and then states only the values that differ. A
+        table ``[map]`` names the columns of the machine's logs (``p_A = "PG_1[psi]"``). The file that commissioning
+        writes for a machine can be loaded, too, if it states an area.
 
     Returns
     -------
@@ -99,7 +99,10 @@ def _load_packaged(name: str) -> Rig:
 
 
 def _is_path(text: str) -> bool:
-    """Test whether a text is the path of a file, and not the name of a packaged rig."""
+    """Return True if a text is the path of a rig's file, rather than the name of a packaged rig.
+
+    A path ends in .toml, contains a separator of folders, or names an existing file.
+    """
     return text.endswith(".toml") or "/" in text or os.sep in text or is_file_path(text)
 
 
@@ -114,10 +117,10 @@ def _load_file(path: Path, place: str) -> Rig:
 
 
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
-    """Replace the table `[map]` in a rig's file, or append it.
+    """Write a channel map into a rig's file, as its table `[map]`; an earlier map is replaced.
 
-    `columns`: channel -> column of the machine's logs. Raises InputError, and leaves the file unchanged, if it is not
-    the file of a rig or cannot be written.
+    `columns`: mapping from channel to column of the machine's logs. Raises InputError if `path` is not the file of
+    a rig or cannot be written; the file is then unchanged.
     """
     if os.fspath(path) in rig_names():
         raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
@@ -152,9 +155,9 @@ class _RigFile(NamedTuple):
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    Its parameters replace those of the extended files. Its table `[map]`, if it has one, replaces theirs as a whole.
-    `place`: name of the file in messages; `visited`: the files that led to this one, to detect circles. Raises
-    InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
+    Its parameters replace those of the extended files. Its table `[map]`, if it has one, replaces theirs as a
+    whole. `place`: name of the file in messages; `visited`: the files that extend this one, to detect circles.
+    Raises InputError for a wrong table or key, a circle, or more than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:

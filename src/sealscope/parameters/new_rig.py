@@ -131,7 +131,7 @@ def valve_rig_text(
 def _check_arguments(name: str, sizes: dict[str, float]) -> None:
     """Check that the rig's name is valid, and that its sizes are finite and > 0.
 
-    `sizes`: name of an argument -> its value. Raises InputError otherwise.
+    `sizes`: mapping from the name of an argument to its value. Raises InputError otherwise.
     """
     for argument, value in sizes.items():
         if not (math.isfinite(value) and value > 0):
@@ -141,15 +141,15 @@ def _check_arguments(name: str, sizes: dict[str, float]) -> None:
 
 
 def _read_template(file: str) -> Template:
-    """Read the template with the name `file` for a rig's file."""
+    """Read a template of a rig's file, which is the file named `file` beside this module."""
     return Template(Path(__file__).with_name(file).read_text(encoding="utf-8"))
 
 
 def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> float:
     """Compute the ratio of a new cylinder's chamber volume to that of the rig `base`.
 
-    The volume is that of the larger side at mid-stroke, including an assumed dead volume. `area_A`, `area_B` [m^2],
-    `stroke` [m].
+    The volume is that of the larger side at mid-stroke, including an assumed dead volume. `area_A`, `area_B` [m^2]:
+    piston areas of the new cylinder; `stroke` [m]: its stroke.
     """
     return (0.5 + _DEAD_VOLUME_RATIO) * max(area_A, area_B) * stroke / base.cylinder.V
 
@@ -157,7 +157,8 @@ def _volume_ratio(base: Rig, area_A: float, area_B: float, stroke: float) -> flo
 def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float) -> dict[str, str]:
     """Format the cylinder and friction parameters of a new rig, scaled from the rig `base`, for a template.
 
-    `area_A`, `area_B` [m^2], `stroke` [m]. Returns a mapping from the names in the template to texts.
+    `area_A`, `area_B` [m^2]: piston areas of the new cylinder; `stroke` [m]: its stroke. Returns a mapping from the
+    names in the template to texts.
     """
     volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))

@@ -39,7 +39,7 @@ class ParameterEntry(NamedTuple):
     place: str
 
     def text(self) -> str:
-        """Format the value and its unit as they were stated."""
+        """Format the parameter's value and unit as they were stated."""
         return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
 
 
@@ -159,8 +159,8 @@ class Rig(Part):
     def _check_valve(self) -> None:
         """Check that valve and supply are both present or both absent, and that the rest of the rig suits them.
 
-        A valve-controlled rig has no throttles, no make-up valves and an integral gain of the motor's speed. Raises
-        ValueError otherwise.
+        A valve-controlled rig has neither throttles nor make-up valves, and its motor's speed loop has an integral
+        gain. Its accumulator, if any, has a precharge below the supply's pressure. Raises ValueError otherwise.
         """
         valve, supply = self.valve, self.supply
         if self.circuit.valve_controlled != (supply.drive != "absent"):
@@ -241,11 +241,14 @@ class Rig(Part):
 
     @property
     def channel_map(self) -> dict[str, str]:
-        """Mapping from channels to columns of this machine's logs, from the table `[map]` of its file."""
+        """Mapping from channel to column of this machine's logs; empty if its file has no table `[map]`."""
         return dict(self._channel_map)
 
     def with_channel_map(self, columns: Mapping[str, str]) -> Rig:
-        """Return the same rig with another channel map; `columns`: channel -> column of the machine's logs."""
+        """Return the same rig with another channel map.
+
+        `columns`: mapping from channel to column of the machine's logs.
+        """
         rig = self.model_copy()
         rig._channel_map = tuple(columns.items())
         return rig
@@ -258,14 +261,14 @@ class Rig(Part):
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
-        """Return a parameter as it was stated, with value, unit, source and place.
+        """Return a parameter as it was stated: value, unit, source, and the file or option that states it.
 
         `name`: its dotted name, or the bare symbol if that is unique.
         """
         return self._stated_entries()[resolve_name(name, declared_names())]
 
     def states(self, *names: str) -> bool:
-        """Test whether all the named parameters are stated for this machine, and none of them is assumed.
+        """Return True if all the named parameters are stated for this machine, and none of them is assumed.
 
         A value is assumed if its source begins with `assumed:`.
         """
@@ -309,8 +312,9 @@ class Rig(Part):
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
         """Return the same rig with other piston areas [m^2], and with volumes that suit them.
 
-        The areas have the source `source`. The dead volume, which the piston does not sweep, and the gas of the
-        accumulator are scaled with the larger area, and marked as assumed.
+        The areas have the source `source`. If the volumes depend on the position, the dead volume, which the piston
+        does not sweep, is scaled with the larger area. So is the gas of the accumulator, which is also at least in
+        proportion to the rod's volume. Scaled values are marked as assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -347,10 +351,10 @@ class Rig(Part):
         ]
 
     def present_values(self) -> dict[str, Value]:
-        """Return the SI values by dotted name, without the parameters of parts and effects that the rig lacks.
+        """Return the SI values of the parameters by dotted name, without those of parts that the rig lacks.
 
-        They identify a machine across versions, because a parameter added in a later version is absent from older
-        rigs.
+        They identify a machine across versions of the package: older rigs lack the parts that a later version adds,
+        so these do not change their values.
         """
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
@@ -381,8 +385,9 @@ class Rig(Part):
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
         """Build a rig from the entries of its parameters by dotted name.
 
-        A parameter without an entry gets its `absent` value. Raises InputError, which states `place`, if it has none,
-        and for an unknown name or an invalid value.
+        A parameter without an entry gets its `absent` value, with which its part or effect is absent from the
+        model. `place`: where the entries come from, for messages. Raises InputError if a parameter has neither, for
+        an unknown name, and for an invalid value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()
@@ -407,9 +412,10 @@ def declared_fields() -> dict[str, FieldInfo]:
 
 
 def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Build the entries of the parameters that a rig's file may omit, with their `absent` values.
+    """Build the entries of the parameters that a rig's file may omit.
 
-    `place`: the file, for messages.
+    Each has the value with which its part or effect is absent from the model (`absent_of`). `place`: the file, for
+    messages.
     """
     return {
         full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
@@ -427,8 +433,9 @@ def declared_names() -> tuple[str, ...]:
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
     """Build a part of a rig, such as its pump, from the entries of its parameters.
 
-    `path`: beginning of their dotted names, such as "pump.", empty for the whole rig. An InputError names the place
-    of the wrong value, or `place` if a rule on several parameters is broken.
+    `model`: class of the part; `path`: beginning of the dotted names of its parameters, such as "pump.", empty for
+    the whole rig. An InputError names the place of the wrong value, or `place` if a rule on several parameters is
+    broken.
     """
     values: dict[str, Any] = {}
     for symbol, field in model.model_fields.items():
@@ -447,9 +454,9 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
 
 
 def _qualify_symbol(full_name: str, text: str) -> str:
-    """Replace the symbol at the beginning of `text` by the dotted name, if several parameters have this symbol.
+    """Replace the symbol at the beginning of a message by the parameter's dotted name, unless the symbol is unique.
 
-    `full_name`: the dotted name of the parameter.
+    `full_name`: the dotted name; `text`: the message.
     """
     symbol = full_name.rpartition(".")[2]
     is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1

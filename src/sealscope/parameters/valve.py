@@ -41,7 +41,10 @@ class ServoValve(Part):
 
     @model_validator(mode="after")
     def _check_overlaps(self) -> Self:
-        """Check that each edge opens or closes within the spool's stroke; raise ValueError otherwise."""
+        """Check that each edge opens or closes within the spool's stroke, and return the valve unchanged.
+
+        Raises ValueError otherwise, as pydantic requires.
+        """
         for name in ("o_PA", "o_AT", "o_PB", "o_BT"):
             overlap = getattr(self, name)
             if not abs(overlap) < self.x_max:

@@ -36,7 +36,7 @@ class Lanes(types.Type):  # type: ignore[misc]
         super().__init__(name=f"Lanes({number}, {width})")
 
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
-        """Tell numba that any single number can be converted to lanes, that is to a vector of equal numbers.
+        """Tell numba that any single number can be converted to lanes, a vector of equal numbers.
 
         Returns None, which forbids the conversion, if `source` is not the type of a number.
         """
@@ -58,7 +58,7 @@ _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
 def _vector_type(lanes: Lanes) -> Any:
-    """Return LLVM's vector type for a type of lanes."""
+    """Return LLVM's vector type for numba's type of a vector of numbers (lanes)."""
     return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
 
 
@@ -83,9 +83,9 @@ def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
 
 
 def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
-    """Build the LLVM instructions that convert a number to a vector of lanes; a vector is returned unchanged.
+    """Build the LLVM instructions that convert a number to lanes, a vector of equal numbers.
 
-    `value_type`: numba's type of the value; `lanes`: type of the result.
+    A vector is returned unchanged. `value_type`: numba's type of the value; `lanes`: type of the result.
     """
     if isinstance(value_type, Lanes):
         return value
@@ -94,15 +94,18 @@ def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, l
 
 @lower_cast(types.Number, Lanes)  # type: ignore[untyped-decorator]
 def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, value: Any) -> Any:
-    """Convert a number to lanes where numba needs one type for both, such as for the results of two branches."""
+    """Convert a number to lanes (a vector) where numba needs one type for both.
+
+    Such a place is a variable that has a number in one branch and lanes in the other.
+    """
     return _convert_to_lanes(context, builder, value, value_type, lanes)
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the type of lanes to which arguments that mix lanes and plain numbers can be converted.
+    """Find the type of lanes to which all arguments of a call can be converted.
 
-    Returns None if no argument is lanes, if the lanes are of different types, or if there is an argument of another
-    kind.
+    Lanes are vectors of numbers; arguments may mix them with single numbers. Returns None if no argument is lanes,
+    if the lanes are of different types, or if there is an argument of another kind.
     """
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
@@ -110,16 +113,19 @@ def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
 
 
 def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
-    """Define a Python function or operator on lanes, alone or mixed with plain numbers, for compiled code.
+    """Define a Python function or operator on lanes (vectors of numbers) for compiled code.
 
-    `build(builder, *values)` writes the LLVM instructions. The result is lanes, or a mask of truth values if
-    `is_test`.
+    Its arguments may mix lanes with single numbers. `build(builder, *values)` writes the LLVM instructions. The
+    result is lanes, or a mask of truth values if `is_test`.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the function's signature for these argument types, or None if they are not lanes."""
+            """Return the function's signature for these types of arguments.
+
+            Returns None if none of them is a vector (lanes).
+            """
             lanes = None if kws else _common_lanes_type(args)
             return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
 
@@ -135,9 +141,9 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Build the LLVM instructions that divide lanes by one number: they multiply by its reciprocal.
+    """Build the LLVM instructions that divide lanes (a vector of numbers) by one number.
 
-    The compiler can then move the division out of a loop.
+    They multiply by the number's reciprocal, so that the compiler can move the division out of a loop.
     """
     lanes, number_type = sig.args
     number = context.cast(builder, args[1], number_type, types.float64)
@@ -157,7 +163,7 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Build the function that writes the call of an LLVM intrinsic on lanes.
+    """Build the function that writes the call of an LLVM intrinsic on lanes, that is on vectors of numbers.
 
     `name`: name of the intrinsic without type, such as "sqrt".
     """
@@ -186,7 +192,10 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
     @infer_global(_function)
     class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature of `&` or `|` for two masks of the same lanes; None for any other arguments."""
+            """Return the signature of `&` or `|` for two masks (vectors of truth values) of one type.
+
+            Returns None for any other arguments.
+            """
             compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
             return signature(args[0], *args) if compatible else None
 
@@ -203,7 +212,7 @@ def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) ->
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature for these argument types, or None if the function does not take them."""
+            """Return the function's signature for these types of arguments, or None if it does not take them."""
             if len(args) != arity or kws:
                 return None
             result_type = infer_type(args)
@@ -215,12 +224,15 @@ def register_lowering(function: Any, arity: int, infer_type: Any, build: Any) ->
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` if the condition is true, else `no`, separately in each lane; both are computed in any case."""
+    """Choose `yes` if the condition is true, else `no`, separately in each lane of a vector.
+
+    Both values are computed in any case.
+    """
     return yes if condition else no
 
 
 def _select_type(arg_types: Any) -> Any:
-    """Find the type of the result of `select`: that of the lanes in its arguments, a double if there are none."""
+    """Find the type of the result of `select`: that of the vectors in its arguments, or a double without any."""
     if isinstance(arg_types[0], Mask):
         return arg_types[0].lanes
     return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
@@ -241,7 +253,10 @@ register_lowering(select, 3, _select_type, _lower_select)
 
 
 def any_lane(condition: Any) -> Any:
-    """Return True if a condition is true in any lane; a plain truth value, of a single run, is returned unchanged."""
+    """Return True if a condition is true in any lane of a vector.
+
+    The truth value of a single run is returned unchanged.
+    """
     return condition
 
 
@@ -257,7 +272,7 @@ register_lowering(any_lane, 1, lambda _: types.boolean, _lower_any_lane)
 
 
 def _float_constant(value_type: Any, value: float) -> Any:
-    """Return the LLVM constant of a number, in every lane if `value_type` is a type of lanes."""
+    """Return the LLVM constant of a number, repeated for every lane if `value_type` is a type of vectors (lanes)."""
     if not isinstance(value_type, Lanes):
         return ir.Constant(ir.DoubleType(), value)
     return ir.Constant(_vector_type(value_type), [value] * value_type.width)
@@ -266,7 +281,7 @@ def _float_constant(value_type: Any, value: float) -> Any:
 def nearest_integer(x: Any) -> Any:
     """Round x to the nearest whole number, returned as a float.
 
-    x| must be below 2^51, in single precision below 2^22.
+    The magnitude of x must be below 2^51, in single precision below 2^22.
     """
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
@@ -284,7 +299,7 @@ register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0], _lower_nea
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for a whole number n in -1022..1023, given as a float or as lanes.
+    """Compute 2^n for a whole number n in -1022..1023, which is a float or lanes (a vector of floats).
 
     In single precision n is limited to -126..127.
     """
@@ -315,12 +330,12 @@ _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _is_array_of_lanes(array: Any) -> bool:
-    """Return True if the rows of arrays of this numba type can be loaded as lanes."""
+    """Return True if the rows of arrays of this numba type can be loaded as lanes (vectors of numbers)."""
     return isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to lanes."""
+    """Build the LLVM instructions that compute the address of a row of an array, as a pointer to a vector (lanes)."""
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
@@ -329,19 +344,20 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def load(array: Any, row: int) -> Any:
-    """Load row `row` of a C-ordered array as lanes; rows are counted through all leading axes.
+    """Load one row of a C-ordered array as lanes, a vector of numbers.
 
-    The array's shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision.
+    The array's shape is (..., WIDTH) of doubles, or (..., SINGLE_WIDTH) in single precision. `row` counts the rows
+    through all leading axes.
     """
 
 
 def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `load`."""
+    """Build the LLVM instructions of `load`, which reads a row of an array as lanes."""
     return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
 def _loaded_type(arg_types: Any) -> Any:
-    """Find the type of lanes that `load` reads from an array.
+    """Find the type of the vector (lanes) that `load` reads from an array.
 
     Returns None if the arguments are not an array with loadable rows and an integer.
     """
@@ -353,17 +369,20 @@ register_lowering(load, 2, _loaded_type, _lower_load)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write the numbers in lanes to row `row` of a C-ordered array; rows are counted as in `load`."""
+    """Write lanes, a vector of numbers, to one row of a C-ordered array.
+
+    `row` counts the rows through all leading axes, as in `load`.
+    """
 
 
 def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `store`."""
+    """Build the LLVM instructions of `store`, which writes lanes to a row of an array."""
     builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
     return context.get_dummy_value()
 
 
 def _stored_type(arg_types: Any) -> Any:
-    """Return numba's type `none`, the result of `store`, or None if the array cannot contain lanes of this type."""
+    """Return numba's type `none`, the result of `store`, or None if the array cannot contain vectors of this type."""
     return types.none if _loaded_type(arg_types) == arg_types[2] else None
 
 
@@ -375,7 +394,7 @@ def broadcast(value: Any) -> Any:
 
 
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `broadcast`."""
+    """Build the LLVM instructions of `broadcast`, which copies one number into every lane of a vector."""
     return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 
@@ -390,14 +409,14 @@ _ROUNDING_DOUBLE, _ROUNDING_SINGLE = 6755399441055744.0, 12582912.0
 
 @contracted
 def exponential(x: Any) -> Any:
-    """Compute exp(x) for a number or for lanes, with x limited to -708..709.
+    """Compute exp(x) for a number or for lanes (a vector of numbers), with x limited to -708..709.
 
     exp(x) is 2^n times a polynomial in r = x - n ln 2. The relative error is below 1e-14, the same for a number and
     for lanes. In single precision it is below 2e-6 for x in -60..60; beyond -87..88 the result stays at a power of
     two.
 
-    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two parts);
-    Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
+    Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two
+    parts); Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.
     """
     x = min(max(x, -708.0), 709.0)
     n = nearest_integer(x * _LOG2_E)

@@ -118,11 +118,11 @@ def filtered_flow(
 ) -> float:
     """Compute the flow Q [m^3/s] of a throttle and a filter in series at the end of an implicit stage of the solver.
 
-    The equation is d + g Q(d) + dp_f(Q) = total, with d, g and `total` as in `implicit_orifice_flow`. The filter has
-    the resistance `R` [Pa s/m^3] and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens at the drop
-    `p_bypass` [Pa]: the drop dp_f is R Q while the valve is shut, and follows from Q = dp_f/R + G_bypass (dp_f -
-    p_bypass) while it is open. In both cases dp_f is linear in Q, so that `implicit_orifice_flow` solves the
-    equation.
+    The equation is d + g Q(d) + dp_f(Q) = total, with d, g and `total` as in `implicit_orifice_flow`. The filter
+    has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens at the
+    drop `p_bypass` [Pa]. The filter's drop dp_f is R Q while the valve is shut, and follows from Q = dp_f/R +
+    G_bypass (dp_f - p_bypass) while it is open. In both cases dp_f is linear in Q, so that `implicit_orifice_flow`
+    solves the equation.
     """
     filter_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open
@@ -133,9 +133,9 @@ def filtered_flow(
 
 @contracted
 def flow_through_filter(Q: float, R: float, p_bypass: float, G_bypass: float) -> float:
-    """Compute how much oil [m^3/s, >= 0] flows through a filter rather than through its bypass valve.
+    """Compute the part of a flow [m^3/s, >= 0] that passes the filter rather than its bypass valve.
 
-    `Q` [m^3/s]: flow through filter and bypass together; `R` [Pa s/m^3]: resistance of the filter. The bypass valve
-    opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
+    `Q` [m^3/s]: flow through filter and bypass together, of either sign; `R` [Pa s/m^3]: resistance of the filter.
+    The bypass valve opens at the pressure drop `p_bypass` [Pa] and has the conductance `G_bypass` [m^3/(s Pa)].
     """
     return min(abs(Q), (abs(Q) + G_bypass * p_bypass) / (1.0 + G_bypass * R))

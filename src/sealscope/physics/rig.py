@@ -117,10 +117,12 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
     """Compute the flow coefficients of the throttles for both directions: (c_A_in, c_A_out, c_B_in, c_B_out).
 
     They are in m^3/(s Pa^0.5), eqs. (4.7)-(4.12); "in" is the flow towards the cylinder. Each throttle is in series
-    with a shut-off valve (`series_coefficient`). `exponent`: 1 if the closed fraction is one of the area (eq. 4.8), 2
-    if it is one of the diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and
-    the return is throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs.
-    (4.9)-(4.12) are printed.
+    with a shut-off valve (`series_coefficient`).
+
+    `exponent`: 1 if a throttle's closed fraction is the fraction of its area (eq. 4.8), 2 if it is the fraction of
+    its diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and the return is
+    throttled on both sides (the text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12)
+    are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -148,20 +150,22 @@ def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float
 
 
 def parameter_values(rig: Rig) -> RigValues:
-    """Collect the parameters of a rig, in SI units, from which the numbers of the compiled laws are computed."""
+    """Collect the rig's parameters that the compiled model needs, in SI units."""
     return RigValues(*(float(attrgetter(name)(rig)) for name in VALUES.values()))
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return a rig's choice between two readings of the throttles' equations, as `exponent` and `literal`.
+    """Return the two options by which a rig interprets the thesis's equations of its throttles.
 
-    Both are arguments of `throttle_flow_coefficients`.
+    The first is `exponent`: 1 if a throttle's closed fraction is that of its area, 2 if that of its diameter. The
+    second is `literal`: True if eqs. (4.9)-(4.12) are taken as printed. Both are arguments of
+    `throttle_flow_coefficients`.
     """
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
 def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
-    """Compute a rig's throttle coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)].
+    """Compute the flow coefficients of a rig's throttles, (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)].
 
     "in" is the flow towards the cylinder, A and B are the sides (`throttle_flow_coefficients`).
     """
@@ -171,8 +175,8 @@ def throttle_coefficients(rig: Rig) -> tuple[float, float, float, float]:
 def rig_numbers(rig: Rig) -> RigNumbers:
     """Convert a rig to the numbers and choices that the compiled physical laws take.
 
-    These are its parameters in SI units, the numbers derived from them (`DERIVED`), and for each optional law
-    (`LAWS`) whether it is in force.
+    These are its parameters in SI units and the numbers derived from them (`DERIVED`). For each optional law
+    (`LAWS`) there is (True,) if the rig has it, else ().
     """
     values = parameter_values(rig)
     choices = {name: attrgetter(parameter)(rig) == value for name, (parameter, value) in _CHOICES.items()}
@@ -230,10 +234,11 @@ def pack_numbers(p: RigNumbers) -> Any:
 
 @contracted
 def limit_state(y: State, p: RigNumbers) -> State:
-    """Limit the motor current and the spool in a state after a step of the solver; return the new state.
+    """Limit the motor current and the spool of a servo valve in a state, after a step of the solver.
 
-    States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
-    the return's pressure. States that no law of the rig changes are set to 0, so that the compiler removes them.
+    Returns the new state. States that the rig does not use are overwritten: without lines p_1 = p_A and p_2 = p_B;
+    with a servo valve p_2 is the return's pressure. States that no law of the rig changes are set to 0, so that the
+    compiler removes them.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -293,8 +298,9 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
 
-    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead; the rate is 0 unless
-    it has LuGre's. `applied` [N]: sum of all other forces on the piston.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law instead. The rate is 0
+    unless it has LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`.
+    `applied` [N]: sum of all other forces on the piston.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -333,6 +339,7 @@ def implicit_flows(
 
     On each side the flow solves d + g Q(d) = total, with `total` [Pa], `g` [Pa s/m^3] and d as in
     `implicit_orifice_flow`. A filter in series with the throttle, p_1 - p_A = d + R Q, adds its resistance R to g.
+    If it has a bypass valve, the flow is that of `filtered_flow`.
     """
     if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
@@ -348,7 +355,7 @@ def implicit_flows(
 
 @contracted
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute how much oil [m^3/s, >= 0] flows through the filters of lines A and B, without their bypasses."""
+    """Compute the flows [m^3/s, >= 0] through the filters of lines A and B, without the flow in their bypasses."""
     Q_A, Q_B = throttle_flows(y, p)
     if len(p.bypassed) == 0:
         return abs(Q_A), abs(Q_B)
@@ -446,10 +453,11 @@ def supply_pressure(y: State, p: RigNumbers) -> float:
 
 @contracted
 def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), by check and relief valves.
+    """Compute the flows [m^3/s] from the make-up's accumulator to sides 1 (A) and 2 (B), through its valves.
 
-    Sides 1 and 2 are the pump's ports, or the chambers A and B in a rig without lines. The pressure on each side can
-    open the check valve of the other if these are pilot-operated.
+    The valves are check valves and, for the opposite direction, relief valves. Sides 1 and 2 are the pump's ports,
+    or the chambers A and B in a rig without lines. The pressure on each side can open the check valve of the other
+    if these are pilot-operated.
     """
     supply = supply_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
@@ -613,7 +621,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
 
 @contracted
 def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute the state's rates dy/dt from all physical laws of the rig.
+    """Compute the rates dy/dt of all states of the rig from its physical laws.
 
     The arguments are those of `rates_without_throttles`.
     """
@@ -626,9 +634,10 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Write the outputs of a state, its numbers and the flows and voltage that follow from them, to `row` (21,).
+    """Write all outputs of the rig in one state to `row` (21,), in the order of `OUTPUTS`.
 
-    The order is that of `OUTPUTS`; the arguments are those of `rates_without_throttles`.
+    The outputs are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. The
+    arguments are those of `rates_without_throttles`.
     """
     for m in range(len(y)):
         row[m] = y[m]

@@ -54,12 +54,12 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Fill the zero state `y` (14,) with the standstill of a pump-controlled rig; return 0, or a code of failure.
+    """Set the zero state `y` (14,) to standstill of a pump-controlled rig; return 0, or a code if this is impossible.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5); the integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3). The code is
-    `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if the current or voltage is beyond the drive's
-    limits.
+    (4.5). The integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3), or 0 if K_i = 0.
+    The code is `BELOW_VACUUM` if a pressure would be below vacuum, `BEYOND_DRIVE` if the current or voltage is
+    beyond the drive's limits.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x

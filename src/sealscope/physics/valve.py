@@ -26,7 +26,7 @@ def spool_speed(v_s: float, v_max: float) -> float:
 
 @contracted
 def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_s: float, v_max: float) -> float:
-    """Compute the rate dv_s/dt [m/s^2] of the spool's speed: that of a second-order lag, or 0 at the speed limit.
+    """Compute the rate dv_s/dt [m/s^2] of the spool's speed, as a second-order lag with a limited speed.
 
     dv_s/dt = omega_s^2 (x_d - x_s) - 2 zeta_s omega_s v_s with position `x_s` and target position `x_d` [m], speed
     `v_s` [m/s], natural frequency `omega_s` [rad/s] and damping ratio `zeta_s`. It is 0 where v_s would leave
@@ -43,7 +43,7 @@ def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_
 def spool_within_stroke(x_s: float, v_s: float, x_max: float, v_max: float) -> tuple[float, float]:
     """Limit the spool's position [m] to its stroke +-x_max and its speed [m/s] to +-v_max; return both.
 
-    At an end of the stroke only a speed that points inwards remains.
+    At an end of the stroke, a speed that points outwards becomes 0.
     """
     v = min(max(v_s, -v_max), v_max)
     v = select(x_s >= x_max, min(v, 0.0), select(x_s <= -x_max, max(v, 0.0), v))

@@ -46,6 +46,7 @@ class Mark:
     known: bool = False
 
     def __post_init__(self) -> None:
+        """Raise InputError if the time of the mark is not finite."""
         if not isfinite(self.t):
             raise InputError(f"time of the mark {self.label!r} must be finite, got {self.t}")
 
@@ -61,10 +62,10 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart of the page.
 
-    `key`: its identifier; `group`: group of charts on the page to which it belongs; `base`: name of the time axis of
-    its lines, that of all samples, of the centres of the RMS windows, or of the leak over the recording; `band`: True
-    if the second and third line are the interval of the first; `limits`: ends of the y axis, None to show all values;
-    `level`: repair limit, None if there is none.
+    `key`: its identifier; `group`: section of the page in which it is shown; `base`: name of the time axis of its
+    lines. The axis has the times of all samples, the centres of the RMS windows, or the times of the leak's estimates
+    over the recording. `height` in pixels; `band`: True if the second and third line are the interval of the first;
+    `limits`: ends of the y axis, None to show all values; `level`: repair limit, None if there is none.
     """
 
     key: str
@@ -92,10 +93,10 @@ class Chart(NamedTuple):
 
 
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Convert a channel (n,) to its display unit; return the unit and the values.
+    """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    Pressures are in `pressure_unit`, raw counts in counts; other channels are in the unit of the log, or if it states
-    none, in degC, mm, rpm, L/min or SI.
+    `name`: name of the channel. Pressures are in `pressure_unit`, and raw counts of a sensor in counts. Other
+    channels are in the unit of the log file, or if it states none, in degC, mm, rpm, L/min or SI.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -109,8 +110,8 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
     """Choose the unit in which values in the SI unit `unit` are displayed; return it, and its size in SI.
 
-    Values are divided by this size for display. `detail`: True for a wavelet detail of a pressure, which has a
-    smaller unit. Raises InputError for an unknown pressure unit.
+    Values are divided by this size for display. `pressure_unit`: display unit of pressures; `detail`: True for a
+    wavelet detail of a pressure, which has a smaller unit. Raises InputError for an unknown pressure unit.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
@@ -137,7 +138,10 @@ def detail_label(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Build the charts of all channels with samples; channels of one kind and unit share a chart."""
+    """Build the charts of all channels with samples; channels of one kind and unit share a chart.
+
+    `pressure_unit`: display unit of pressures.
+    """
     charts = []
     for key, title, height, members in _CHANNELS:
         units: dict[str, list[ChartLine]] = {}
@@ -163,7 +167,11 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build the charts of the RMS of wavelet details in windows: d1 to d4 of each chamber, then d3d4 of each."""
+    """Build the charts of the RMS of wavelet details in windows.
+
+    `chambers`: wavelet details of the pressure of each cylinder chamber; `pressure_unit`: display unit of pressures.
+    The list has a chart of d1 to d4 for each chamber, then one of d3d4, the product of d3 and d4, for each.
+    """
     charts = []
     for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
@@ -221,8 +229,8 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
     """Compute the limits of the y axis, which include zero, all estimates `values` and their intervals.
 
-    `low`, `high`: ends of the intervals, not finite if unknown. If the intervals more than double the range, only 90
-    % of their ends are included, because a few wide intervals would flatten the curve.
+    `low`, `high`: ends of the intervals, not finite if unknown. If the intervals more than double the range, the
+    outermost 10 % of their ends are left out, because a few wide intervals would flatten the curve.
     """
     required_values = [0.0, float(np.nanmin(values)), float(np.nanmax(values))]
     low_ends, high_ends = low[np.isfinite(low)], high[np.isfinite(high)]
@@ -235,7 +243,10 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber; the charts of the same detail follow each other."""
+    """Build a chart for each wavelet detail of each chamber; the charts of the same detail follow each other.
+
+    `chambers`: wavelet details of the pressure of each cylinder chamber; `pressure_unit`: display unit of pressures.
+    """
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -254,9 +265,9 @@ Moment = tuple[str, float, float | None]
 class DrawnCharts(NamedTuple):
     """All charts in the form that a page needs.
 
-    `data`: plain JSON values for the script; `still`: still picture of each chart, by its key; `base`: times at which
-    the channels are drawn; `span` [s]: first and last of these times; `fine` [s]: ends of the interval in which all
-    samples are drawn.
+    `data`: plain JSON values for the script that draws the charts; `still`: still picture of each chart, by its key,
+    for readers without scripts; `base`: times at which the channels are drawn; `span` [s]: first and last of these
+    times; `fine` [s]: ends of the interval in which all samples are drawn.
     """
 
     data: dict[str, Any]
@@ -275,8 +286,9 @@ def draw(
 ) -> DrawnCharts:
     """Reduce and encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
-    Peaks are preserved, because the minimum and the maximum of each bucket of samples are drawn. `chambers`: wavelet
-    details, for their time axes; `marks`: moments to mark on every chart, besides the onset of the diagnosis.
+    Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
+    peaks are preserved. `chambers`: wavelet details, for their time axes; `marks`: moments to mark on every chart,
+    besides the onset of the diagnosis.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
@@ -320,7 +332,7 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its interval limited to the time `span` [s] of the chart.
+    """Return the onset of the leak [s], and its confidence interval limited to the time `span` [s] of the chart.
 
     Each is None if it is not known.
     """
@@ -338,8 +350,8 @@ def render_still(
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high.
 
-    `lines`: values (n,) of each line, at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`:
-    moments and intervals to mark.
+    A page shows it where no script runs, such as on paper. `lines`: values (n,) of each line, at the times `t` (n,)
+    [s]; `span` [s]: ends of the time axis; `moments`: moments and intervals to mark.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)

@@ -119,8 +119,9 @@ class Parts(NamedTuple):
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Choose the parts of a recording to compare: before and after the interval of the onset, or the two halves.
 
-    The halves are compared if no onset was found. If each has fewer than `HALF_WINDOWS` RMS windows, the recording is
-    not divided: a difference would reflect the stroke and not the seal.
+    The halves are compared if no onset was found. If they are too short for `HALF_WINDOWS` RMS windows each, the
+    first part is the whole recording and the second is empty: a difference of short halves would reflect the stroke
+    and not the seal.
     """
     t = ordered_time(recording.t, recording.rate)[0]
     if diagnosis.onset_s is not None:
@@ -140,6 +141,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
     """Compute the RMS of each wavelet detail of each chamber in two parts of the recording.
 
+    `chambers`: wavelet details of each chamber's pressure; `parts`: end of the first part and start of the second.
     The RMS is None for a part without finite values.
     """
     t = ordered_time(recording.t, recording.rate)[0]

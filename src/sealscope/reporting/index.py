@@ -16,10 +16,10 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Compute the key by which pages are sorted, the most severe diagnosis first.
+    """Compute a sort key that puts the most severe diagnosis first.
 
-    It compares the verdict, then the leak as a fraction of the repair limit, then the flow, then the name of the
-    file.
+    It consists of the number of the verdict (leak, cannot tell, no leak), the negative leak as a fraction of the
+    repair limit, the negative flow [L/min], and the name of the file. Unknown numbers are 0.
     """
     severity = diagnosis.severity
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]

@@ -26,7 +26,7 @@ ABSENT = "–"
 
 @cache
 def _texts() -> dict[str, dict[str, str]]:
-    """Load the texts in `messages.toml`, by section and key."""
+    """Load the texts in `messages.toml`, as a mapping of section and key to text."""
     return tomllib.loads((resources.files("sealscope.reporting") / "messages.toml").read_text(encoding="utf-8"))
 
 
@@ -40,7 +40,7 @@ def say(name: str, /, **values: Any) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits; a dash for None or NaN.
+    """Format a number with `digits` significant digits; a dash for None or NaN, and the sign for infinity.
 
     Between 1e-6 and 1e9 it is written without an exponent.
     """
@@ -68,7 +68,7 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a sentence for the heading of the page and of the card, its picture."""
+    """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis."""
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
         key = diagnosis.cause
@@ -102,7 +102,11 @@ def state_text(machine_state: MachineState) -> str:
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the time since which the machine leaks, with its interval; return None if the verdict is no leak."""
+    """Format the time since which the machine leaks, with its interval.
+
+    If the onset is not known, the text says that the leak is older than the recording or rises within it. Returns
+    None if the verdict is no leak.
+    """
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -114,9 +118,9 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Format the leak flow [L/min], or the reason why no flow is stated.
+    """Format the leak flow [L/min] with its interval, or the reason why no flow is stated.
 
-    For verdicts other than "leak", format the upper bound of a leak; return None if it is not known.
+    For verdicts other than "leak", the text is the upper bound of a leak, or None if it is not known.
     """
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
@@ -142,7 +146,7 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return the text that says why the leak cannot be stated in L/min, and how that can be remedied."""
+    """Return the reason why the leak cannot be stated in L/min, with its remedy, as text."""
     if "leak_lpm" not in diagnosis.refuses:
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
@@ -195,7 +199,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in three other forms: in mL/min, relative to the pump's flow, and by a piston's speed of creep.
+    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep speed of the piston in mm/min.
 
     Forms that are not known are left out; None is returned if all are unknown.
     """
@@ -303,7 +307,8 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 def _odds(diagnosis: Diagnosis) -> str | None:
     """Format the odds that a healthy recording looks like this one; return None if they are not known.
 
-    If the verdict is `no leak` and no detector raised an alarm, the text says "shows as much change" instead.
+    If the verdict is `no leak` and no detector raised an alarm, the text says "shows as much change" in place of
+    "looks like this".
     """
     odds = diagnosis.odds
     if odds is None or diagnosis.verdict != "no leak" or diagnosis.alarmed:
@@ -451,9 +456,11 @@ _FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as a line of a table: file, date, verdict and L/min; a second line states the next step.
+    """Format a diagnosis as a line of a table: file, date, verdict and leak flow in L/min.
 
-    `start_s`: start of the recording [s since 1970].
+    A second line states the cause and the next step, unless the verdict is no leak without a named cause. The name of
+    a file longer than its column stands on a line of its own. `start_s`: start of the recording [s since 1970], None
+    to leave the date blank.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

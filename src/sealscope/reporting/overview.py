@@ -19,9 +19,10 @@ CURVE_WIDTH = 20
 
 
 def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
-    """Draw values (n,) as a line of `width` bar characters, scaled between minimum and maximum.
+    """Draw values (n,) as a line of at most `width` bar characters, scaled between minimum and maximum.
 
-    A blank stands for missing samples.
+    The values are divided into as many parts as there are characters, and each shows the middle value of its part. A
+    blank stands for missing samples.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:

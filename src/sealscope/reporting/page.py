@@ -44,7 +44,7 @@ def report(
     title: str | None = None,
     pressure_unit: str | None = None,
 ) -> Path:
-    """Write the page of a diagnosis: one HTML file with charts, figures and findings, and nothing outside it.
+    """Write the page of a diagnosis as one self-contained HTML file with charts, figures and findings.
 
     Parameters
     ----------
@@ -101,14 +101,18 @@ def report(
 
 
 def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
-    """Write the page of a diagnosis with `report`; deprecated, and its arguments are in an older order."""
+    """Write the page of a diagnosis with `report`; deprecated, and its arguments are in an older order.
+
+    `options`: further arguments of `report`.
+    """
     return report(recording, path, diagnosis, **options)
 
 
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 
-    Returns None if `rig` states no dimensions, or if no packaged rig was stated.
+    `rig`: a Rig, the name of a packaged rig or the path of a TOML file. Returns None if it is merely the default rig,
+    which nobody stated, or without `rig`, if the diagnosis names no packaged rig.
     """
     from sealscope.parameters import load_rig, rig_names
 
@@ -122,9 +126,9 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the marks of all charts: `marks`, and the true onset [s] if it is known.
+    """Collect the moments to mark on all charts: `marks`, and the true onset [s] if it is known.
 
-    Raises InputError if the recording is empty, for then there is no page.
+    Raises InputError if the recording is empty, as no page can be made of it.
     """
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
@@ -223,8 +227,9 @@ def _change_rows(
 ) -> dict[str, Any]:
     """Build the template's values for the table that compares the details' RMS in two parts of the recording.
 
-    Returns `changes`, rows of (channel, detail, unit, RMS before, RMS after, change [%]); `bar_limit` [%], the
-    largest change that the bars show; and `parts`.
+    `chambers`: wavelet details of each chamber's pressure. Returns `changes`, rows of (channel, detail, unit, RMS
+    before, RMS after, change [%]); `bar_limit` [%], the largest change that the table's bars show; and `parts`, the
+    two parts.
     """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
@@ -238,7 +243,11 @@ def _change_rows(
 
 
 def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    """Compute minimum, mean and maximum of a channel in its display unit, and the number of missing samples."""
+    """Compute minimum, mean and maximum of a channel in its display unit, and the number of missing samples.
+
+    Returns them as `low`, `mean`, `high` and `missing`, with the channel's `name` and `unit`. The first three are
+    None if the channel has no finite sample.
+    """
     unit, values = charts.display_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
     statistics = (np.min, np.mean, np.max)
@@ -247,7 +256,10 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested mappings as pairs of dotted name and text."""
+    """Yield the entries of nested mappings as pairs of dotted name and text, such as ("rig.name", "thesis").
+
+    `prefix`: beginning of each name.
+    """
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

@@ -72,29 +72,36 @@ class Picture:
         return {shape.style for shape in self.shapes}
 
     def x(self, values: Array | float) -> Array:
-        """Convert values of the x axis to distances from the left of the frame."""
+        """Convert values of the x axis to distances from the left of the frame, in pixels."""
         start, stop = self.x_ends
         positions = np.log10(values) if self.log else np.asarray(values)
         return np.asarray((positions - start) / (stop - start) * self.width)
 
     def y(self, values: Array | float) -> Array:
-        """Convert values of the y axis to distances from the top of the frame."""
+        """Convert values of the y axis to distances from the top of the frame, in pixels."""
         low, high = self.y_ends
         return np.asarray(self.height * (high - np.asarray(values)) / (high - low))
 
     def draw(self, style: str, path: str, title: str = "") -> None:
-        """Draw an SVG path in pixels of the picture; `style`: its name in the style sheet; `title`: its tooltip."""
+        """Add an SVG path to the picture, with coordinates in pixels from the frame's top left corner.
+
+        `style`: its name in the style sheet; `title`: its tooltip, "" for none.
+        """
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
         """Draw the line through points (n,) in values of the axes, interrupted where y is missing (NaN).
 
-        `digits`: decimals of the coordinates in the SVG path.
+        `style`: its name in the style sheet; `title`: its tooltip; `digits`: decimals of the coordinates in the SVG
+        path.
         """
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Format the line through points (n,) as an SVG path, interrupted at a missing y (NaN)."""
+        """Format the line through points (n,) as an SVG path, interrupted at a missing y (NaN).
+
+        `x`, `y`: values of the axes; `digits`: decimals of the coordinates in pixels.
+        """
         is_drawn = np.isfinite(y)
         is_first = is_drawn & ~np.append(False, is_drawn[:-1])
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
@@ -123,9 +130,10 @@ class Picture:
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
-        """Draw one of the `SYMBOLS`, which the first word of `style` names, at `x`.
+        """Draw a symbol, such as a dot or a cross, at the value `x` of the x axis.
 
-        `down`: distance from the top of the frame in pixels.
+        The first word of `style` names one of the `SYMBOLS`. `down`: distance from the top of the frame in pixels;
+        `title`: tooltip, "" for none.
         """
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
@@ -142,7 +150,10 @@ class Picture:
         self.draw("frame", f"M0 0H{self.width:g}V{self.height:g}H0z")
 
     def below(self, x: float, text: str, anchor: str = "middle") -> None:
-        """Write a text below the frame at `x`."""
+        """Write a text below the frame at the value `x` of the x axis.
+
+        `anchor`: part of the text that is placed at `x`, as in SVG.
+        """
         self.labels.append(SvgText(float(self.x(x)), self.height + 16.0, text, anchor))
 
 

@@ -68,10 +68,10 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 
 
 def _inline_styles(page: str) -> str:
-    """Prepare a page (HTML) for WeasyPrint: copy its style sheet into each drawing, and resolve its variables.
+    """Prepare a page (HTML) for WeasyPrint, and return it.
 
-    WeasyPrint neither applies the style sheet of a page to drawings nor supports variables in them. A variable is
-    replaced by its value for print.
+    WeasyPrint neither applies the style sheet of a page to drawings nor supports CSS variables in them. The style
+    sheet is therefore copied into each drawing, and each variable is replaced by its value for print.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -109,8 +109,8 @@ def _write_by_browser(
 ) -> None:
     """Run a browser that converts the page (HTML) to a file; raise InputError unless the file is complete.
 
-    `target`: the file that the browser writes; `options`: those that tell it to do so; `kind`: name of the kind of
-    file, for the error message; `is_complete`: function that tests the bytes of the file.
+    `target`: the file that the browser writes; `options`: command-line options that make it write this file; `kind`:
+    name of the kind of file, for the error message; `is_complete`: function that tests the bytes of the file.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"

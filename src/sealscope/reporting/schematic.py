@@ -31,10 +31,10 @@ class Circuit(NamedTuple):
     """The parts of a machine that the schematic shows.
 
     `cylinder`: kind of the cylinder, such as "double-rod cylinder"; `rods`: sides with a rod, "A", "B" or "AB";
-    `rod`: height of the drawn rod, for a single rod sqrt(1 - A_small / A_large) of the drawn bore; `throttles`,
-    `make_up`, `bypass`: True if the machine has throttles in its lines, make-up valves, or a bypass with a flow
-    meter; `valve`: True if a servo valve drives the cylinder; `values`: by label, the value with its unit, "" if it
-    is not known.
+    `rod`: height of the drawn rod, for a single rod sqrt(1 - A_small / A_large) of the drawn bore, but at most 0.8 of
+    it; `throttles`, `make_up`, `bypass`: True if the machine has throttles in its lines, make-up valves, or a bypass
+    with a flow meter; `valve`: True if a servo valve drives the cylinder; `values`: by label, the value with its
+    unit, "" if it is not known.
     """
 
     cylinder: str

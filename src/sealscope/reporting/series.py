@@ -38,8 +38,9 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        A bucket gives its minimum and its maximum, the minimum first if its values rise; a bucket of one sample gives
-        one point. Buckets without finite samples give NaN, as do gaps in time, which interrupts the line.
+        Each bucket, a group of successive samples, gives its minimum and its maximum, the minimum first if its values
+        rise. A bucket of one sample gives one point. A bucket without finite samples gives NaN, as does a gap in
+        time, which interrupts the line.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -50,7 +51,10 @@ class DrawnTimes:
 
 
 def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
-    """Interleave the first and second points (k,) of k buckets; a bucket with the size 1 has no second point."""
+    """Arrange the first and second points (k,) of k buckets, groups of samples, in their order along the line.
+
+    `sizes` (k,): number of samples in each bucket; a bucket of one sample has no second point.
+    """
     pairs = np.stack([first, second], axis=1)
     is_point = np.stack([np.ones(sizes.size, dtype=bool), sizes > 1], axis=1)
     return np.asarray(pairs[is_point])
@@ -59,8 +63,8 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
     """Choose an increasing time axis (n,) [s] for a recording with the time stamps `t` (n,) [s].
 
-    If they do not increase, the time axis is the number of the sample over the sampling rate [Hz], and the second
-    result is True; otherwise they are returned, with False.
+    If the time stamps increase, they are the axis, and the second result is False. Otherwise the axis is the number
+    of the sample over the sampling rate [Hz], and the second result is True.
     """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
@@ -69,12 +73,13 @@ def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
 def choose_drawn_times(
     t: Array, rate: float, points: int, *, near: float | None = None, near_samples: int = 0
 ) -> DrawnTimes:
-    """Choose the times at which a chart draws a recording: two for each bucket of samples, about `points` in all.
+    """Choose the times at which a chart draws a recording, about `points` in all.
 
-    `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which `near_samples`
-    samples are all drawn, None for no such time. Buckets have equal numbers of samples, so a drawn peak is at most
-    one bucket away from its true time. A gap in time starts a new bucket, and an additional point there interrupts
-    the line; if there are many gaps, only the longest ones do.
+    There are two for each bucket, a group of successive samples of which only minimum and maximum are drawn. `t` (n,)
+    [s]: time stamps; `rate` [Hz]: nominal sampling rate; `near` [s]: time around which `near_samples` samples are all
+    drawn, None for no such time. Buckets have equal numbers of samples, so a drawn peak is at most one bucket away
+    from its true time. A gap in time starts a new bucket, and an additional point there interrupts the line; if there
+    are many gaps, only the longest ones do.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)

@@ -30,7 +30,10 @@ _SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 @cache
 def _environment(package: str) -> jinja2.Environment:
-    """Build the jinja2 environment for the templates of a package, which may include those of this package."""
+    """Build the jinja2 environment for the templates of a package.
+
+    They may include templates of `sealscope.reporting`.
+    """
     import jinja2
 
     environment = jinja2.Environment(
@@ -50,9 +53,9 @@ def render(
 ) -> str:
     """Render the template called `template` as the text of a page, with the values `context`.
 
-    `package`: package of the template; `scripts`: files of it with scripts that the page runs; `chart_data`: plain
-    JSON values of charts, for which the scripts that draw them are added, None for none. Control characters, which
-    may come from names and descriptions in files, are replaced.
+    `package`: package of the template; `scripts`: names of the package's files with scripts that the page runs;
+    `chart_data`: plain JSON values of charts, for which the scripts that draw them are added, None for a page without
+    charts. Control characters, which may come from names and descriptions in files, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -61,7 +64,7 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file of `package`, or of this package if it is not there, as text that templates do not escape."""
+    """Read a file of `package`, or else of `sealscope.reporting`, as text that templates do not escape."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -86,7 +89,7 @@ def _script_json(value: Any) -> Markup:
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
     """Convert the path of a page to a Path, and check its suffix; raise InputError for any other suffix.
 
-    A page ends in .html, .htm or .pdf, and if `card` is True, also in .png, its picture.
+    A page ends in .html, .htm or .pdf, and if `card` is True, also in .png, a picture that sums up the page.
     """
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]
     if Path(path).suffix.lower() not in suffixes:
@@ -95,7 +98,7 @@ def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
 
 
 def write(path: str | os.PathLike[str], page: str) -> Path:
-    """Write a page atomically, as UTF-8, or as a PDF if the name ends in .pdf.
+    """Write a page (HTML) to a file atomically, as UTF-8, or as a PDF if the name ends in .pdf; return the path.
 
     Raises InputError if it cannot be written, MissingExtra if no program for printing a PDF is installed.
     """
@@ -109,7 +112,7 @@ def write(path: str | os.PathLike[str], page: str) -> Path:
 
 
 def _installed_version() -> str:
-    """Return the version of the installed package, which is shown at the foot of a page."""
+    """Return the version of the installed package for the foot of a page, or "(not installed)"."""
     try:
         return metadata.version("sealscope")
     except metadata.PackageNotFoundError:

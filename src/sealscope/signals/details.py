@@ -51,11 +51,11 @@ class Details:
 
     @property
     def levels(self) -> int:
-        """Number of levels."""
+        """Number of levels of the wavelet transform."""
         return int(self.values.shape[0])
 
     def __getitem__(self, level: int) -> Array:
-        """Return the detail of a level, (n,), including the samples at both ends that depend on padding.
+        """Return the detail d_j of the level j, (n,), including the samples at both ends that depend on padding.
 
         Raises InputError if there is no such level; the first one is 1.
         """
@@ -78,7 +78,10 @@ class Details:
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of samples that do not depend on padding at a level; None stands for all levels."""
+        """Return the slice of the samples of a level that do not depend on padding.
+
+        `level`: 1 for d_1, or None for the samples that do not depend on padding in any level.
+        """
         before, after = self.edges[(level or self.levels) - 1]
         return slice(int(before), self.values.shape[1] - int(after))
 
@@ -149,15 +152,19 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean square of each of the five `QUANTITIES` between consecutive sample numbers, (k, 5).
+    """Compute the mean squares of d1, d2, d3, d4 and d3d4 in each of k segments of a signal, (k, 5).
 
-    `bounds` (k + 1,) are the sample numbers at which segments begin and end.
+    `transformed`: the details of the signal; `bounds` (k + 1,): sample numbers at which the segments begin, and the
+    end.
     """
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
-    """Compute the means (r, k) of rows of `values` (r, n) between consecutive sample numbers `bounds` (k + 1,)."""
+    """Compute the means (r, k) of the rows of `values` (r, n) over k segments.
+
+    `bounds` (k + 1,): sample numbers at which the segments begin, and the end.
+    """
     edges = np.asarray(bounds)
     sums = np.add.reduceat(values, edges[:-1], axis=1)
     sums[:, -1] = values[:, edges[-2] : edges[-1]].sum(axis=1)  # reduceat sums to the end of the row
@@ -198,7 +205,7 @@ def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Ar
     before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]  # by level, from 0
 
     def hold_coefficients(coefficients: Array, level: int) -> Array:
-        """Repeat each coefficient of a level 2^level times, and remove the padding."""
+        """Repeat each coefficient of a level 2^level times, and remove the samples of the padding; returns (n,)."""
         # coefficient o is the stationary detail at sample 2^j o - before_j
         return np.repeat(coefficients, 2**level)[before[level] : before[level] + x.size]
 
@@ -218,7 +225,10 @@ def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[A
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
     def reconstruct_level(index: int) -> Array:
-        """Invert the transform with all coefficients set to zero except those at `index`."""
+        """Compute the part of the signal that comes from one level, (n,).
+
+        The transform is inverted with all coefficients set to zero except those at `index` of the list.
+        """
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
         return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
 

@@ -22,8 +22,8 @@ def filter_rows(
 ) -> None:
     """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
-    i runs from 0 to n - 1, and k from 0 to n_taps - 1. The second axis of `rows`, `taps` and `out` holds the eight
-    signals. Eight outputs are computed at a time.
+    i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows: the second axis of `rows`, `taps`
+    and `out` holds the eight signals. Eight outputs are computed at a time.
     """
     i = 0
     while i + 8 <= n:
@@ -81,10 +81,10 @@ def split_levels(
 
 @contracted
 def move_history(buffers: Array, start: int, levels: int, capacity: int, fill: int, history: int) -> None:
-    """Move the last `history` of the `fill` used rows to the front of each buffer of one channel.
+    """Move the last `history` of the `fill` used rows to the front of each buffer of one channel, to make room.
 
-    The channel has one buffer of `capacity` rows for each of `levels` levels. The buffers follow each other, and the
-    first one begins at row `start`.
+    The channel has one buffer of `capacity` rows for each of `levels` levels. The buffers follow each other, and
+    the first one begins at row `start`.
     """
     for level in range(levels):
         row = start + level * capacity
@@ -104,12 +104,13 @@ def advance_details(
     details: Array,
     out: Array,
 ) -> int:
-    """Compute the wavelet details of the next block of all signals, and return the new fill of the buffers.
+    """Compute the wavelet details of the next block of all signals.
 
-    `block` (channels, actuators, n) are the samples, and `out` (channels, actuators, levels, n) receives the details.
-    `groups` are the first and the last + 1 of the groups of eight signals to filter. `buffers` (groups, channels,
-    levels, capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`
-    and `high` (taps, WIDTH) are the filters, and `details` (levels, CHUNK, WIDTH) is a work array.
+    Returns the number of rows that are then in use in the buffers. `block` (channels, actuators, n) are the
+    samples, and `out` (channels, actuators, levels, n) receives the details. `groups` are the first and the last +
+    1 of the groups of eight signals to filter. `buffers` (groups, channels, levels, capacity, WIDTH) have `fill`
+    rows in use, the last `history` of which are needed for later outputs. `low` and `high` (taps, WIDTH) are the
+    filters, and `details` (levels, CHUNK, WIDTH) is a work array.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]

@@ -99,7 +99,7 @@ class DetailStream:
         self._workspaces = [aligned_zeros((self.levels, CHUNK, WIDTH)) for _ in self._parts]
 
     def update(self, block: ArrayLike, out: Array | None = None) -> Array:
-        """Filter the next block and return its details.
+        """Filter the next block of samples and return its wavelet details.
 
         Parameters
         ----------
@@ -146,8 +146,8 @@ class DetailStream:
         def filter_part(part: tuple[int, int], work: Array) -> int:
             """Filter the block for a part of the groups of eight signals, in one thread.
 
-            `part` are the first and the last + 1 group, and `work` is the thread's work array. Returns the new fill
-            of the buffers.
+            `part` are the first and the last + 1 group, and `work` is the thread's work array. Returns the number
+            of rows that are then in use in the buffers.
             """
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
@@ -158,7 +158,7 @@ class DetailStream:
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
-        """Pool with one thread for each part of the signals."""
+        """Pool of threads that filter the block, one for each part of the signals."""
         from concurrent.futures import ThreadPoolExecutor
 
         return ThreadPoolExecutor(len(self._parts))
@@ -179,9 +179,9 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Make a stream that continues from a saved `state_dict`, with identical results.
+        """Make a stream that continues from a saved `state_dict`, with results as if it had not been interrupted.
 
-        Raises InputError if it is not valid.
+        Raises InputError if the state is not valid.
         """
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         table = tuple(channels) if isinstance(channels, list) else channels

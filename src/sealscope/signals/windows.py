@@ -107,7 +107,7 @@ class RmsStream:
         self._n_unused = 0  # number of pieces to skip, which are in no window (step > size)
 
     def update(self, block: ArrayLike) -> WindowedRms:
-        """Add the next block and return the windows that it completes, possibly none.
+        """Add the next block of samples and return the RMS of the windows that it completes, possibly none.
 
         Parameters
         ----------
@@ -151,7 +151,7 @@ class RmsStream:
         return WindowedRms(ends, values)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the stream as numbers and arrays, from which `from_state` continues."""
+        """Return the state of the stream as numbers, None, and arrays, from which `from_state` continues."""
         return {
             "size": self.size,
             "step": self.step,
@@ -164,7 +164,7 @@ class RmsStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Make a stream that continues from a saved `state_dict`; raise InputError if it is not valid."""
+        """Make a stream that continues from a saved `state_dict`; raise InputError if the state is not valid."""
         size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
         stream = cls(size, step, skip=require_count(state, "skip"))
         stream._next_end, stream._n_unused = require_count(state, "next_end"), require_count(state, "ahead")
@@ -179,17 +179,20 @@ class RmsStream:
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Compute the sum of squares of each complete piece of `piece` samples of `x` (..., n), (..., n // piece)."""
+    """Compute the sums of squares of consecutive pieces of a series, (..., n // piece).
+
+    Each piece has `piece` samples of `x` (..., n); an incomplete last one is left out.
+    """
     n_pieces = x.shape[-1] // piece
     in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
     return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
-    """Compute the RMS of each complete window from the sums of squares of its pieces.
+    """Compute the RMS of each complete window of a series, (..., windows).
 
-    `sums` (..., pieces) are added in order. `size` and `step` are the samples of a window and from one window to the
-    next. Returns (..., windows).
+    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples, which are added in
+    order. `size`: number of samples in a window; `step`: number of samples from one window to the next.
     """
     piece = math.gcd(size, step)
     per_window, per_step = size // piece, step // piece  # pieces

@@ -71,9 +71,10 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute the parameter `field` at times t [s] from its value in the rig.
+    """Compute one parameter at times t [s] by applying the effects to its value in the rig.
 
-    `effects`: all changes within the run; those of other parameters are ignored.
+    `rig_value`: value of the parameter without effects; `field`: name of the parameter; `effects`: changes of
+    parameters over time, of which only those of this parameter are applied.
     """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
@@ -85,16 +86,18 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
     """Compute all model parameters that the effects change, at times t (n,) [s].
 
-    Returns an array (n,) by name of the parameter. `base`: the model's parameters without effects.
+    Returns a mapping from the name of a parameter to its values (n,). `base`: the model's parameters without
+    effects.
     """
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
 
 def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
-    """Divide a run into blocks within which the solver takes all parameters as constant; return their bounds.
+    """Divide a run into blocks of time within which the solver takes all parameters as constant.
 
-    The run has `n_out` outputs at `rate` [Hz]. The bounds (blocks + 1,) are indices of outputs, from 0 to `n_out`.
+    Returns the bounds of the blocks (blocks + 1,) as indices of outputs, from 0 to `n_out`. The run has `n_out`
+    outputs at `rate` [Hz]; `effects`: changes of parameters within the run.
 
     A block is at most `LONGEST_BLOCK` long, and short enough that no effect changes by more than its `max_change`
     within it, but not shorter than the effect's `min_block`. Breakpoints of effects fall on bounds, to within one
@@ -118,11 +121,12 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the sets of model parameters for which the solver's step must be short enough.
+    """Collect the extreme values of the model's parameters in a run, each of which the solver's step must resolve.
 
-    These are `base`, the parameters without effects, and those just before and after each breakpoint of a fast
-    effect, such as a valve that switches (`min_block` below `SHORTEST_BLOCK`). All other effects change the
-    parameters too little to matter.
+    The parameters change during the run. A step that is short enough for each of the returned parameter sets is
+    short enough for the whole run. The first set is `base`, the parameters without effects. The others are the
+    parameters just before and just after each breakpoint of a fast effect, such as a valve that switches
+    (`min_block` below `SHORTEST_BLOCK`). Slow effects change the parameters too little to matter.
     """
     fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
@@ -141,7 +145,11 @@ class Schedule:
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
-        """Apply `effects` to the model parameters `base`, for a run of `n_out` outputs at `rate` [Hz]."""
+        """Divide a run into blocks of time, and compute the model's parameters in each of them.
+
+        The run has `n_out` outputs at `rate` [Hz]. `effects`: changes of parameters within the run; `base`: the
+        parameters without these changes.
+        """
         self.bounds = block_bounds(effects, n_out, rate)
         self.numbers = [base]
         if not effects:
@@ -162,7 +170,10 @@ class Schedule:
         self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
-        """Yield (start, stop, parameters) for the outputs first <= k < last, divided where the parameters change."""
+        """Yield the blocks of constant parameters within the outputs first <= k < last.
+
+        Each item is (start, stop, parameters): the outputs start <= k < stop have these model parameters.
+        """
         k = int(np.searchsorted(self.bounds, first, side="right")) - 1
         while first < last:
             stop = min(int(self.bounds[k + 1]), last)
@@ -187,13 +198,16 @@ class Readings:
     holds: tuple[Hold, ...] = ()
 
     def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute an instrument's parameter, given by its dotted name, at times t [s] from its value in the rig."""
+        """Compute a parameter of an instrument at times t [s], with the changes within the run.
+
+        `parameter`: its dotted name, such as "sensors.p_A.noise"; `rig_value`: its value without changes.
+        """
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Repeat one reading over each span in which the channel is stuck.
+        """Return the readings of a channel in which each span of a stuck sensor repeats its first reading.
 
-        `values` (n,): readings of the channel at times `t` (n,) [s].
+        `values` (n,): readings of the channel at times `t` (n,) [s] as if it were never stuck.
         """
         for hold in self.holds:
             samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
@@ -207,11 +221,15 @@ class Shape(Protocol):
     """The course of a drift: the change of a parameter since the start of the run, relative or in its SI unit."""
 
     def value_at(self, t: Array) -> Array:
-        """Compute the change at times t [s], for an array t of any shape; it is 0 at t = 0."""
+        """Compute the drift at times t [s], for an array t of any shape.
+
+        The drift is the change of the parameter since the start of the run, where it is 0. It is a fraction of the
+        parameter's value, or in the parameter's SI unit.
+        """
         ...
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the change jumps or changes its slope."""
+        """Return the times [s] at which the drift jumps or changes its slope."""
         ...
 
 
@@ -233,7 +251,7 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the walk's value, that is the drift's change, at times t [s]."""
+        """Compute the random walk, which is the change of a drifting parameter, at times t [s]."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)
         if self.weights:  # next term by sin(a + phase) = 2 cos(phase) sin(a) - sin(a - phase)
@@ -245,7 +263,7 @@ class Wander:
         return change
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return an empty tuple: the path is smooth."""
+        """Return the times [s] at which the random walk jumps or changes its slope: none, because it is smooth."""
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
@@ -255,11 +273,11 @@ class Wander:
         return self.times(size / path_range) if path_range > 0 else self
 
     def times(self, factor: float) -> Wander:
-        """Multiply the walk by `factor`."""
+        """Return this random walk multiplied by `factor`."""
         return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
 
     def plus(self, other: Wander) -> Wander:
-        """Add another walk over the same duration."""
+        """Return the sum of this random walk and another one over the same duration."""
         pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
@@ -321,16 +339,17 @@ class ParameterDrift:
             raise InputError(f"a relative drift must stay above -100 %, got {100 * lowest:.4g} % ({self.parameter})")
 
     def effects(self) -> tuple[Effect, ...]:
-        """Build the effects of the drift, each of which describes how one parameter changes over time.
+        """Build the changes over time by which the drift acts on the compiled model or on an instrument.
 
-        A drift of an instrument has one effect, on the instrument's parameter. A drift of a machine's parameter has
-        an effect on each parameter of the model that is derived from it, proportional to a power of it. An absolute
-        drift is added to the values instead.
+        Each effect changes one parameter. For a drift of an instrument there is one effect, on the instrument's
+        parameter. For a drift of a machine's parameter there is one for each parameter of the model that is derived
+        from it and is proportional to a power of it. An absolute drift is added to these parameters, a relative one
+        is a factor on them.
         """
         breakpoints = self.shape.breakpoints()
 
         def build_effect(field: str, power: float) -> Effect:
-            """Build the effect on the model parameter `field`, proportional to a power of the drifting parameter."""
+            """Build the change of the model parameter `field` by the drift, raised to `power` if it is relative."""
             if self.absolute:
                 max_change = _ABSOLUTE_MAX_CHANGES.get(field, math.inf)
                 return Effect(field, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)

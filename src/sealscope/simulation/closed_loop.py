@@ -98,13 +98,13 @@ class Feedback:
         )
 
     def volts(self, outputs: int) -> Array:
-        """Return the controller's voltage [V] at the first `outputs` solver outputs."""
+        """Return the controller's voltage [V] at the first `outputs` outputs of the solver, (outputs,)."""
         return np.asarray(self.loop.volts[np.arange(outputs) // self._spacing])
 
     def compensated_flow(self, outputs: int) -> Array | None:
-        """Return the leakage flow [m^3/s] that the controller compensates, at the first `outputs` solver outputs.
+        """Return the compensated leakage flow [m^3/s] at the first `outputs` solver outputs, (outputs,).
 
-        Returns None if the controller reports none.
+        Returns None if the controller does not report this flow.
         """
         if not self.loop.counters[REPORTED]:
             return None

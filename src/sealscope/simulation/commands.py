@@ -113,7 +113,7 @@ class Alternating:
                 raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
 
     def volts(self, t: Array) -> Array:
-        """Compute the voltage u [V] of the sine whose turn it is at times t [s]; 0 before t = 0."""
+        """Compute the voltage u [V] at times t [s], that of the sine which is active at each time; 0 before t = 0."""
         lengths = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of the parts [s]
         ends = np.cumsum(lengths)
         time_in_cycle = np.mod(t, ends[-1])
@@ -182,7 +182,10 @@ _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the polyline through points (t [s], y); `words`: text of the signal, such as "step 5 at 1 s"."""
+    """Make the signal that is linear between the points (t [s], y).
+
+    `words`: text of the signal, such as "step 5 at 1 s".
+    """
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, words)
 
@@ -301,7 +304,8 @@ _CHECK_CHUNK = 1_000_000
 def check_command(command: Command, t: Array, limit: float) -> None:
     """Check that a command is within +-`limit` [V] at the times `t` [s].
 
-    Raises InputError, with the first voltage and time at which it is not; NaN is not within the limit.
+    Raises InputError otherwise, with the first voltage beyond the limit and its time. A voltage that is NaN is
+    beyond the limit.
     """
     for start in range(0, t.size, _CHECK_CHUNK):
         part = t[start : start + _CHECK_CHUNK]
@@ -345,7 +349,7 @@ _FORMS: tuple[tuple[str, Callable[[list[str | None]], Command]], ...] = (
 
 
 def parse_seconds(text: str | None) -> float:
-    """Parse a time in seconds from a text such as "90", "90 s" or "1.5[min]" (`TIME`); return 0 for None."""
+    """Parse a time in seconds from a text such as "90", "90 s" or "1.5[min]"; return 0 for None."""
     return 0.0 if text is None else parse_quantity(text.lower(), "s", name="a time")
 
 

@@ -237,27 +237,33 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command, changed by any faults of the duty; raises InputError for a position target."""
+        """The voltage command of the run, with the changes of amplitude and frequency by faults of the duty.
+
+        Raises InputError if the experiment has a position target instead.
+        """
         if isinstance(self.command, Position):
             raise InputError(f"what a controller sends is known after its run only, got {self.command}")
         return self._with_duty_changes(self.command)
 
     @property
     def target(self) -> Position | None:
-        """The position target, changed by any faults of the duty; None for a voltage command."""
+        """The position target of the run, with the changes of amplitude and frequency by faults of the duty.
+
+        None if the experiment has a voltage command instead.
+        """
         if not isinstance(self.command, Position):
             return None
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Change a command's amplitude and frequency by the faults of the duty."""
+        """Return a command with the changes of amplitude and frequency that faults of the duty cause."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
 
     @property
     def active_controller(self) -> Controller | None:
-        """The controller that follows the position target, the stated one or else a PI controller for the rig.
+        """The controller that follows the position target: the stated one, or else a PI controller for the rig.
 
         None if the experiment has a voltage command.
         """
@@ -268,19 +274,23 @@ class Experiment:
         return self.controller or PositionPI.from_rig(self.rig)
 
     def effects(self) -> tuple[Effect, ...]:
-        """Collect the effects of drifts and faults on the machine within the run, without its instruments."""
+        """Collect the changes of the machine's parameters over time by drifts and faults.
+
+        Those of the instruments are in `readings`.
+        """
         return tuple(effect for effect in self._all_effects() if not effect.changes_instrument)
 
     def _all_effects(self) -> tuple[Effect, ...]:
-        """Collect the effects of all drifts and faults on machine and instruments within the run."""
+        """Collect the changes over time of all parameters of machine and instruments, by drifts and faults."""
         drift_effects = [effect for drift in self.drifts for effect in drift.effects()]
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Divide the openings of laminar leaks by the oil's relative viscosity over time: warmer oil leaks more.
+        """Return leaks that open further as the oil gets thinner: warmer oil leaks more through a laminar gap.
 
-        The leaks' coefficients hold at the viscosity of the rig's oil temperature. Without a fault of the oil's
-        temperature the leaks are returned unchanged.
+        The openings of laminar leaks are divided by the oil's relative viscosity over time. The leaks' coefficients
+        hold at the viscosity of the rig's oil temperature. Without a fault of the oil's temperature the leaks are
+        returned unchanged.
         """
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
@@ -296,16 +306,16 @@ class Experiment:
         return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
 
     def readings(self) -> Readings:
-        """Collect the effects of drifts and faults on the instruments within the run.
+        """Collect all changes of the instruments within the run by drifts and faults.
 
-        They include the time spans in which a sensor is stuck.
+        These are the changes of sensors' parameters, and the time spans in which a sensor is stuck.
         """
         effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
         return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
 
     @property
     def error_allowed(self) -> float:
-        """Largest rms error [Pa] of a pressure by which the solver's step is chosen, stated or by default."""
+        """Largest rms error [Pa] of a pressure that the solver's step may cause, stated or by default."""
         return PRESSURE_TOLERANCE if self.error is None else self.error
 
     @property

@@ -205,7 +205,10 @@ class Fault:
         return (Hold(self.at, self.onset(), stop),)
 
     def change_command(self, command: Command) -> Command:
-        """Change a command's amplitude and frequency by a fault of the duty; any other fault returns it unchanged."""
+        """Return the command with the changes of amplitude and frequency over time by this fault.
+
+        Only a fault of the duty changes the command; for any other fault it is returned unchanged.
+        """
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
@@ -260,9 +263,10 @@ class ChangedDuty:
     change: Fault
 
     def original_time(self, t: Array) -> Array:
-        """Compute the times [s] at which the original command is evaluated, so that its frequency appears changed.
+        """Compute the times [s] at which to evaluate the original command for a changed frequency.
 
-        They are t + (factor - 1) times the integral of the fault's opening up to t, with the factor on the frequency.
+        They are t + (factor - 1) times the integral of the fault's opening up to t. The factor is the one on the
+        frequency, and the opening is the extent of the fault over time, 0 to 1.
         """
         start, stop = self.change.opening.rise or (math.inf, math.inf)
         opening_integral = np.maximum(t - start, 0.0)
@@ -281,9 +285,10 @@ class ChangedDuty:
 
 
 def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of moving a shut-off valve: changes of the flow coefficients of the throttle in its line.
+    """Build the effects of opening or closing a shut-off valve within a run.
 
-    Raises InputError for a rig without throttles in its lines.
+    The effects change the two flow coefficients of the throttle in the valve's line. Raises InputError for a rig
+    without throttles in its lines.
     """
     from sealscope.physics.restrictors import orifice_coefficient, series_coefficient
     from sealscope.physics.rig import throttle_coefficients
@@ -325,7 +330,10 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     assert viscosity is not None
 
     def density_power(power: float) -> Callable[[Array], Array]:
-        """Build the function of times [s] that computes the oil's density over the rig's, raised to `power`."""
+        """Build a function of times [s] that computes a power of the oil's relative density.
+
+        The density is relative to that at the rig's oil temperature, and raised to `power`.
+        """
         alpha = rig.fluid.alpha
         return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
 

@@ -27,7 +27,7 @@ class Outputs(Protocol):
     """The simulated outputs of a run, available by name, such as a `Trajectory`."""
 
     def __getitem__(self, name: str) -> Array:
-        """Return the values of the output `name` over time."""
+        """Return the simulated values of the output `name` over time."""
         ...
 
 
@@ -48,11 +48,11 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 
 
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
-    """Filter a signal against aliasing (`anti_alias_taps`), and take `n` samples of it, one in `factor` values.
+    """Filter a signal against aliasing (`anti_alias_taps`), and return `n` samples of it, one in `factor` values.
 
-    `values` must continue for FILTER_REACH samples after the last one; before the beginning they are taken as
-    constant. `delay` >= 0, in intervals of `values` and not necessarily whole: each sample is the signal that much
-    earlier.
+    `values` must continue for FILTER_REACH samples after the last returned one. Before their beginning the signal
+    is taken as constant. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not
+    necessarily whole.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -84,11 +84,11 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Sample a signal with a clock that jitters.
+    """Compute the samples (n,) of a signal that a clock with jitter takes.
 
-    `sample(values)` takes the samples (n,) of a signal with a clock that does not jitter; `lateness` (n,): delay of
-    each sample, -1 .. 1 intervals of `values`, or None for no jitter. The signal is interpolated by a parabola
-    through three of its values.
+    `sample(values)` takes the samples (n,) with a clock without jitter. `lateness` (n,): delay of each sample in
+    intervals of `values`, -1 .. 1, or None for no jitter. The signal is interpolated by a parabola through three of
+    its values.
     """
     center = sample(values)
     if lateness is None:
@@ -146,9 +146,9 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the harmonics 2 to `HUM_HARMONICS` of a mains hum of amplitude 1 at times t [s], with random phases.
+    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum of amplitude 1 at times t [s].
 
-    Each harmonic is `sensor.hum_harmonics` times as large as the one before.
+    Each harmonic has a random phase and `sensor.hum_harmonics` times the amplitude of the one before.
     """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)
@@ -195,11 +195,14 @@ def record(
         jitter_steps = np.clip(rig.daq.jitter * rate * factor * random["clock"].standard_normal(n), -1.0, 1.0)
 
     def read_instantly(values: Array) -> Array:
-        """Read a signal at the samples without a filter, as an encoder does."""
+        """Read a signal at the sampling times without a filter, as an encoder does."""
         return sample_with_jitter(lambda signal: signal[at_samples], values, jitter_steps)
 
     def read_filtered(values: Array, delay: float = 0.0) -> Array:
-        """Read a signal at the samples behind the anti-alias filter, `delay` intervals of the signal late."""
+        """Read a signal at the sampling times behind the anti-alias filter.
+
+        `delay`: lag of the readings in intervals of the signal.
+        """
         return sample_with_jitter(lambda signal: decimate(signal, factor, n, delay), values, jitter_steps)
 
     angle_resolution = 2.0 * np.pi / sensors.theta.counts

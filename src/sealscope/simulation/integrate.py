@@ -83,28 +83,39 @@ class RunInputs:
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
-        """Take the command from `experiment`, and the leaks from `leaks`; their coefficients must be known."""
+        """Prepare the voltage command of an experiment and its leaks as inputs of the solver.
+
+        `leaks` replace those of the experiment; their leakage coefficients must be known.
+        """
         self._leaks = experiment.scale_with_viscosity(leaks)
         # under a target the voltage is that of the controller (`Feedback`), and this command is not used
         self._command = experiment.voltage_command if experiment.target is None else Sine(0.0, 0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
     def at_nodes(self, start: Array, offsets: Array) -> tuple[Array, Array, Array]:
-        """Compute command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)] at times start[:, None] + offsets [s].
+        """Compute the voltage command and the leakage coefficients at all times that some steps of the solver need.
 
-        `start` (steps,): beginnings of the solver's steps; `offsets` (nodes,): times within a step. Each result is
-        (steps, nodes). Raises InputError for a command beyond its limit.
+        Returns the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), at the times start[:,
+        None] + offsets [s]. `start` (steps,): beginnings of the steps; `offsets` (nodes,): times within a step.
+        Raises InputError for a command beyond its limit.
         """
         t = start[:, None] + offsets
         return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
 
     def max_leakage(self, t: Array) -> tuple[float, float]:
-        """Compute the largest total G [m^3/(s Pa)] and the largest total C [m^3/(s Pa^0.5)] at the times t [s]."""
+        """Compute the largest leakage coefficients, summed over all leaks, at the times t [s].
+
+        Returns the largest G [m^3/(s Pa)] and the largest C [m^3/(s Pa^0.5)].
+        """
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
 
     def _leakage(self, t: Array) -> tuple[Array, Array]:
-        """Compute G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], summed over all leaks, at times t [s]."""
+        """Compute the leakage coefficients at times t [s], summed over all leaks.
+
+        Returns G [m^3/(s Pa)] of the laminar leaks and C [m^3/(s Pa^0.5)] of the orifices, each with the shape of
+        t.
+        """
         G, C = np.zeros(t.shape), np.zeros(t.shape)
         for leak in self._leaks:
             if not leak.coefficient or t.max(initial=-math.inf) < leak.opening.onset():
@@ -128,8 +139,8 @@ class RunInputs:
 def oversampling(experiment: Experiment) -> int:
     """Compute the number of solver outputs per recorded sample that an experiment needs.
 
-    The anti-alias filter needs a minimum (`oversampling_of`), and every sample of a controller must fall on an
-    output.
+    An output is a time at which the solver writes its results. The anti-alias filter needs a minimum
+    (`oversampling_of`), and every sample of a controller must fall on an output.
     """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
@@ -190,12 +201,15 @@ def integrate_run(
 
 
 def _without_mean_leaks(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Give each leak whose mean flow is stated the coefficient 0, where the search for its coefficient starts."""
+    """Return the leaks with the coefficient 0 for each one whose mean flow is stated instead.
+
+    The search for its coefficient starts at 0.
+    """
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the leakage coefficients that give the stated mean flows; return the leaks with their coefficients."""
+    """Find the leakage coefficients that give the stated mean flows; return the leaks of the experiment with them."""
     if not any(leak.mean for leak in experiment.leaks):
         return _without_mean_leaks(experiment.leaks)
     return run_with_sized_leaks(experiment)[0]
@@ -208,11 +222,12 @@ def run_with_sized_leaks(
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    The coefficients are found by repeated simulation (`size_leaks`). `progress(task, fraction)` is called during this
-    search, `report_time(t)` with the time reached [s] if there is nothing to search for.
+    The coefficients are found by repeated simulation (`size_leaks`). During this search `progress(task, fraction)`
+    is called. If no mean flow is stated, there is no search, and `report_time(t)` is called with the time reached
+    [s].
 
-    Raises InputError for a leak larger than the pump's mean flow |Q_1| or never open within the run; SimulationFailed
-    if the search does not converge.
+    Raises InputError for a leak larger than the pump's mean flow |Q_1| or never open within the run;
+    SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     initial_leaks = _without_mean_leaks(leaks)
@@ -369,7 +384,7 @@ class _Integration:
     def refuse_unresolved(self, n_steps: int) -> None:
         """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig.
 
-        Leaks are not considered. Does nothing if the run may be unresolved.
+        The limit holds for the rig without its leaks. Nothing is checked if the experiment allows unresolved runs.
         """
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
@@ -378,9 +393,9 @@ class _Integration:
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
         """Integrate the state `y` (14,) in place from output `start` to output `stop`; write the outputs to `rows`.
 
-        Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next. Raises
-        SimulationFailed if a state is not finite or, unless the run may be unresolved, if the step is too long for a
-        leak or an end stop or if a pressure is below vacuum.
+        Output k is written to rows[k - origin]. `n_steps`: number of solver steps from one output to the next.
+        Raises SimulationFailed if a state is not finite. Unless the experiment allows unresolved runs, it is also
+        raised if the step is too long for a leak or an end stop, or if a pressure is below vacuum.
         """
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
@@ -421,8 +436,8 @@ class _Integration:
         """Check outputs that were integrated with steps of h [s].
 
         `rows` (n, 21): the outputs, of which the first has the index `first` in the run. Raises SimulationFailed if
-        one is not finite or, unless the run may be unresolved, if a pressure is below vacuum or the step is too long
-        for an end stop that was hit.
+        one is not finite. Unless the experiment allows unresolved runs, it is also raised if a pressure is below
+        vacuum or if the step is too long for an end stop that was hit.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
@@ -496,7 +511,11 @@ class StepErrorCheck:
     """
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
-        """Begin a comparison of outputs at `rate` [Hz]; `tolerance` [Pa rms]: allowed difference of a pressure."""
+        """Prepare the comparison of a run with the same run at half the solver's step.
+
+        `rig`: the simulated rig; `rate` [Hz]: rate of the solver's outputs; `tolerance` [Pa rms]: allowed
+        difference of a pressure.
+        """
         self._tolerance = tolerance
         self._every = max(1, round(rate / rig.daq.sample_rate))
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
@@ -505,11 +524,13 @@ class StepErrorCheck:
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:
-        """Compare the two runs in one more window; return the largest ratio of an error to its tolerance.
+        """Compare a run with the one at half the step in one more window of time.
+
+        Returns the largest ratio of an error to its tolerance.
 
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The pressures are compared
-        within the window. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared over all windows
-        so far, at the recording's rate and with its noise added.
+        within the window. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared over all
+        windows so far, at the recording's rate and with its noise added.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -525,7 +546,10 @@ class StepErrorCheck:
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)
 
     def describe_worst(self) -> str:
-        """Describe in words the error that is largest relative to its tolerance, and this tolerance."""
+        """Describe in words the difference between the two runs that is largest relative to its tolerance.
+
+        It is the difference of a pressure or of the RMS of a wavelet detail, and is stated with its tolerance.
+        """
         if self.pressure_error / self._tolerance >= self.detail_error / DETAIL_TOLERANCE:
             return f"a pressure by {self.pressure_error:.4g} Pa rms, which must be <= {self._tolerance:.4g} Pa"
         error, tolerance = 100 * self.detail_error, 100 * DETAIL_TOLERANCE

@@ -33,7 +33,7 @@ _LEAK = rf"(?:{_MEAN}|(?P<letter>[GC])\s*=\s*(?P<coefficient>{UNSIGNED}))(?:\s+(
 
 
 def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) -> Polyline:
-    """Make the opening of a leak or fault that begins at `start` and ends at `stop` [s].
+    """Make the opening of a leak or fault, 0 (shut) to 1 (full), that begins at `start` and ends at `stop` [s].
 
     It rises from 0 to 1 within `ramp` [s] from `start` on, and falls back to 0 within `ramp` from `stop` on. Raises
     InputError if the times do not fit together.
@@ -51,7 +51,7 @@ def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) 
 
 
 def growing_opening(start: float, stop: float) -> Polyline:
-    """Make the opening of a leak or fault that grows linearly from 0 at `start` to 1 at `stop` [s].
+    """Make the opening of a leak or fault that grows linearly from 0 (shut) at `start` to 1 (full) at `stop` [s].
 
     It stays at 1 afterwards. Raises InputError unless `stop` is after `start`.
     """
@@ -73,7 +73,7 @@ class Thinned:
     rise: ClassVar[None] = None
 
     def value_at(self, t: Array) -> Array:
-        """Compute the opening at times t [s], divided by the oil's relative viscosity."""
+        """Compute the opening of the leak at times t [s], divided by the oil's relative viscosity."""
         return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:
@@ -122,9 +122,9 @@ class Leak:
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening of a leak or fault from the times in the named groups of a match, such as of `WHEN`.
+    """Build the opening of a leak or fault from the times in its text; without times it is fully open from t = 0 on.
 
-    Without times it is fully open from t = 0 on.
+    `groups`: the named groups of a regular expression's match, such as of `WHEN`.
     """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))

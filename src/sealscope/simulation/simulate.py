@@ -123,7 +123,10 @@ class Run:
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Describe the run in lines of text: solver and step, leaks, other faults, and the mean flows."""
+        """Describe the run in lines of text: solver and step, leaks with their mean flow, and other faults.
+
+        Under a controller that reports it, the last line states the leakage flow that the controller compensates.
+        """
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
         lines += [f"leak: {leak}" for leak in self.truth.leaks] + [f"fault: {fault}" for fault in self.truth.faults]
@@ -324,7 +327,8 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
     """Describe a drift over the times t [s] by its range (maximum minus minimum) and its change from start to end.
 
-    Relative drifts are in per cent, absolute ones in the parameter's SI unit.
+    Relative drifts are in per cent, absolute ones in the parameter's SI unit. Returns plain values for JSON by
+    name.
     """
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])

@@ -36,10 +36,10 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Compute the mean flow [m^3/s] of a leak while it is open, referred to full opening.
+    """Compute the mean flow [m^3/s] of a leak while it is open, as if it were always fully open.
 
-    It is the sum of `flow` (n,), |Q_L| [m^3/s] at times `t` (n,) [s], over the sum of the leak's opening; 0 if the
-    leak never opens.
+    It is the sum of `flow` (n,), |Q_L| [m^3/s] at times `t` (n,) [s], over the sum of the leak's opening, 0 to 1.
+    It is 0 if the leak never opens.
     """
     opening = leak.opening.value_at(t)
     opening_sum = float(opening.sum())
@@ -49,10 +49,12 @@ def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
 def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[float, float]) -> float:
     """Compute the next leakage coefficient to try in the search for a stated mean flow.
 
-    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs. A run
-    of coefficient 0 states the flow that a coefficient of 1 would have under its pressures. The next coefficient is
-    on the line through both runs on logarithmic scales, whose slope is limited to 0.1 .. 1, the range that leaks
-    have; it is taken as 1 if the two coefficients are too close.
+    `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs. For
+    a run with the coefficient 0, the flow is the one that a coefficient of 1 would have under the pressures of this
+    run.
+
+    The next coefficient is on the straight line through both runs on logarithmic scales. The slope of this line is
+    limited to 0.1 .. 1, the range that leaks have, and taken as 1 if the two coefficients are too close.
     """
     (c_0, q_0), (c_1, q_1) = previous, latest
     if c_1 == 0.0:
@@ -71,11 +73,13 @@ def size_leaks(
 ) -> tuple[Array, T]:
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
-    `coefficients`: values to start from; they stay for leaks without a stated mean. `measure(coefficients)` simulates
-    the rig and returns each leak's mean flow per unit coefficient (n,), and any other result of the run. Returns the
-    coefficients, and this other result for them. A small leak's flow is proportional to its coefficient, because
-    friction sets the pressure difference; a large leak's flow grows less, so that its coefficient is found step by
-    step (`next_coefficient`). Raises SimulationFailed if the search does not converge.
+    `coefficients`: values to start from; they stay for leaks without a stated mean. `measure(coefficients)`
+    simulates the rig and returns each leak's mean flow per unit coefficient (n,), and any other result of the run.
+    Returns the coefficients, and this other result for them.
+
+    A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
+    leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed
+    if the search does not converge.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

@@ -74,9 +74,10 @@ class Force:
         return self.signal.volts(t)
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the load's breakpoints over position and over velocity as two arrays for `piecewise_linear_force`.
+        """Build the tables of the load over position and over velocity that the compiled model takes.
 
-        Returns None if the load depends on time alone.
+        Returns two arrays of breakpoints for `piecewise_linear_force`, first over position, then over velocity; a
+        table without a load is zero. Returns None if the load depends on time alone.
         """
         if not (self.over_x or self.over_v):
             return None
@@ -115,9 +116,11 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
 
 
 def breakpoints_through(s: Array, F: Array) -> Breakpoints:
-    """Convert points (s, F) to the breakpoints that `piecewise_linear_force` takes.
+    """Convert points (s, F) of a load to the equivalent breakpoints of `piecewise_linear_force`.
 
-    `s` (n,), rising: positions [m] or speeds [m/s]; `F` (n,) [N]. Beyond the outer points the force is constant.
+    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. Beyond the outer points the force is
+    constant. The first returned pair is (F_0, 0): the force and the slope before the first point. The others are
+    the pairs (s_k, change of the slope at s_k).
     """
     # the coefficient c_k of a breakpoint is the change of slope there
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
@@ -227,10 +230,10 @@ def _unit_pattern(units: Mapping[str, float]) -> str:
 
 
 def _term_pattern(letter: str, slopes: Mapping[str, float], places: Mapping[str, float]) -> re.Pattern[str]:
-    """Compile the pattern of one term of a load, such as ``- 5 kN/mm over x from 50 mm``.
+    """Compile the regular expression of one term of a load, such as ``- 5 kN/mm over x from 50 mm``.
 
-    `letter`: x or v, over which the term is; `slopes`, `places`: allowed units of slope and start. The groups are
-    sign, slope, its unit, start, and its unit.
+    `letter`: x or v, the argument of the load; `slopes`, `places`: allowed units of slope and start. The groups of
+    a match are sign, slope, its unit, start, and its unit.
     """
     start = rf"(?:\s+from\s+([-+]?{UNSIGNED})\s*\[?({_unit_pattern(places)})\b\]?)?"
     return re.compile(rf"(?:^|([-+]))\s*({UNSIGNED})\s*\[?({_unit_pattern(slopes)})\b\]?\s+over\s+{letter}\b{start}\s*")
@@ -267,5 +270,5 @@ def parse_force(text: str) -> Force:
 
 
 def _match_unit(unit: str, units: Mapping[str, float]) -> str:
-    """Find the key of `units` that equals the text `unit` apart from blanks."""
+    """Return the key of `units` that equals the text `unit` apart from blanks."""
     return next(name for name in units if name.replace(" ", "") == unit.replace(" ", ""))

@@ -74,7 +74,10 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Write a file, or the names in a folder, to the disk; `flags` are those of `os.open`."""
+    """Force the content of a file, or the names of the files in a folder, from memory to the disk.
+
+    `flags` are those of `os.open` with which it is opened.
+    """
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
@@ -85,9 +88,9 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    If `target` is given, only the temporary files of the file with this name are removed, else those of any file, in
-    subfolders, too. A file is removed if its process ran on this computer and has ended, and otherwise after a day.
-    Links to folders are not followed.
+    If `target` is given, only the temporary files of the file with this name are removed. Otherwise those of all
+    files are removed, in subfolders, too. A file is removed if its process ran on this computer and has ended, and
+    otherwise after a day. Links to folders are not followed.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
         match = _TEMPORARY.fullmatch(path.name)
@@ -100,7 +103,10 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
 
 
 def _is_alive(process: int) -> bool:
-    """Test whether a process of this computer is running; True if unknown."""
+    """Return True if a process of this computer is running, or if this cannot be found out.
+
+    `process`: number of the process.
+    """
     if os.name == "nt":  # signal 0 would end the process
         return True
     try:

@@ -23,9 +23,9 @@ def make_folder(folder: Path) -> None:
 
 
 def make_inner_folder(folder: Path, *names: str) -> Path:
-    """Create the nested folders `names` within `folder`, which may come from others; return the innermost one.
+    """Create the nested folders `names` within `folder`, one in the other, and return the innermost one.
 
-    Raises InputError if one cannot be created, or is a link.
+    `folder` may come from others. Raises InputError if a folder cannot be created, or is a link.
     """
     make_folder(folder)
     for name in names:
@@ -37,9 +37,10 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield those of `paths` that are files in `folder`; skip links that lead out of it, with a logged warning.
+    """Yield those of `paths` that are files in `folder`; skip links that lead out of the folder.
 
-    The folder may come from others. Links that stay within it are followed, and the folder may itself be a link.
+    A skipped link is logged as a warning. The folder may come from others. Links that stay within it are followed,
+    and the folder may itself be a link.
     """
     root = folder.resolve()
     for path in paths:
@@ -54,7 +55,7 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Split a name into texts and numbers, as a sort key that puts day_2 before day_10."""
+    """Split a name into its texts and numbers, which sorts "day_2" before "day_10"."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 

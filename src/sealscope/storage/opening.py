@@ -23,7 +23,7 @@ _KINDS = (
 
 
 def is_file_path(text: str | os.PathLike[str]) -> bool:
-    """Test whether a text is the path of an existing file; False also if it cannot be a path at all."""
+    """Return True if a text is the path of an existing file; False also if it cannot be a path at all."""
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for these until Python 3.14
 
 
@@ -50,10 +50,11 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
 
 
 def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"] = "rb") -> BinaryIO:
-    """Open a file in a folder of results that may come from others: mode `rb` to read, `ab+` to append or create.
+    """Open a file in a folder of results that may come from others, in binary mode.
 
-    `what` names the file in error messages. Raises InputError for a link, for other files that are not regular and,
-    when writing, for a file with several hard links. Raises OSError if it cannot be opened.
+    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages. Raises InputError for
+    a link, for other files that are not regular and, when writing, for a file with several hard links. Raises
+    OSError if it cannot be opened.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")
@@ -61,9 +62,10 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a file with additional flags of `os.open`; raise InputError unless it is a regular file.
+    """Open a file in binary mode with additional flags of `os.open`; raise InputError unless it is a regular file.
 
-    A file to write must not have several hard links.
+    `mode`: `rb` to read, `ab+` to append or create; `what` names the file in error messages. A file to write must
+    not have several hard links.
     """
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:
@@ -84,7 +86,7 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
 
 @contextmanager
 def raising_unreadable(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
-    """Convert any error that a damaged file causes in the block to an UnreadableFile of one line.
+    """Convert any error that a damaged file causes in the block to an UnreadableFile with a message of one line.
 
     `what`, such as "a rig", and the path `place` appear in the message. MissingExtra and UnreadableFile are not
     changed. Unexpected errors are also logged.

@@ -20,7 +20,7 @@ _MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to a mapping of its shape and its bytes (little endian, base64).
+    """Convert an array of numbers to a mapping for JSON, with its shape and its bytes (little endian, base64).
 
     The columns of a structured array become the last axis, without names.
     """
@@ -38,7 +38,7 @@ def _as_plain_array(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def plain_fields(values: Any) -> dict[str, Any]:
-    """Convert a dataclass whose fields are plain values to a dict.
+    """Convert a dataclass whose fields are plain values to a dict from field to value.
 
     Lists are copied, as the original ones may grow.
     """
@@ -46,7 +46,10 @@ def plain_fields(values: Any) -> dict[str, Any]:
 
 
 def restore(kind: type[_T], state: Any, name: str) -> _T:
-    """Convert a part of a saved state to the type `kind`; raise InputError, with its `name`, if it does not fit."""
+    """Convert one entry of a saved state to the type `kind`.
+
+    Raises InputError, which names the entry by `name`, if it does not fit the type.
+    """
     try:
         return convert_type(kind, state)
     except ValueError as error:
@@ -54,9 +57,9 @@ def restore(kind: type[_T], state: Any, name: str) -> _T:
 
 
 def restore_array(value: Any, name: str) -> NDArray[np.float64]:
-    """Restore an array from the mapping that `plain_array` made.
+    """Restore an array of doubles from the mapping that `plain_array` made.
 
-    Raises InputError, with its `name`, for other values.
+    Raises InputError, which names the entry of the saved state by `name`, for any other value.
     """
     try:
         shape = tuple(int(size) for size in value["shape"])
@@ -69,7 +72,10 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 
 
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
-    """Return the entry `name` of a saved state; raise InputError if it is missing or not of the type `kind`."""
+    """Return the entry `name` of a saved state, which is a mapping.
+
+    Raises InputError if the entry is missing or not of the type `kind`.
+    """
     if not isinstance(state, Mapping) or name not in state:
         raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
     value = state[name]
@@ -90,7 +96,7 @@ def require_count(state: Any, name: str) -> int:
 
 
 def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the entry `name` of a saved state as an array of this shape; raise InputError if it does not fit."""
+    """Return the entry `name` of a saved state as an array of this shape; raise InputError if it is not one."""
     try:
         values = np.asarray(require_part(state, name, object))
         if values.size and values.dtype.kind not in "fi":
@@ -112,7 +118,7 @@ def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Convert one attribute to a plain value (`save_attributes`)."""
+    """Convert one attribute of an object to a value that JSON can store, as `save_attributes` describes."""
     if callable(getattr(value, "state", None)):
         return value.state()
     if is_dataclass(value):
@@ -127,12 +133,12 @@ def _to_plain_value(value: Any) -> Any:
 def restore_attributes(
     owner: Any, names: Iterable[str], state: Any, kinds: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
-    """Set the attributes of `owner` called `names` to the values that `save_attributes` saved.
+    """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
-    None leaves an attribute unchanged that is a number or None. `kinds` gives the types of attributes that may be
-    None or may have another type than the present value. Raises InputError if an attribute is missing in `state`, or
-    differs from the present value in type or in the shape of an array; axes that are empty at present may have any
-    length.
+    A saved None leaves an attribute unchanged if its present value is a number or None. `kinds`: types of
+    attributes that may be None or may have another type than the present value. An object with a method
+    `load_state` restores itself. Raises InputError if an attribute is missing in `state`, or differs from the
+    present value in type or in the shape of an array; axes that are empty at present may have any length.
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)

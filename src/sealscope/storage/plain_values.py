@@ -46,7 +46,10 @@ def _parse_whole(text: str) -> int:
 
 @cache
 def _type_adapter(kind: Any) -> Any:
-    """Make pydantic's validator for a type; it is cached, as this takes long."""
+    """Make the pydantic validator of a type.
+
+    It is cached, because making one takes long.
+    """
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)
@@ -55,8 +58,8 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    The error is one line and names no file. `entry_name` converts an entry of `value` to its name in the error.
-    `context` is passed to the validators of `kind`.
+    The error is one line and names no file. `entry_name` converts the name of an entry of `value` to its name in
+    the error. `context` is passed to the validators of `kind`.
     """
     from pydantic import ValidationError
 
@@ -76,8 +79,8 @@ _PLAIN_RULES = {
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
     """Format the first error of pydantic as one line, "ENTRY must be ..., got ...".
 
-    Unknown entries come before other errors. `entry_name` converts an entry ("" for the whole value) to its name in
-    the text. `unit` is appended to the rule.
+    Unknown entries come before other errors. `entry_name` converts the name of an entry ("" for the whole value) to
+    its name in the text. `unit` is appended to the rule.
     """
     errors = error.errors(include_url=False)
     first = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])

@@ -25,10 +25,10 @@ class StoredRow(Protocol):
 
     @property
     def id(self) -> str:
-        """Name of the job; a later row of the same job replaces an earlier one."""
+        """Name of the job whose result the row is; a later row of the same job replaces an earlier one."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain values for JSON."""
+        """Return the result of the job as plain values for JSON."""
 
 
 Row = TypeVar("Row", bound=StoredRow)
@@ -37,10 +37,10 @@ Row = TypeVar("Row", bound=StoredRow)
 def read_rows(
     folder: Path, row_of: Callable[[Any], Row | None], what: str, parse: Callable[[bytes], Any] = parse_json
 ) -> dict[str, Row]:
-    """Read the rows that were stored in a folder, and return the last row of each job by its id.
+    """Read the results of jobs that `store_rows` stored in a folder; return the last row of each job by its id.
 
-    `row_of` makes a row from the JSON value of a line, or None for a line to ignore, and `parse` parses a line.
-    `what` names the folder in errors. A last line that was cut off is ignored, and a missing file has no rows. Raises
+    `row_of` makes a row from the JSON value of a line, or None for a line to ignore; `parse` parses a line. `what`
+    names the folder in errors. A last line that was cut off is ignored, and a missing file has no rows. Raises
     UnreadableFile, with the place, for a line that is not a row.
     """
     path = folder / ROWS
@@ -69,8 +69,9 @@ def read_rows(
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
     """Append each row to the file in a folder as soon as its job ends, then yield the row.
 
-    `rows` is closed at the end, and `what` names the folder in errors. Raises ValueError for a row with a number that
-    is not finite, unless `allow_nan`, and InputError if the file cannot be written.
+    A last line that was cut off before is removed first. `rows` is closed at the end, and `what` names the folder
+    in errors. Raises ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if
+    the file cannot be written.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
@@ -90,10 +91,10 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
 
 @contextmanager
 def lock_rows(folder: Path, what: str) -> Iterator[None]:
-    """Lock the rows of a folder against other processes while the block runs, and remove old temporary files.
+    """Lock the stored rows of a folder against other processes while the block runs, and remove old temporary files.
 
-    The lock also ends with the process. Raises InputError if another process holds it; `what` names the folder in the
-    message.
+    The lock also ends with the process. Raises InputError if another process holds it; `what` names the folder in
+    the message.
     """
     busy = f"{what} must be run by one process at a time, got another at work ({folder})"
     with folders.lock_file(folder / LOCK, busy):

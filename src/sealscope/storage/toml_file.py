@@ -106,7 +106,10 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert the rows of a table to the type `kind`, a `PriorTable` or a mapping; `place` names it in errors."""
+    """Convert a table of a file of priors to the type `kind`, a `PriorTable` or a mapping.
+
+    `rows`: mapping from key to {value, unit, source}; `place` names the table in errors.
+    """
     is_mapping, optional = get_origin(kind) is not None, tuple[str, ...]()
     if is_mapping:
         names, value_kind = get_args(kind)
@@ -120,7 +123,10 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
 
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Return the value of a row {value, unit, source} as `kind`: an int, a tuple of numbers, or else a float."""
+    """Return the value of a prior as `kind`: an int, a tuple of numbers, or else a float.
+
+    `row`: its entry {value, unit, source} in the file; `place` names it in errors.
+    """
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
     if get_origin(kind) is tuple:
@@ -140,9 +146,9 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 
 
 def _check_keys(rows: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that the keys of a table are `names`, of which `optional` ones may be absent.
+    """Check that a table has all keys in `names`, except perhaps those in `optional`, and no other keys.
 
-    Raises InputError otherwise.
+    `rows`: keys of the table; `place` names it in errors. Raises InputError otherwise.
     """
     for name in rows:
         if name not in names:
@@ -153,7 +159,10 @@ def _check_keys(rows: Collection[str], names: Collection[str], optional: Collect
 
 
 def _estimate_memory(text: str) -> int:
-    """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed."""
+    """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed.
+
+    The estimate counts tables, keys and values without parsing the text.
+    """
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
         if line.lstrip().startswith("[["):  # an element of an array of tables

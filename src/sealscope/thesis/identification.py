@@ -62,10 +62,11 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute the logarithm of the RMS of d1..d4 and d3d4, (..., 5), of pressures with white noise.
+    """Compute the logarithm of the RMS of the wavelet details d1..d4 and d3d4 of pressures with white noise.
 
-    `squares` (..., 5): mean squares of these wavelet details without noise; `sigma` [psi]: standard deviation of the
-    noise. The formulas are in the module's docstring.
+    It is ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the
+    product d3d4. `squares` (..., 5): mean squares m of the details without noise; `sigma` [psi]: standard deviation
+    of the noise. Returns (..., 5).
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -109,7 +110,7 @@ class Hypothesis:
     factors of parameters in both halves; `leaking_factors`: further factors in the half with the leak; `x_0`,
     `x_0_leaking` [m]: start of the piston in the half without and in the half with the leak; `extra_closing_B`:
     fraction by which throttle B is closed further than A; `gain_B`: gain of the pressure sensor B; `law`: law of the
-    leak.
+    leak's flow, "laminar" or "orifice".
     """
 
     name: str

@@ -54,7 +54,7 @@ class Condition:
 
     @property
     def group(self) -> tuple[str, float]:
-        """Operating condition (command, closing [%]) of the test, which other tests may have, too."""
+        """Operating condition (command, closing [%]) of the test; several tests share one and differ in the leak."""
         return self.command, self.closed_pct
 
 
@@ -105,7 +105,7 @@ class DataSheet:
 
     @property
     def tests(self) -> int:
-        """The number of tests."""
+        """Number of tests in the data sheet."""
         return len(self.rms["p_A"]["d3"])
 
     def log_change(self, chamber: str, quantity: str) -> Array:

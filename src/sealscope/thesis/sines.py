@@ -11,9 +11,10 @@ from sealscope.recordings.recording import Array
 
 
 class SineFit(NamedTuple):
-    """Result of `sine_fit`: the sines' complex `amplitudes` (k,), and what remains of the signal beside them.
+    """Result of `sine_fit`: complex amplitudes of the sines, linear trend, and residual.
 
-    `slope` [unit/s]: linear trend of the signal; `residual` (n,): the signal minus constant, trend and sines.
+    `amplitudes` (k,): one for each sine; `slope` [unit of the signal/s]; `residual` (n,): the signal minus constant,
+    trend and sines.
     """
 
     amplitudes: NDArray[np.complex128]

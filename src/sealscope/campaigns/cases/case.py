@@ -94,9 +94,10 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
 
 
 def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
-    """Compute hashes of the families and of the controllers' files that are levels of a plan, by factor and level.
+    """Compute hashes of the machine families and controller files of a plan's factors, by factor and level (value).
 
-    The id of a case depends on the hashes of its own levels only: its stored row stays valid when others are edited.
+    The id of a case depends on the hashes of its own levels only. Its stored row thus stays valid when another family
+    or file is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
     for level in plan.factors.get(FAMILY, ()):
@@ -110,7 +111,7 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
 def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
     """List all cases of a plan, one for each record.
 
-    The records of each group are dealt in turn to the combinations of the factors' levels.
+    The records of a group are assigned to the combinations of the factors' levels one after the other, in cycles.
     """
     cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = shared_inputs(plan)
@@ -140,9 +141,10 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
 
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
-    """Order the cases to spread each kind, that is those of one use, leak, law and fault, evenly over the list.
+    """Reorder the cases of a campaign, with each kind of case spread evenly over the list.
 
-    A campaign that is ended early then has each kind in nearly its planned proportion.
+    Cases are of one kind if they have the same use, leak, law of the leak, and fault. A campaign that is ended early
+    then has each kind in nearly its planned proportion.
     """
     kinds = [(case.use, case.leak_lpm, case.law, case.fault) for case in cases]
     n_total, n_listed = Counter(kinds), Counter[Any]()

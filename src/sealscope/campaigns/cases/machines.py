@@ -40,11 +40,11 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
 
 
 def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
-    """Build the experiment of a case with a leak that is stated as a mean flow, without its coefficient.
+    """Build the experiment of a case with its leak given by the mean flow, as the leak coefficient is not yet known.
 
     The machine is drawn from the plan's profile with the seed of the case, or is the plan's rig if there is no
-    profile. The levels of the case replace its parameters, command, controller and load. `profile`: the plan's
-    profile, if it is already loaded.
+    profile. The levels (values) of the plan's factors in this case replace its parameters, command, controller and
+    load. `profile`: the plan's profile, if it is already loaded.
     """
     if plan.profile:
         family = str(case.levels.get(FAMILY, ""))

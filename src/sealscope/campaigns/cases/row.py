@@ -45,7 +45,7 @@ class Statement:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence | Statement) -> Statement:
-        """Copy the fields of this class from a detector's evidence, with None for numbers that are not finite."""
+        """Copy the stored fields from a detector's evidence; numbers that are not finite become None."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
             numbers = value if isinstance(value, tuple) else (value,)
@@ -99,9 +99,9 @@ def named_cause(evidence: Evidence | Statement) -> str:
 
 
 def ranking_score(evidence: Evidence | Statement) -> float | None:
-    """Return a detector's score if it ranks records by leakage, else None.
+    """Return a detector's score of a record if a higher score means more evidence of a leak, else None.
 
-    It does not if the verdict is `cannot tell` or the named cause is no leak.
+    It is None if the verdict is `cannot tell` or the detector names a cause other than a leak.
     """
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
@@ -120,9 +120,9 @@ class CaseRow(CaseInputs):
     """The stored result of one record: its inputs, and either scores or the error that prevented them.
 
     `flow_lpm` [L/min]: simulated mean flow of the leak while it is open, None if it is not known; `scores`: by
-    detector, its score and the onset that it estimates; `statements`: by detector, what it states, without scorers;
-    `error`: text of the error, None for none; `seconds`: processor time, which differs between runs and is not part
-    of the result.
+    detector, its score and the onset that it estimates; `statements`: by detector, its verdict and estimates, without
+    the scorers, which compute a score only; `error`: text of the error, None for none; `seconds`: processor time,
+    which differs between runs and is not part of the result.
     """
 
     flow_lpm: float | None = None
@@ -136,7 +136,7 @@ class CaseRow(CaseInputs):
         return self.scores[detector][0] if detector in self.scores else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the row to a dictionary of plain JSON values."""
+        """Convert the stored result of a record to a dictionary of plain JSON values."""
         return {**self.__dict__, "statements": {name: asdict(statement) for name, statement in self.statements.items()}}
 
     @classmethod

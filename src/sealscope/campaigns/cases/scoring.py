@@ -53,9 +53,10 @@ def judge_record(
 
 
 def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run one detector that is no scorer on a recording; return its evidence.
+    """Run one detector that states a verdict, not a scorer, on a recording; return its evidence.
 
-    It is the watch of a machine, `diagnose` or a registered detector. `examination`: the prepared recording.
+    The detector is the continuous watch of a machine, `diagnose` or a registered detector. `examination`: the
+    prepared recording.
     """
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
@@ -69,9 +70,9 @@ def score_details(
 ) -> dict[str, tuple[float | None, float | None]]:
     """Compute the score of each scorer among the detectors `names`; return (score, None) by detector.
 
-    The score is None if it cannot be computed. The second value stands for the onset, which a scorer does not
-    estimate. `split_rms`: RMS of the wavelet details of both parts of the record; `views`: channels by the name of a
-    view.
+    A scorer computes a score from wavelet details, but no verdict. The score is None if it cannot be computed; the
+    second value stands for the onset, which a scorer does not estimate. `split_rms`: RMS of the wavelet details of
+    both parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
     """
     scores: dict[str, tuple[float | None, float | None]] = {}
     for name in names:

@@ -57,7 +57,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Check that batches can simulate and score all cases of a plan; raise InputError otherwise."""
 
     def refusal(rule: str) -> InputError:
-        """Build the error for a plan that breaks the given rule of batches."""
+        """Build the error for a plan that batches cannot run; `rule`: the rule that it breaks."""
         return InputError(f"a plan in batches must have {rule}; run it without --batch ({plan.place})")
 
     for name in plan.detectors:
@@ -116,8 +116,8 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
 def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
     """Simulate and score one batch of cases, given with their experiments, and return their rows.
 
-    If the batch fails, its halves are run in turn, until only the cases that fail by themselves have a row with an
-    error.
+    If the batch fails, each half of it is run alone, and so on. In the end only the cases that fail by themselves
+    have a row with an error.
     """
     if not pairs:
         return []
@@ -141,8 +141,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Find the leak coefficients that give the planned mean flows, in short runs; return the experiments with them.
 
-    The solver's step of an experiment is shortened if it is too long for the leak. Raises an error if one of several
-    experiments fails.
+    The solver's step of an experiment is shortened if it is too long for the leak. If a short run fails, the error is
+    raised, unless there is only one experiment: this is tried once more with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]

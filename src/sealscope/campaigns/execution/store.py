@@ -108,12 +108,12 @@ def _installed_version() -> str:
 
 
 def read_rows(folder: Path) -> dict[str, CaseRow]:
-    """Read the newest row of each case in a campaign's folder, by the id of the case."""
+    """Read the newest row (stored result) of each case from a campaign's folder, by the id of the case."""
     return rows.read_rows(folder, CaseRow.from_dict, WHAT)
 
 
 def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
-    """Read the rows of a plan's cases from a campaign's folder, by the id of the case in rising order.
+    """Read the rows (stored results) of a plan's cases from a campaign's folder, by id of the case, ascending.
 
     A row that lacks the score of one of the plan's detectors is left out, unless it is the row of a failed case.
     Raises InputError if the rows belong to another plan, and UnreadableFile if the inputs in a row differ from those

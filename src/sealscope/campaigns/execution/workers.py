@@ -168,7 +168,7 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
 
 
 def _run_numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
-    """Run `task` on the item in a pair of number and item."""
+    """Run `task` on an item that is given as a pair (number, item), and return the result."""
     return task(numbered[1])
 
 
@@ -187,7 +187,7 @@ def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any
 
 
 def _run_task(item: Any) -> Any:
-    """Run the task that this worker process has stored on an item."""
+    """Run the task of this worker process, stored when it was started, on an item; return the result."""
     return _task[0](item)
 
 

@@ -21,15 +21,15 @@ ALL, ANY_LAW = "all", "any"
 
 @dataclass(frozen=True)
 class AlarmFractions:
-    """Fractions of records on which one detector raised an alarm, and similar fractions, in one group of records.
+    """Fractions of the records of one group on which one detector raised an alarm, stated no verdict, and similar.
 
     The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`. `alarms`:
     fraction with the verdict `leak`; `cannot_tell`: fraction with the verdict `cannot tell`, which includes the
-    records without a result; `failed`: number of these; `coverage`: of the intervals stated for the leak flow,
-    fraction that contains the true flow; `false_alarm`, `per_hour`: fraction of false alarms among the leak-free
-    records, and false alarms per hour, None if there are no such records or the hours are not known; `named`:
-    fraction of records with an alarm that names the true cause (`matches_cause`), None if the detector names no
-    causes.
+    records without a result; `failed`: number of records without a result. `coverage`: of the intervals stated for
+    the leak flow, fraction that contains the true flow. `false_alarm`: fraction of false alarms among the leak-free
+    records, None if there are none; `per_hour`: false alarms per hour, None if the hours are not known either.
+    `named`: fraction of records with an alarm that names the true cause (`matches_cause`), None if the detector names
+    no causes.
     """
 
     detector: str
@@ -71,18 +71,18 @@ class Alarms:
     confidence: float
 
     def _with_references(self) -> Verdicts:
-        """Append the verdicts of two reference detectors, which always or never raise an alarm, to all others."""
+        """Collect the verdicts of all detectors, and of two references that always or never raise an alarm."""
         rows = [record.row for record in next(iter(self.verdicts.values()), ())]
         references = {name: [JudgedRow(row, verdict, None) for row in rows]
                       for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
         return {**self.verdicts, **references}
 
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
-        """Yield the alarms of each detector for each size of leak; if `pooled`, for all sizes together.
+        """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        Records with other faults are left out. The detectors that always and never raise an alarm come last. `hours`:
-        operating time of a record, None to omit false alarms per hour. If there are no records with a leak, each
-        detector has one result of size 0, with alarms in 0 of 0 records.
+        Records with other faults are left out. Two reference detectors, which always or never raise an alarm, come
+        last. `hours`: operating time of a record, None to omit false alarms per hour. If there are no records with a
+        leak, each detector has one result of size 0, with alarms in 0 of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -97,24 +97,31 @@ class Alarms:
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
     def by_cell(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms of each detector for each size of leak and each combination of the factors' levels."""
+        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels.
+
+        Records with faults other than a leak are left out.
+        """
         for name, records in drop_other_faults(self.verdicts).items():
             cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
             for (size, _), group in cells.items():
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms of each detector for each fault other than a piston leak, on records without a leak."""
+        """Yield the fractions of alarms of each detector for each fault other than a piston leak.
+
+        Only records without a leak count. Two reference detectors, which always or never raise an alarm, come last.
+        """
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)
             for fault, group in group_by(faulty, lambda record: record.row.fault).items():
                 yield self._summarise(name, group, fault=fault)
 
     def by_family(self) -> Iterator[AlarmFractions]:
-        """Yield the alarms of each detector for each family of machines, size of leak and law of the leak.
+        """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
         The results of all families together come first. A size that occurs with several laws also has a result for
-        all of them together. If the records have no families, nothing is yielded.
+        all of them together. Records with faults other than a leak are left out. If the records have no families,
+        nothing is yielded.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)

@@ -17,8 +17,8 @@ class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak.
 
     `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
-    `why`: reason why there is no curve; `proven`: smallest size above which a detection probability of 90 % is proven
-    without a curve, by counting detections.
+    `why`: reason why there is no curve. `proven`: smallest size from which on counted detections alone prove a
+    detection probability of 90 % at all tested sizes, inf if none.
     """
 
     detector: str

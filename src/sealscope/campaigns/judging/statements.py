@@ -118,7 +118,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
 
 
 def _true_cause(record: JudgedRow) -> str:
-    """Return the true cause of a record: "piston leak", the cause that its fault is known by, or "none"."""
+    """Return the true cause of a record: "piston leak", the cause that stands for its fault, or "none"."""
     if record.size > 0:
         return PISTON_LEAK
     return expected_cause(record.row.fault) if record.row.fault else NO_CAUSE

@@ -34,13 +34,16 @@ class PriorKnowledge:
     rig: str
 
     def as_row(self) -> TableRow:
-        """Convert the fields to values of a table's row, by name of the column."""
+        """Convert the information given to a detector to the cells of a table's row, by name of the column."""
         return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
 
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load the file `tables.toml`: by table and column, the content of the column, as `_build_cells` reads it."""
+    """Load the layouts of all tables from `tables.toml`, by name of the table.
+
+    A layout gives the content of each column, by name of the column: flags and the path of a value (`_build_cells`).
+    """
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
@@ -60,11 +63,12 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the values in one row for one entry of `tables.toml`, by name of the column.
+    """Build the cells that one entry of `tables.toml` gives for one row of a table, by name of the column.
 
-    `content`: flags, and the dotted path of the value in `row`. With the flag "share" the value is a proportion,
-    which fills five columns; with "stated" too, they are empty if the proportion counts no records. With the flag
-    "size" it is a size of leak, and nan becomes "any". The path "levels" fills a column for each of the `factors`.
+    `content`: flags, and the dotted path of the value in `row`, the object that fills the row. With the flag "share"
+    the value is a proportion, which fills five columns; with "stated" too, they are empty if the proportion counts no
+    records. With the flag "size" it is a size of leak, and nan becomes "any". The path "levels" fills a column for
+    each of the `factors`.
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)
@@ -110,9 +114,10 @@ def build_tables(
     }
 
     def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
-        """Build one row of a table from its columns, by name with their content, and the object that fills it.
+        """Build one row of a table, by name of the column, from the object `row` that fills it.
 
-        Columns for the information given to a detector (content "known ...") are left out if `knowledge` is empty.
+        `columns`: contents of the columns by name, as in `tables.toml`. Columns for the information given to a
+        detector (content "known ...") are left out if `knowledge` is empty.
         """
         cells: TableRow = {}
         for column, content in columns.items():

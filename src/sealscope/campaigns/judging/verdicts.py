@@ -39,7 +39,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def alarm(self) -> bool:
-        """True for the verdict `leak`."""
+        """True if the detector's verdict on the record is `leak`."""
         return self.verdict == "leak"
 
 
@@ -57,8 +57,9 @@ def compute_thresholds(
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free rows.
 
     The duty of a row is its command and stroke direction (`duty_label`). A row without a score cannot raise an alarm,
-    so it counts as the lowest score. `false_alarm`, `promise`, `confidence`: as in `quantile_threshold`. Returns
-    thresholds by (detector, duty). Raises InputError if no duty has enough rows for `false_alarm`.
+    so it counts as the lowest score. `false_alarm`: wanted false-alarm probability. With the `promise` "average" it
+    is kept on average over sets of leak-free rows, with "bound" with the probability `confidence`. Returns thresholds
+    by (detector, duty). Raises InputError if no duty has enough rows for `false_alarm`.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
@@ -91,7 +92,7 @@ def collect_verdicts(
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:
-        """Determine the verdict of one detector on one row."""
+        """Determine the verdict of one detector on the result of one record."""
         if row.error is not None:
             return JudgedRow(row, CANNOT_TELL, None)
         if (statement := row.statements.get(detector)) is not None:

@@ -72,8 +72,8 @@ def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
 def throttle_values(level: str | float) -> dict[str, str | float]:
     """Compute the rig's parameters that close the throttles of both lines by `level`, such as 0.25 or '25 %'.
 
-    A level of 0 does not contain `line.orifices`, which says if the rig has throttles. Raises InputError for a level
-    below 0, or of 100 % and more.
+    Returns them by name. At a level above 0 they include `line.orifices`, which gives the rig throttles. Raises
+    InputError for a level below 0, or of 100 % and more.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
@@ -83,10 +83,10 @@ def throttle_values(level: str | float) -> dict[str, str | float]:
 
 
 def parse_plan_fault(text: str, onset_s: float) -> Fault:
-    """Parse the text of a fault other than a piston leak.
+    """Parse the text of a fault other than a piston leak, such as "pump leak x3".
 
-    It starts at `onset_s` [s] unless the text states a time itself ("... from 20 s"). Raises InputError if it is no
-    fault.
+    It starts at `onset_s` [s] unless the text states a time itself ("... from 20 s"). Raises InputError if the text
+    names no fault.
     """
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")

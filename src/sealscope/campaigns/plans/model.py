@@ -121,10 +121,10 @@ class RecordGroup(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan(_TomlTable):
-    """The fields of all plans.
+    """The entries that plans of all types have.
 
-    `name`: also that of files; `title`: by default the name; `confidence`: of all intervals; `note`: remark of the
-    author; `place`: path of the plan's file.
+    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: probability of all
+    confidence intervals; `note`: remark of the author; `place`: path of the plan's file.
     """
 
     name: FileName
@@ -138,10 +138,11 @@ class _Plan(_TomlTable):
 class _JudgedPlan(_Plan):
     """The fields that plans of simulated records and plans of recordings have in common.
 
-    `false_alarm`: wanted false-alarm probability; `promise`: "average" or "bound", in which sense thresholds keep it
-    (`quantile_threshold`); `detectors`: names, as in "diagnose @ pressures"; `unit`: unit of the leaks' sizes;
-    `views`: sets of channels, by the name that follows the "@"; `channels`: channels of the detectors without a view;
-    `assume`: name of the rig that detectors may assume; `assume_set`: values that replace some of its parameters.
+    `false_alarm`: wanted false-alarm probability; `promise`: "average" if thresholds keep it on average, "bound" if
+    they keep it with the probability `confidence` (`quantile_threshold`); `detectors`: names, as in "diagnose @
+    pressures"; `unit`: unit of the leaks' sizes; `views`: sets of channels, by the name that follows the "@";
+    `channels`: channels of the detectors without a view; `assume`: name of the rig that detectors may assume;
+    `assume_set`: values that replace some of its parameters.
     """
 
     false_alarm: Fraction = 0.01
@@ -154,10 +155,10 @@ class _JudgedPlan(_Plan):
     assume_set: Values = field(default_factory=dict)
 
     def _load_assumed(self, rig: Rig | None) -> Rig | None:
-        """Load the rig that detectors may assume: the rig named by `assume`, else `rig`.
+        """Load the rig that detectors may assume, with the parameter values `assume_set` of the plan.
 
-        The values `assume_set` replace its parameters; if there is no rig but such values, they replace those of the
-        rig `thesis`. Returns None if there are neither a rig nor values.
+        It is the rig named by `assume`, else `rig`. If there are values but neither of these, it is the rig `thesis`.
+        Returns None if there is no rig and there are no values.
         """
         rig = rig if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -236,8 +237,8 @@ class RecordingSet(_TomlTable):
 class RecordedPlan(_JudgedPlan):
     """The plan of a campaign over recordings of real machines, which are files in a folder.
 
-    `channel_map`: names of columns by channel; `rate_hz` [Hz]: sampling rate for files without times; `sets`: the
-    recordings.
+    `channel_map`: names of columns by channel; `rate_hz` [Hz]: sampling rate for files without times; `sets`: sets of
+    recordings with the same size of leak.
     """
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)

@@ -167,7 +167,8 @@ def _check_factors(plan: SimulatedPlan) -> None:
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """List the commands of a plan's records.
 
-    They are the levels of the factor `command`, else the commands of the plan's families, else those of its profile.
+    They are the levels of the factor `command`, else the commands of the plan's families of machines, else those of
+    its profile. A plan without this factor and without a profile has the command '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))

@@ -57,7 +57,7 @@ class SplitRms:
 
     @classmethod
     def from_recording(cls, recording: Recording, split_s: float) -> SplitRms:
-        """Compute the logarithms of the RMS on both sides of the time `split_s` [s].
+        """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
 
         The recording must be uniformly sampled without missing samples. If one of the parts is too short, the result
         has no chamber.
@@ -73,7 +73,7 @@ class SplitRms:
 
     @classmethod
     def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
-        """Compute the logarithms of the RMS from the mean squares of the details in both parts.
+        """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
 
         `squares`: by chamber, mean squares (2, 5) before and after the split; `bounds` (2, 2): first sample and end
         of each part (`split_bounds`). The mean over both parts is weighted by their numbers of samples.
@@ -86,12 +86,12 @@ class SplitRms:
         return cls(log_rms)
 
     def through(self, channels: Iterable[str]) -> SplitRms:
-        """Select the chambers whose pressures are among `channels`; leave out the others."""
+        """Keep the log RMS of those chambers whose pressures, "p_A" or "p_B", are among `channels`."""
         visible = set(channels)
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return one number: how the log RMS of a quantity changes at the split, or its level over both parts.
+        """Return the change of a wavelet detail's log RMS at the split of the record, or its level over both parts.
 
         `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" or "level". Returns None
         if the chamber is missing or the number is not finite.

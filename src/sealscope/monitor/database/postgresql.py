@@ -56,9 +56,10 @@ def limit_answers(engine: Engine) -> None:
             return super().wait(self._limited(gen), *arguments, **options)
 
         def _limited(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Pass on the generator `gen`; close the connection and raise OperationalError without an answer.
+            """Run psycopg's generator `gen`; raise OperationalError if the server does not answer within `ANSWER_S`.
 
-            Psycopg resumes the generator several times a second, even if there is no answer.
+            Before that the connection is closed. Psycopg resumes the generator several times a second, even if there
+            is no answer.
             """
             last_answer, ready = time.monotonic(), None
             while True:

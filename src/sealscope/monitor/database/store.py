@@ -67,10 +67,10 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add a block's samples and the verdict on them, which a restart judges again until the next checkpoint.
+        """Add the samples of a block and the verdict on them, which a restarted monitor must judge again.
 
-        `number`: number of the block since the checkpoint, from 1; `follows`: False if there is a gap between these
-        samples and those before.
+        They are deleted at the next checkpoint of the actuator. `number`: number of the block since the checkpoint,
+        from 1; `follows`: False if there is a gap between these samples and those before.
         """
         self.pending.append({"actuator": actuator, "number": number, "samples": _pack(samples, follows, verdict)})
 
@@ -87,7 +87,10 @@ class StoredRows:
             self.events.append({**actuator, **entry, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
-        """Add a checkpoint: the settings (JSON) and state of an actuator, which replace its pending samples."""
+        """Add a checkpoint, that is the settings (JSON) and the state of an actuator.
+
+        Samples of the actuator that were stored before it are deleted.
+        """
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
         plain = json.dumps(state, allow_nan=False)
         self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
@@ -226,7 +229,11 @@ class MonitorStore:
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
-        """Write rows to all tables within a transaction, and delete the old rows that `rows` states."""
+        """Write rows to all tables within a transaction, and delete those that the rows replace.
+
+        These are the samples before a new checkpoint, and the blocks and estimates up to the numbers that `rows`
+        states.
+        """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
             delete_pending = tables.pending.delete().where(tables.pending.c.actuator == actuator)
@@ -292,13 +299,16 @@ class MonitorStore:
         return n_before
 
     def end_decoding(self, reader: str, digest: str) -> None:
-        """Delete the record of `begin_decoding`: the reader has finished with the message of this digest."""
+        """Delete the record that a message is being decoded (`begin_decoding`), as its reader has finished with it.
+
+        `digest`: hash of the message.
+        """
         columns = tables.decodings.c
         with self._begin_relaxed_transaction() as connection:
             connection.execute(tables.decodings.delete().where(columns.reader == reader, columns.digest == digest))
 
     def last_number(self, table: sa.Table, actuator: str) -> int:
-        """Read the highest running number of an actuator's blocks or estimates, whichever `table` has; 0 for none."""
+        """Read the highest running number of an actuator in `table`, that of blocks or of estimates; 0 for none."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
@@ -422,7 +432,7 @@ def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: boo
 
 
 def _unpack(data: bytes) -> StoredSamples:
-    """Unpack the samples that `_pack` has packed as bytes."""
+    """Unpack a block of samples from the bytes in which the database stores it (`_pack`)."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)

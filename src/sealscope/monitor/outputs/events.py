@@ -38,7 +38,7 @@ class EventLines:
         self._unwritten, self._number = b"", 0  # rest of the line under way, and the number of its event
 
     def deliver(self) -> None:
-        """Write the new events; raise PartAway if the stream is closed or refuses them."""
+        """Write the new alarm events as lines of JSON; raise PartAway if the stream is closed or refuses them."""
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
@@ -82,11 +82,11 @@ class Webhook:
             self._headers["Authorization"] = f"Bearer {token}"
 
     def deliver(self) -> None:
-        """Post the new events; raise PartAway if one is not confirmed."""
+        """Post the new alarm events to the web address; raise PartAway if one is not confirmed."""
         self._store.deliver("webhook", self._send_post)
 
     def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an event unless its alarm is shelved; return True, or raise PartAway if it is not confirmed."""
+        """Post an alarm event unless its alarm is shelved; return True, or raise PartAway if it is not confirmed."""
         if not _is_announced(event):
             return True
         try:

@@ -58,9 +58,10 @@ class SparkplugNode:
         self._next_update = 0.0
 
     def deliver(self) -> None:
-        """Send the birth messages if they are due, then new events and, every few seconds, changed values.
+        """Send new events of alarms and, every few seconds, changed values to the Sparkplug host.
 
-        Connects to the broker at the first call; does nothing while there is no connection.
+        Before that it sends the birth messages, which state all metrics, if they are due. It connects to the broker
+        at the first call, and does nothing while there is no connection.
         """
         if not self._link.is_open:
             self._last_birth_number = self._store.position(_BIRTHS)
@@ -91,7 +92,7 @@ class SparkplugNode:
                     sent_values.update(changed_values)
 
     def end(self) -> None:
-        """Send the remaining events and disconnect."""
+        """Send the remaining events of alarms, and disconnect from the broker."""
         try:
             self.deliver()
         finally:
@@ -105,16 +106,17 @@ class SparkplugNode:
         return spb.SparkplugMetric(spb.BIRTH_SEQUENCE, self._birth_number, spb.INT64)
 
     def _death_message(self) -> tuple[str, bytes]:
-        """Build topic and payload of the death message, which is the last will of the next connection.
+        """Build topic and payload of the node's death message, which is the last will of the next connection.
 
-        Its number bdSeq is the one after that of the last birth.
+        The broker publishes it when the connection is lost. Its number bdSeq is the one after that of the last birth
+        message.
         """
         self._birth_number = (self._last_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
         return self._topic("NDEATH"), spb.encode_payload(payload)
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Subscribe to commands after a connection, and have the birth messages, which state all metrics, sent again.
+        """Subscribe to commands after a connection, and mark the birth messages, which state all metrics, as due.
 
         The library paho calls this after an attempt to connect. If the broker refuses the connection, that is only
         logged.
@@ -126,7 +128,10 @@ class SparkplugNode:
         self._birth_due.set()
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        """Acknowledge a received command, and mark the birth as due if the command requests it."""
+        """Acknowledge a received command; if it requests the birth messages, mark them as due.
+
+        Birth messages state all metrics.
+        """
         if message.qos:
             client.ack(message.mid, message.qos)
         try:
@@ -151,7 +156,7 @@ class SparkplugNode:
         return self._send("DDATA", metrics, alarm["actuator"])
 
     def _send_births(self) -> None:
-        """Send the births of the node and of all devices, with the present values of all metrics."""
+        """Send the birth messages of the node and of all devices, with the present values of all metrics."""
         self._store.write_position(_BIRTHS, self._birth_number)
         self._last_birth_number = self._birth_number
         summaries = self._summaries()
@@ -204,9 +209,10 @@ def _milliseconds(t: float | None) -> int:
 
 
 def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Look up the value of each metric of a table of `sparkplug_node.toml` in nested values.
+    """Look up the value of each metric in nested values, such as an actuator's summary.
 
-    Returns the values by name of the metric, with None for a missing one.
+    `table`: table of `sparkplug_node.toml`, which states the path of each metric's value. Returns the values by name
+    of the metric, with None for a missing one.
     """
     result: dict[str, Any] = {}
     for name, row in _load_table(table).items():
@@ -219,9 +225,10 @@ def _metric_values(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _build_metrics(table: str, values: Mapping[str, Any], timestamp: int) -> list[spb.SparkplugMetric]:
-    """Build metrics of a table of `sparkplug_node.toml` from their values by name.
+    """Build Sparkplug metrics from their values by name.
 
-    `timestamp` [ms since 1970]: time of all of them.
+    `table`: table of `sparkplug_node.toml`, which states the type and unit of each metric; `timestamp` [ms since
+    1970]: time of all of them.
     """
     rows = {name: _load_table(table)[name] for name in values}
     return [

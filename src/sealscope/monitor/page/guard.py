@@ -54,7 +54,8 @@ class Admission:
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
         """Return True if a token is right; if it is wrong, count that for its address and return False.
 
-        `session`: True if `token` is the cookie of a browser that has stated the token before.
+        A right token clears the count of the address. `session`: True if `token` is the cookie of a browser that has
+        stated the token before.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -99,7 +100,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
     base: Any = AutoHTTPProtocol
 
     class LimitedProtocol(base):  # type: ignore[misc]
-        """A connection to the page.
+        """A connection to the page that is closed after a long silence, or if there are too many connections.
 
         `last_activity` [s]: time at which it last sent a request or read a part of an answer.
         """

@@ -50,7 +50,7 @@ class _Window:
     version: int = 0
 
     def add(self, samples: Recording) -> None:
-        """Append samples; start anew after a gap, or if the sampling rate or the channels change.
+        """Append samples to the window; start anew after a gap, or if the sampling rate or the channels change.
 
         Samples that are in the window already, without channels, or with times that are not finite are ignored.
         """

@@ -174,8 +174,9 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         """Answer with a stream of server-sent events: one after each change, and the live curves of an actuator.
 
-        Parameters of the query: `actuator`, the actuator's name, without which there are no curves; `pressure`, the
-        pressure whose wavelet details are drawn; `drawn`, the form in which they are drawn.
+        Without changes an event is repeated from time to time, to keep the connection alive. Parameters of the query:
+        `actuator`, the actuator's name, without which there are no curves; `pressure`, the pressure whose wavelet
+        details are drawn; `drawn`, the form in which they are drawn.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -194,7 +195,8 @@ class _Pages:
     async def _lines(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
         """Yield the text of server-sent events: a number after each change, and curves of an actuator's last samples.
 
-        `name`: the actuator, "" for no curves; `pressure`, `detail_form`: as in `LiveSamples.curves`.
+        Without changes the number is repeated from time to time, to keep the connection alive. `name`: the actuator,
+        "" for no curves; `pressure`: the pressure whose wavelet details are drawn; `detail_form`: "rms" or "details".
         """
         live, actuators = self._live, self._actuators
         with ExitStack() as viewing:
@@ -330,7 +332,8 @@ async def _read_body(request: Request) -> bytes:
 class PageServer:
     """The web server of the page, which runs in a separate thread until `close`.
 
-    `queue_load`, `live`: as in `site`. Raises InputError if the port is taken or the token cannot be read.
+    `queue_load`: function that returns the load of the queue of blocks; `live`: the last samples of the service; by
+    default only stored samples are shown. Raises InputError if the port is taken or the token cannot be read.
     """
 
     def __init__(
@@ -382,7 +385,7 @@ class PageServer:
             raise RuntimeError("the page's server has ended")
 
     def leave(self) -> None:
-        """Tell the server to end, without waiting for that."""
+        """Tell the web server to end, and return at once."""
         self._actuators.closed = True
         if self._server is not None:
             self._server.should_exit = True

@@ -73,7 +73,7 @@ def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
 
 
 class _Connection:
-    """The connection of a service to its broker."""
+    """The connection of a monitor to its MQTT broker, by which blocks arrive and alarms are published."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
         self._settings, self._service = settings, service
@@ -123,7 +123,10 @@ class _Connection:
             self._link.close()
 
     def _on_connect(self, client: Any, userdata: Any, flags: Any, reason: Any, properties: Any) -> None:
-        """Publish that the host is online and subscribe to all topics, or begin an outage if the broker refuses."""
+        """Subscribe to all topics after a connection, or begin an outage if the broker refuses it.
+
+        A Sparkplug primary host also publishes that it is online.
+        """
         self._connection += 1
         if reason.is_failure:
             self._broker.begin_outage(f"{self._settings.host} refuses the connection: {reason}")
@@ -166,7 +169,8 @@ class _Connection:
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         """Queue a received message, without waiting for room: that would let the connection time out.
 
-        If the queue is full, a message of QoS 0 is dropped, and one of QoS 1 is left unacknowledged.
+        If the queue is full, a message of QoS 0 is dropped. One of QoS 1 is left unacknowledged, as are all later
+        ones of this connection, and the broker sends them again after the next connection.
         """
         queue_entry, size = (self._connection, message), len(message.payload)
         if message.qos == 0:
@@ -185,8 +189,8 @@ class _Connection:
     def _submit_arrived(self) -> None:
         """Decode and submit the queued messages in their order until the service stops.
 
-        A connection whose messages found a full queue is closed once the queue is empty; the broker then sends them
-        again.
+        If a connection left messages unacknowledged because the queue was full, it is closed once the queue is empty;
+        the broker then sends them again.
         """
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._arrived.pop(1, 0.5)
@@ -201,7 +205,7 @@ class _Connection:
                     refusing_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
-        """Decode a message and submit its block, or its refusal; it is acknowledged once that is stored.
+        """Decode a message and submit its block, or the reason to refuse it; it is acknowledged once that is stored.
 
         `connection`: number of the connection by which the message came.
         """
@@ -260,7 +264,7 @@ class _Connection:
             return
 
         def publish_alarm(event: dict[str, Any]) -> bool:
-            """Publish the alarm of an event."""
+            """Publish the alarm that an event concerns; return True if the broker acknowledges it."""
             return self._publish(event["alarm"]["actuator"], "alarm", json.dumps(event["alarm"]))
 
         self._service.store.deliver(_NAME, publish_alarm)

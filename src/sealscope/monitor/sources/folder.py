@@ -171,9 +171,9 @@ class WatchedFolder:
             return None, f"{_printable(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
-        """Find the reason to refuse a recording: it is older than those watched before; return "" to accept it.
+        """Return the reason to refuse a recording that is older than those watched before, or "" to accept it.
 
-        A file that is dated in the future is logged, and does not count as newest.
+        If the newest recording is dated in the future, none is refused. A file that is dated in the future is logged.
         """
         if samples is None:
             return ""

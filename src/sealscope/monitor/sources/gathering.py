@@ -28,8 +28,9 @@ LATE = "values that came after their block"
 class _Channel:
     """The values of one channel that are not in a block yet.
 
-    `values`: by index on the time axis; `previous`: the value before them, None for none; `arrival` [s]: time at
-    which the last value arrived; `newest`: index of the newest value so far, None for none.
+    `values`: by index on the time axis, i.e. by number of the sample; `previous`: the value before them, None for
+    none; `arrival` [s]: time at which the last value arrived; `newest`: index of the newest value so far, None for
+    none.
     """
 
     values: dict[int, float] = field(default_factory=dict)
@@ -76,9 +77,10 @@ class ValueGatherer:
         self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Add samples of a channel in SI units; return the blocks that they complete.
+        """Add samples of a channel in SI units; return the blocks that they complete, often none.
 
-        `t` [s]: time of the first sample. NaN is an unknown value.
+        `t` [s]: time of the first sample. NaN is an unknown value. Values without a finite time are dropped. If the
+        time jumps forward, the blocks continue after the pause; if it jumps back, they start again.
         """
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
@@ -122,7 +124,11 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks for which every channel that is not silent has values up to the end."""
+        """Remove and return the blocks that are complete.
+
+        In a complete block every channel has values up to the end; channels that have been silent for `SILENT_S` do
+        not count, as their last value is repeated.
+        """
         channels = self._channels.values()
         if self._start is None:
             if any(channel.last_value() is None for channel in channels) or not any(

@@ -44,7 +44,10 @@ _RULES = (
 
 
 class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
-    """Raised if a message breaks a limit; `oversized`: True if a list in it is too long."""
+    """Raised if a message has too many, too long or too deep items.
+
+    `oversized`: True if the cause is a list with too many samples.
+    """
 
     def __init__(self, rule: str, *, oversized: bool = False) -> None:
         super().__init__(rule)
@@ -52,9 +55,10 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check the limits of a CBOR message, and return its number of pairs of key and value.
+    """Check the numbers and the depth of the items in a CBOR message; return its number of pairs of key and value.
 
-    Raises MessageLimit if it breaks a rule.
+    Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, or if an item is of a
+    type that is not allowed.
     """
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
@@ -63,9 +67,9 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check the limits of a JSON message, and return the number of its colons, including those within texts.
+    """Check the numbers of quotation marks and brackets in a JSON message; return its number of colons.
 
-    Raises MessageLimit if it has too many quotation marks or brackets.
+    Colons within texts are counted, too. Raises MessageLimit if quotation marks or brackets are too many.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:
@@ -163,7 +167,7 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 
 @kernel
 def _scan_items(data: Any) -> tuple[int, int, int]:
-    """Check the limits of a CBOR message, given as bytes (n,), in one pass.
+    """Check the numbers, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
     Returns the code of the broken rule (0 for none, an index into `_RULES`), the position of the fault, and the
     number of pairs.

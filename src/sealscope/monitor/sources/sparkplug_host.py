@@ -51,10 +51,10 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 @dataclass
 class _Birth:
-    """The metrics of a birth message that are channels or the sampling rate.
+    """The channels of an actuator in the birth message of its Sparkplug node, which states all metrics.
 
-    `names`: name of the metric of each channel; `aliases`: name of the metric of each alias, a number; `metrics`: by
-    name, the metric with its last value.
+    `names`: name of the metric of each channel and of the sampling rate; `aliases`: name of the metric of each alias,
+    a number; `metrics`: by name, the metric with its last value.
     """
 
     names: dict[str, str] = field(default_factory=dict)
@@ -114,10 +114,11 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """The state of the session of an edge node.
+    """The state of the session of a Sparkplug edge node.
 
-    `births`: births by device, "" for the node itself; `birth_sequence`: number bdSeq of the last birth; `seq`: last
-    sequence number, None before a birth; `is_complete`: True if no sequence number since the birth is missing.
+    A birth message, which states all metrics, begins the session. `births`: births by device, "" for the node itself;
+    `birth_sequence`: number bdSeq of the last birth; `seq`: last sequence number, None before a birth; `is_complete`:
+    True if no sequence number since the birth is missing.
     """
 
     births: dict[str, _Birth] = field(default_factory=dict)

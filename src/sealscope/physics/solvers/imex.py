@@ -59,10 +59,10 @@ W = (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211, GAMMA)
 
 @contracted
 def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -> State:
-    """Compute the state z + h (e f + i s) from the rates of one stage of the Runge-Kutta step.
+    """Compute the state z + h (e f + i s), the contribution of one Runge-Kutta stage to the state z.
 
-    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: their tableau
-    coefficients.
+    `f`: explicit rates of all states; `s`: implicit rates of the four pressures; `e`, `i`: coefficients of the two
+    in the method's tableau; `h` [s]: step.
     """
     return add_to_pressures(add_step(z, h * e, f), h * i, s)
 

@@ -41,16 +41,16 @@ class Loop(NamedTuple):
 
 @law
 def quantize(value: float, count: float) -> float:
-    """Round a value down to whole encoder counts of size `count`; 0 leaves it unchanged."""
+    """Round a value down to a multiple of an encoder's count `count`; a count of 0 leaves it unchanged."""
     return np.floor(value / count) * count if count > 0.0 else value  # type: ignore[no-any-return]
 
 
 @law
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
-    """Measure the state `y` (14,) and call the controller for sample k; return False if its voltage is not finite.
+    """Measure the state `y` (14,) and call the controller for its sample number k.
 
-    A sample that the controller has already taken, such as when the solver repeats a part of the run at half the
-    step, keeps its first voltage.
+    Returns False if the controller's voltage is not finite. A sample that the controller has already taken keeps
+    its first voltage, such as when the solver repeats a part of the run at half the step.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:

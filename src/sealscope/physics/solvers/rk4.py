@@ -18,7 +18,7 @@ Nodes = tuple[float, float, float]
 
 @contracted
 def freeze_integral(dy: State, euler_integral: bool) -> State:
-    """Set the rate of the controller's integral to 0 in the state's rates `dy` if `euler_integral`, else return `dy`.
+    """Return the state's rates `dy`, with the rate of the controller's integral set to 0 if `euler_integral`.
 
     The integral is then updated once per step instead, which is eq. (4.2) taken literally (`rk4_step`).
     """

@@ -34,7 +34,7 @@ FLOW, OPENING, MAX_TRAVEL, MIN_PRESSURE, DIVERGED = range(N_TOTALS)
 
 
 def _compile(text: str, **scope: Any) -> Any:
-    """Compile the function named `law` that the source `text` defines.
+    """Compile a function from its source text, in which it has the name `law`.
 
     `scope`: the objects that the source uses, by name. The source is generated as text because numba needs each
     element of a tuple written out.
@@ -47,7 +47,7 @@ def _compile(text: str, **scope: Any) -> Any:
 def _row_loader(count: int) -> Any:
     """Compile a function (array, row) that loads `count` successive rows of an array as a tuple, from row `row` on.
 
-    Each row holds one number for each lane.
+    Each row holds one number for each run of a group.
     """
     return _compile(f"def law(array, row):\n    return ({', '.join(f'load(array, row + {k})' for k in range(count))})")
 
@@ -60,22 +60,25 @@ load_numbers = _compile(f"def law(table, row, p):\n    return RigNumbers({', '.j
 
 @contracted
 def leak_opening(leak: Leak, t: float) -> float:
-    """Compute the opening of a leak, 0 to 1, at t [s]: it rises linearly from its start on and then stays at 1.
+    """Compute the opening of a leak, 0 to 1, at t [s].
 
-    `leak`: the numbers of the leak, of which the third is its start [s] and the fourth its slope [1/s] (`LEAK_ROWS`).
+    It rises linearly from the leak's start on and then stays at 1. `leak`: the numbers of the leak, of which the
+    third is the start [s] and the fourth the slope [1/s] (`LEAK_ROWS`).
     """
     return min(max((t - leak[2]) * leak[3], 0.0), 1.0)
 
 
 def _build_inputs_law(count: int) -> Any:
-    """Compile the function that computes the inputs u, G, C, F of a group of runs at the `count` nodes of step k.
+    """Compile the function that computes the inputs of the rig for a group of runs in step k of the solver.
 
-    Its arguments are (t, nodes, shape, k, drive, leak, p): `t` [s] is the start of the step, `drive` and `leak`
-    belong to the group, the others are those of `advance`.
+    The inputs are the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count`
+    times within a step (nodes) that the method needs. The function's arguments are (t, nodes, shape, k, drive,
+    leak, p): `t` [s] is the start of the step, `drive` and `leak` belong to the group, the others are those of
+    `advance`.
     """
 
     def for_nodes(text: str) -> str:
-        """Repeat a piece of source text for each node, with the node's number `n` filled in."""
+        """Repeat a piece of source text for each node, with the node's number in place of `{n}`."""
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -97,9 +100,10 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Add an output of a group of runs to their totals (`N_TOTALS`): sums, extremes, and the flag of diverged runs.
+    """Add one output of a group of runs to the totals of these runs: sums, extremes, and the flag of diverged runs.
 
-    `z`: states of the runs at the output; `t` [s]: its time; `q`: numbers of the runs' rigs.
+    `z`: states of the runs at the output; `leak`: their leaks; `t` [s]: time of the output; `totals`: as listed at
+    `N_TOTALS`; `q`: numbers of the runs' rigs. Returns the new totals.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -136,13 +140,19 @@ def advance(
 ) -> None:
     """Integrate groups of runs in place over n steps of h [s]; write their pressures and add to their totals.
 
-    The groups are `groups[0]` <= g < `groups[1]`, the first step is `start`. `implicit`: `IMPLICIT` or `EXPLICIT`,
-    the method; `y` (groups, 14, WIDTH): states; `shape` (n, nodes): the command's shape at the times `nodes` [s]
-    within each step, or (n, 2 nodes) if the load [N] at the same times follows; `drive` (groups, 2, WIDTH): the
-    command's gain and offset [V]; `leaks` (groups, LEAK_ROWS, WIDTH); `table` (groups, cells, fields, WIDTH): the
-    rigs' numbers, constant within a cell, which is a span of steps; `bounds` (cells + 1,): steps at which the cells
-    begin; `p`: the choices that all rigs share; `pressures` (groups, outputs, CHANNELS, WIDTH): written from output
-    `begin` on, before every `every`-th step; `totals`: (groups, N_TOTALS, WIDTH).
+    The groups are `groups[0]` <= g < `groups[1]`, each of WIDTH runs; the first step is `start`.
+
+    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method.
+    `y` (groups, 14, WIDTH): states.
+    `shape` (n, nodes): the command's shape at the times `nodes` [s] within each step; (n, 2 nodes) if the load [N] at
+    the same times follows.
+    `drive` (groups, 2, WIDTH): gain and offset [V] of the command.
+    `leaks` (groups, LEAK_ROWS, WIDTH): numbers of the leaks.
+    `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a span of steps.
+    `bounds` (cells + 1,): steps at which the cells begin, and the end.
+    `p`: the choices that all rigs share.
+    `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before every `every`-th step.
+    `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
     for g in range(groups[0], groups[1]):
@@ -176,7 +186,7 @@ def advance(
 def advance_lanes_rk4(*run: Any) -> None:
     """Integrate groups of runs by the explicit Runge-Kutta method in compiled code.
 
-    The arguments are those of `advance` without the first.
+    The arguments are those of `advance` in this module without the first, `implicit`.
     """
     advance(EXPLICIT, *run)
 
@@ -185,6 +195,6 @@ def advance_lanes_rk4(*run: Any) -> None:
 def advance_lanes_imex(*run: Any) -> None:
     """Integrate groups of runs of rigs with throttles by the implicit-explicit method in compiled code.
 
-    The arguments are those of `advance` without the first.
+    The arguments are those of `advance` in this module without the first, `implicit`.
     """
     advance(IMPLICIT, *run)

@@ -45,7 +45,7 @@ def _format_area(area: Area) -> str:
 def column_sizes(judgement: Judgement) -> list[float]:
     """List the leak sizes for the columns of the main table, in the unit of the plan.
 
-    If there are too many sizes or none, the list is [nan], a column of all sizes together.
+    If there are more than `_MAX_SIZES` sizes or none, the list is [nan], for one column of all sizes together.
     """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
@@ -54,8 +54,9 @@ def column_sizes(judgement: Judgement) -> list[float]:
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row for each detector.
 
-    A row has the fractions of false alarms and of detected leaks, the area under the ROC curve, and the sizes a90 and
-    a90/95. The detectors of the plan come first, then two that always or never raise an alarm.
+    A row has the information that the detector was given, if any was, the fractions of false alarms and of detected
+    leaks of each size, the area under the ROC curve, and the sizes a90 and a90/95. The detectors of the plan come
+    first, then two that always or never raise an alarm.
     """
     judgement = result.judgement
     sizes = column_sizes(judgement)
@@ -161,7 +162,10 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format a note for each set of channels and for each rig that was given, with the names of the detectors."""
+    """Format notes on the channels and the rigs that detectors were given, with the names of these detectors.
+
+    There is a note for each different set of channels, and for each different rig.
+    """
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -240,7 +244,10 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, and up to six parameters that differ from the simulated rig."""
+    """Describe the rig that the detectors assume, and up to six parameters that differ from the simulated rig.
+
+    If the two rigs are equal, the text says so.
+    """
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     simulated_values = {row.name: row.value for row in plan.rig.table()}
@@ -251,10 +258,10 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 
 
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
-    """Build the template's values for the section of one detector.
+    """Build the template's values for the section of one detector on a campaign's page.
 
-    They are its plots, the areas under its ROC curves, and the fractions of detections for each combination of
-    levels.
+    They are its plots, the areas under its ROC curves, and the fractions of detections for each combination of the
+    levels of the plan's factors. `unit`: unit of the leak sizes.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -281,7 +288,7 @@ def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict
 
 
 def _size_text(roc: SizeRoc, unit: str) -> str:
-    """Format the size of the leaks to which an ROC curve belongs."""
+    """Format the size of the leaks to which an ROC curve belongs; "any size" for a curve of all leaks."""
     return "any size" if math.isnan(roc.leak_lpm) else f"{roc.leak_lpm:g} {unit}"
 
 
@@ -309,7 +316,7 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     """Draw a detector's fraction of detections over the size of the leak, on a logarithmic axis.
 
     The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 and a90/95.
-    Returns its title and the picture, or None if there are fewer than two sizes.
+    Returns its `title` and the `picture`, or None if there are fewer than two sizes. `unit`: unit of the sizes.
     """
     if len(pod.sizes) < 2:
         return None
@@ -337,8 +344,8 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
     """Draw ROC curves, detections over false alarms, with a line for each size of leak.
 
-    A single line is drawn with its confidence band. Returns the title and the picture, or None if there are no
-    curves.
+    A single line is drawn with its confidence band. Returns the `title` and the `picture`, or None if there are no
+    curves. `unit`: unit of the sizes.
     """
     if not rocs:
         return None

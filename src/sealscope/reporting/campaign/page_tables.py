@@ -14,7 +14,7 @@ from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 
 
 def percent(proportion: Proportion | None) -> str:
-    """Format a proportion with its interval in percent; a dash if there are no records."""
+    """Format a proportion with its interval in percent; a dash if it counts no records or is None."""
     if proportion is None or proportion.n == 0:
         return "–"
     value, low, high = map(_format_percent, (proportion.value, proportion.low, proportion.high))
@@ -46,7 +46,7 @@ class PageTable(NamedTuple):
 def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
     """Build the tables that `page_tables.toml` lists, by name; empty ones are left out.
 
-    `unit`: unit of the leaks' sizes; `part`: purpose of the plan, which is added to titles.
+    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as development, which is added to titles.
     """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
@@ -62,7 +62,8 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 def _format_cell(row: Any, content: str) -> str:
     """Format one cell of a table as text.
 
-    `content`: an entry of `_FORMATS` or a format specification, a space, and the dotted path of the value in `row`.
+    `content`: kind of format, a space, and the dotted path of the value in `row`. The kind is an entry of `_FORMATS`,
+    such as "percent", or a format specification of Python.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)

@@ -22,7 +22,7 @@ from sealscope.units import DAY
 
 
 class Judged(NamedTuple):
-    """A judged recording: its diagnosis, its start, and a function that reads it.
+    """A diagnosed recording: its diagnosis, its start, and a function that reads it.
 
     `start_s` [s since 1970]: start of the recording, None if it is not known.
     """
@@ -81,7 +81,7 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Draw the leak of each recording over time, as a picture for each of the `SIZES`.
+    """Draw the leak of each recording over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
     `ordered`: recordings in order of their starts; if one has no date, all are drawn over their numbers, from 1.
     Returns None if no recording states an estimate or a bound.
@@ -101,13 +101,19 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     top = 1.08 * max(shown_values, default=0.0) or 1.0
 
     def format_day(day: float) -> str:
-        """Format a value of the time axis as a date, or as the number of a recording, "" between two numbers."""
+        """Format a value of the time axis as a date, or if there are no dates, as the number of a recording.
+
+        `day`: time [d], or the number, for which the text is "" between two recordings.
+        """
         if has_dates:
             return stamp(day * DAY, days[-1] - days[0])
         return f"{day:g}" if day.is_integer() else ""
 
     def draw_levels(picture: Picture) -> None:
-        """Draw a point with its interval for each recording, or a symbol for a bound, large or missing value."""
+        """Draw the leak of each recording into the picture as a point with its interval.
+
+        A bound, a value above the frame and a missing value each have a symbol of their own.
+        """
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, picture.height - 4.0)

@@ -29,13 +29,14 @@ _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91
 def write_trend_page(path: str | os.PathLike[str], trend: Trend, *, title: str = "") -> Path:
     """Write the page of a trend as .html, .htm or .pdf, and return its path.
 
-    `title`: title of the page. Raises InputError for another suffix, or if it cannot be written.
+    `title`: title of the page, "" for "Trend of a machine". Raises InputError for another suffix, or if the page
+    cannot be written.
     """
     return template.write(template.parse_page_path(path, card=False), render_trend_page(trend, title=title))
 
 
 def render_trend_page(trend: Trend, *, title: str = "") -> str:
-    """Render the page of a trend as HTML."""
+    """Render the page of a trend as HTML; `title`: its title, "" for "Trend of a machine"."""
     return template.render(
         "trend.html.j2",
         trend=trend,
@@ -54,7 +55,7 @@ def level_pictures(
     format_day: Callable[[float], str],
     draw: Callable[[Picture], None],
 ) -> dict[str, Picture]:
-    """Draw levels of leakage over time, as a picture for each of the `SIZES`.
+    """Draw levels of leakage over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
     `days`: times of the first and last recording [d]; `levels`: ends of the axis of levels; `limit`: repair limit,
     which is drawn if it is on the axis, None for none; `format_day`: function that formats a time [d] on the axis;
@@ -79,7 +80,10 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Draw a trend as a picture for each of the `SIZES`; return None if no recording has a level of leakage."""
+    """Draw a trend as a picture for each of the `SIZES`, "wide" and "narrow".
+
+    Returns None if no recording has a level of leakage.
+    """
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
     ends, format_day = (trend.points[0].day, trend.points[-1].day), partial(text.moment, trend)
@@ -109,7 +113,11 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:
-    """Compute the limits of the axis of levels; they include all intervals, and the repair limit unless it is far."""
+    """Compute the limits (low, high) of the axis of levels, in the trend's unit.
+
+    They include all intervals of recordings and healthy ranges, and zero for levels in L/min. The repair limit is
+    included if it is below 2.5 times the largest of these.
+    """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
     low, high = min(ends), max(ends)
@@ -124,8 +132,8 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
     """Compute the vertices (day, level) of the line fitted to an episode, the recordings from one repair to the next.
 
-    The line is straight, or if there is an alarm with an onset, constant until then. `days`: times of all recordings
-    [d].
+    The line is straight. If there is an alarm with an onset, it is constant until then, and rises to the present
+    level afterwards, at once if the change is a step. `days`: times of all recordings [d].
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

@@ -19,7 +19,10 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of the present level: "total" for leakage of pump and piston, "now" for ringing."""
+    """Return the label of the present level in a trend.
+
+    It is "total" for the leakage of pump and piston, and "now" if the level is the damping of the pressures' ringing.
+    """
     return "now" if trend.basis == "ringing" else "total"
 
 
@@ -54,7 +57,7 @@ def headline(trend: Trend) -> str:
 
 
 def verdict_sentence(trend: Trend) -> str:
-    """Format the verdict of a trend as a sentence."""
+    """Format the verdict of a trend as a sentence for the heading of its page."""
     if trend.decision.summary != trend.verdict:
         return trend.decision.summary.capitalize()
     key = "ringing"
@@ -71,8 +74,8 @@ def figures(trend: Trend) -> dict[str, str]:
     """Format the numbers of a trend as text, by name; "" for a number that is not known.
 
     They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level;
-    `healthy`, the range of healthy recordings; `since`, the onset; `growth`; and `limit`, the time until the repair
-    limit is reached.
+    `healthy`, the range of healthy recordings; `since`, the onset; `growth`, the rise in a month or in a step; and
+    `limit`, the time until the repair limit is reached.
     """
     wear = trend.wear
     if wear is None:
@@ -102,16 +105,19 @@ def figures(trend: Trend) -> dict[str, str]:
 
 
 def healthy_end(wear: Wear) -> float:
-    """Compute the upper end of the healthy range for display: it is cut off at the repair limit.
+    """Compute the upper end of the healthy range for display, cut off at the repair limit.
 
-    It does not lie below the healthy level itself.
+    It is at least the healthy level itself, even if that exceeds the limit.
     """
     high = wear.healthy.high
     return high if wear.limit is None else min(high, max(wear.limit, wear.healthy.value))
 
 
 def _format_estimate(interval: Interval, unit: str) -> str:
-    """Format an estimate with its interval and unit; "open" stands for an infinite end of the interval."""
+    """Format an estimate with its interval and unit; "not known" if it is not finite.
+
+    The word "open" stands for an infinite end of the interval.
+    """
     if not math.isfinite(interval.value):
         return "not known"
     ends = (number(end, 2) if math.isfinite(end) else "open" for end in (interval.low, interval.high))
@@ -155,7 +161,7 @@ def assumptions_text(trend: Trend) -> str:
 
 
 def limit_note(trend: Trend) -> str:
-    """Format the repair limit and its origin, with a remark if healthy recordings exceed it."""
+    """Format the repair limit and its origin, with a remark if healthy recordings scatter beyond it."""
     origin = "" if trend.repair.stated else ", what a maker of excavators allows a cylinder in service"
     wear = trend.wear
     is_in_scatter = wear is not None and wear.limit is not None and wear.limit < wear.healthy.high
@@ -198,7 +204,11 @@ def trend_text(trend: Trend, *, whole: bool = False) -> str:
 
 
 def trend_csv(trend: Trend) -> str:
-    """Format a trend as CSV text, with a row for each recording: its time, level with interval, and notes."""
+    """Format a trend as CSV text, with a row for each recording.
+
+    The columns are file, time, day since the first recording, level with its interval, group of comparable
+    recordings, oil temperature [degC] and note.
+    """
     unit, time = trend.unit, "time" if trend.dated else "time [d]"
     levels = (f"level [{unit}]", f"low [{unit}]", f"high [{unit}]")
     with io.StringIO(newline="") as text:

@@ -225,9 +225,9 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    It is the shortest step that error control finds for the first seconds of a few runs of the set, and no longer
-    than any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients; `error`
-    [Pa]: allowed rms error of a pressure.
+    It is the shortest step that error control finds for the first seconds of a few runs of the set. It is also no
+    longer than any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients;
+    `error` [Pa]: allowed rms error of a pressure.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -263,7 +263,8 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
     def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
         """Simulate the set; return each leak's mean flow [m^3/s] per unit coefficient (runs,), and None.
 
-        The None stands for the further results that `size_leaks` passes on.
+        `coefficients` (runs,): leakage coefficients; a leak with the coefficient 0 is measured as if it were 1
+        under the pressures of the run. The None stands for the further results that `size_leaks` passes on.
         """
         flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)  # a unit leak where none acts yet
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))

@@ -26,23 +26,23 @@ _SQRT_2, _LN_2 = math.sqrt(2.0), math.log(2.0)
 
 
 def _integer_constant(value: int) -> Any:
-    """Make an LLVM constant with a 64-bit integer in every lane."""
+    """Make the LLVM constant of a vector that contains a 64-bit integer in every place."""
     return ir.Constant(_INTEGERS, [value] * WIDTH)
 
 
 def noise_keys(seeds: list[int]) -> Array:
     """Compute the 64-bit key of each run's noise from its seed, (runs,).
 
-    The bits are stored as doubles, so that they can be loaded as lanes.
+    The bits are stored as doubles, so that compiled code can load the keys of several runs as one vector.
     """
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 
 
 def uniform(key: Any, position: int) -> Any:
-    """Draw uniform random numbers in (0, 1], one for each lane, in compiled code.
+    """Draw uniform random numbers in (0, 1] for a vector of runs, in compiled code.
 
-    `key`: keys of the lanes (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
+    `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
     """
 
 
@@ -96,9 +96,10 @@ for _function, _arity, _build in (
 
 @contracted
 def logarithm(x: Any) -> Any:
-    """Compute ln x for lanes of normal numbers x > 0, with an error of 2e-15 (absolute near 1, else relative).
+    """Compute ln x for a vector of numbers x > 0, none of them subnormal.
 
     ln x = e ln 2 + 2 artanh((m - 1)/(m + 1)) with x = 2^e m and m in sqrt(1/2)..sqrt(2), by the series of artanh.
+    The error is 2e-15, absolute near 1 and relative elsewhere.
     """
     e, m = _exponent(x), _fraction(x)
     above_sqrt_2 = m > _SQRT_2
@@ -113,7 +114,7 @@ def logarithm(x: Any) -> Any:
 
 @contracted
 def half_turn_sine(v: Any) -> Any:
-    """Compute sin(pi v) for -1/2 <= v <= 1/2 to 5e-14, by Taylor's polynomial of degree 17."""
+    """Compute sin(pi v) for -1/2 <= v <= 1/2 with an error of 5e-14, by Taylor's polynomial of degree 17."""
     x = v * math.pi
     s = x * x
     q = s * s
@@ -124,7 +125,7 @@ def half_turn_sine(v: Any) -> Any:
 
 @contracted
 def normals(key: Any, pair: int) -> tuple[Any, Any]:
-    """Draw two independent standard normal random numbers for each lane, in compiled code.
+    """Draw two independent standard normal random numbers for each of a vector of runs, in compiled code.
 
     They are computed from the uniform numbers at positions 2 `pair` and 2 `pair` + 1 of the sequences that `key`
     selects (`uniform`). Source: Box and Muller, Annals of Mathematical Statistics 29 (1958) 610-611; cos 2a = 1 - 2

@@ -49,16 +49,17 @@ class Member:
 
     @property
     def leak(self) -> Leak:
-        """The leak of the experiment; a leak of coefficient 0 if it has none."""
+        """The leak of the experiment, or a leak with the coefficient 0 if the experiment has none."""
         leaks = self.experiment.leaks
         return leaks[0] if leaks else Leak("laminar", 0.0)
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """Sets of model parameters for which the solver's step must be short enough.
+        """Extreme values of the model's parameters in the run, each of which the solver's step must resolve.
 
-        The parameters may change within the run. The sets are the parameters without any change, and those just
-        before and after each fast change, such as the switching of a valve.
+        The parameters change during the run. A step that is short enough for each of these parameter sets is short
+        enough for the whole run. They are the parameters without any change, and those just before and just after
+        each fast change, such as the switching of a valve.
         """
         return step_limiting_parameters(self.effects, self.numbers)
 
@@ -77,7 +78,7 @@ class ExperimentSet:
 
 
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
-    """Raise InputError for an experiment that cannot be part of a batch.
+    """Raise InputError for an experiment that cannot be part of a batch, with the rule that it breaks.
 
     `row`: its index in the batch, for the message.
     """
@@ -116,7 +117,10 @@ class _ScaledCommand(NamedTuple):
 
 
 def _split_command(command: Command) -> _ScaledCommand:
-    """Split a command into gain, shape and offset; the shape of a command that is no sine is the command itself."""
+    """Split a command into gain, shape and offset, so that commands of equal shape can be simulated together.
+
+    The shape of a sine is the sine of amplitude 1. Any other command is its own shape, with gain 1 and offset 0.
+    """
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
         return _ScaledCommand(str(identity_values(shape)), shape, command.amplitude, command.offset)
@@ -163,7 +167,7 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
 
 
 def pack_lanes(values: Array, width: int) -> Array:
-    """Rearrange an array (runs, ...) by groups of `width` runs as (groups, ..., width), for vector registers.
+    """Rearrange an array (runs, ...) in groups of `width` runs, (groups, ..., width), for vector registers.
 
     If the last group is not full, copies of the last run fill it.
     """
@@ -179,12 +183,12 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 
 
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
-    """Build the leaks' parameters (runs, LEAK_ROWS) for the compiled laws (`physics.vector.runs`).
+    """Build the table (runs, LEAK_ROWS) of the leaks' parameters that the compiled model takes.
 
-    The columns are G and C that act in the run, start [s] and slope [1/s] of the opening, and G and C whose mean flow
-    is computed. `coefficients` (runs,) give the first two, `flow_coefficients` (runs,) the last two. They differ
-    while leaks are sized: a run without a leak then computes the flow that a unit leak would have under its
-    pressures.
+    The columns are: the coefficients G and C of the leak that acts in the run; start [s] and slope [1/s] of its
+    opening; G and C of the leak whose mean flow is computed. `coefficients` (runs,) give the first two,
+    `flow_coefficients` (runs,) the last two. They differ only while coefficients are searched for: a run in which
+    no leak acts yet then computes the flow that a leak of coefficient 1 would have under its pressures.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -213,9 +217,10 @@ class Cells:
     values: Array
 
     def table(self, first: int, last: int, width: int) -> Array:
-        """Build the parameters (groups, cells, parameters, width) in the cells first <= cell < last.
+        """Build the table of the model's parameters in the cells first <= cell < last, for compiled code.
 
-        `width`: number of runs in a group, the last axis.
+        A cell is a span of time within which the parameters are constant. Returns (groups, cells, parameters,
+        width), with `width` runs in a group.
         """
         table = np.repeat(self.base[:, None, :], last - first, axis=1)
         for k, parameter in enumerate(self.changing):
@@ -224,9 +229,10 @@ class Cells:
 
 
 def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
-    """Build the model parameters of a set of runs over time, in cells so short that no effect changes much in one.
+    """Compute the model's parameters over time for a set of runs.
 
-    `n_out`: number of outputs of the run, at `rate` [Hz].
+    Time is divided into cells in which the parameters are constant, so short that they change little from one cell
+    to the next. `n_out`: number of outputs of a run, at `rate` [Hz].
     """
     from sealscope.physics.rig import NUMBERS
 
@@ -255,9 +261,10 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 
 
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the parameters of the instruments of p_A and p_B, (runs, 2, INSTRUMENT_ROWS), for a span of samples.
+    """Build the table of the parameters of the instruments of p_A and p_B, for a span of samples.
 
-    Parameters that change are linear from sample `first` to sample `last`.
+    Returns (runs, 2, INSTRUMENT_ROWS), for compiled code. Parameters that change within the run are taken as linear
+    from sample `first` to sample `last`.
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -272,10 +279,10 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments of p_A and p_B between two times.
+    """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
 
-    `ends` (2,): the times [s]; `samples`: number of samples between them, over which changing parameters are taken as
-    linear; `readings`: changes of the instruments.
+    `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it, over which changing parameters
+    are taken as linear; `readings`: changes of the instruments. The rows are p_A and p_B.
     """
     from sealscope.simulation.batch import signals
 
@@ -332,9 +339,11 @@ class SetRun:
         flow_coefficients: Array,
         bounds: Array | None,
     ) -> None:
-        """Prepare the runs at standstill, to be integrated with a step of at most `step` [s].
+        """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
-        Raises SimulationFailed if this step cannot resolve one of the runs.
+        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those whose
+        mean flow is computed; `bounds` [s]: limits of the segments of the statistics, None to compute mean flows
+        only. Raises SimulationFailed if the step cannot resolve one of the runs.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -377,8 +386,8 @@ class SetRun:
     def _prepare_filters(self, rate: float) -> None:
         """Compute the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        Coefficient k multiplies the output k - `taps_before` outputs after the sample. `rate` [Hz]: rate of the
-        outputs.
+        Coefficient k multiplies the output that is k - `taps_before` outputs after the sample. `rate` [Hz]: rate of
+        the outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -393,10 +402,10 @@ class SetRun:
         self.taps = pack_lanes(filters, self.width)
 
     def _prepare_statistics(self, bounds: Array) -> None:
-        """Prepare the sums of squared wavelet details over the segments, and the keys of the runs' noise.
+        """Prepare empty sums of squared wavelet details over the segments, and the keys of the runs' noise.
 
-        The segments between `bounds` [s] are clipped to the samples that the wavelet's filters reach within the
-        record.
+        `bounds` [s]: limits of the segments. Samples near the ends of the record, where the wavelet's filters reach
+        beyond it, are left out.
         """
         from sealscope.signals.filters import reach
         from sealscope.simulation.batch.noise import noise_keys
@@ -410,15 +419,19 @@ class SetRun:
         self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Simulate all runs on `threads` threads (compiled code releases Python's lock).
+        """Simulate all runs of the set on `threads` threads.
 
-        `progress` is called with the completed fraction of the set.
+        `progress` is called with the completed fraction of the set. The threads run in parallel because compiled
+        code releases Python's lock.
         """
         cuts = np.unique(np.linspace(0, self.n_groups, min(threads, self.n_groups) + 1).round().astype(int)).tolist()
         lock, completed = threading.Lock(), 0.0
 
         def add_progress(fraction: float) -> None:
-            """Add `fraction` to the completed fraction of the set, and report the sum; called by all threads."""
+            """Add `fraction` to the completed fraction of the set of runs, and report the sum.
+
+            It is called by all threads.
+            """
             nonlocal completed
             if progress is not None:
                 with lock:
@@ -429,7 +442,10 @@ class SetRun:
             list(pool.map(lambda groups: self._run_groups(groups, add_progress), itertools.pairwise(cuts)))
 
     def _chunks(self) -> list[_Chunk]:
-        """Divide the run into chunks that are integrated at once: several whole cells, or a part of a long cell."""
+        """Divide the run into chunks, spans of time that are integrated by one call of compiled code.
+
+        A chunk covers several whole cells, which are spans of constant parameters, or a part of one long cell.
+        """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges = self.cells.bounds
         chunks = []
@@ -450,9 +466,11 @@ class SetRun:
         return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
 
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
-        """Simulate the groups groups[0] <= g < groups[1] of runs, chunk by chunk from standstill to the end.
+        """Simulate some groups of runs, chunk by chunk from standstill to the end.
 
-        The squared wavelet details of each chunk's readings are added to the sums.
+        The groups, each of which fills a vector register, are groups[0] <= g < groups[1]. The squared wavelet
+        details of each chunk's readings are added to the sums. `add_progress` is called with the fraction that each
+        chunk completes.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -496,10 +514,10 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command's shape [V], and the load [N] if any, at the nodes of the steps of a chunk.
+        """Compute the command's shape [V] and the load [N] at all times that the solver's steps in a chunk need.
 
-        The chunk has the outputs start <= output < stop. Returns (steps, nodes), or (steps, 2 nodes) with the load in
-        the last columns.
+        The chunk has the outputs start <= output < stop; each step needs the inputs at `nodes` times within it.
+        Returns (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load
@@ -509,9 +527,10 @@ class SetRun:
         )
 
     def _sensors(self, groups: tuple[int, int], first: int, last: int) -> Array:
-        """Build the instruments' parameters of some groups of runs for the samples from `first` to `last`.
+        """Build the parameters of the pressure instruments for some groups of runs and a span of samples.
 
-        Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups groups[0] <= g < groups[1].
+        The span is from sample `first` to sample `last`. Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups
+        groups[0] <= g < groups[1] of `width` runs.
         """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
@@ -520,9 +539,9 @@ class SetRun:
 
     @cached_property
     def _constant_sensors(self) -> Array | None:
-        """The instruments' parameters of all groups, or None if any of them change within a run.
+        """The parameters of the pressure instruments of all groups of runs, (groups, 2, INSTRUMENT_ROWS, width).
 
-        Their shape is (groups, 2, INSTRUMENT_ROWS, width).
+        None if any of them change within a run.
         """
         if any(member.experiment.readings().effects for member in self.experiment_set.members):
             return None
@@ -531,8 +550,8 @@ class SetRun:
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
 
-        Also raises it if a run fell below vacuum or hit an end stop that its step cannot resolve, unless the run may
-        be unresolved.
+        Also raises it if a run fell below vacuum or hit an end stop that its step cannot resolve, unless the
+        experiment allows unresolved runs.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.vector.runs import DIVERGED, MAX_TRAVEL, MIN_PRESSURE
@@ -576,7 +595,7 @@ class SetRun:
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute each leak's mean |Q_L| (runs,) [m^3/s] while open, referred to full opening.
+        """Compute each leak's mean |Q_L| (runs,) [m^3/s] while it is open, as if it were always fully open.
 
         The leaks have the coefficients `flow_coefficients`. The flow is 0 for a leak that never opens.
         """

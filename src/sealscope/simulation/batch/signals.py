@@ -29,11 +29,11 @@ INSTRUMENT_ROWS = 18
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressures [Pa] that analog-digital converters read in a group of runs.
+    """Compute the pressures [Pa] that are read back from analog-digital converters, for a group of runs at once.
 
-    The transducer saturates at its range, as in `instruments.digitize`. `pressure`: pressures before conversion [Pa];
-    `sensor`: table of the parameters of the instruments; `row`: index of the first of the `INSTRUMENT_ROWS` rows
-    for this channel.
+    The transducer saturates at its range, as in `instruments.digitize`. `pressure`: pressures before conversion
+    [Pa]; `sensor`: table of the parameters of the instruments; `row`: index of the first of the `INSTRUMENT_ROWS`
+    rows for this channel.
     """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
@@ -46,10 +46,10 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 
 @contracted
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
-    """Compute the mains hum [Pa] of a pressure channel at a sample, in each lane.
+    """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
-    `sensor`, `row`: parameters of the channel's instrument, see `convert_lanes`. The sine is computed as 2 sin a cos
-    a.
+    `sensor`, `row`: parameters of the channel's instrument, see `convert_lanes`. The sine is computed as 2 sin a
+    cos a, with the phase 2 a.
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
@@ -90,7 +90,8 @@ def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, su
     """Add the squared wavelet details of n samples, and the squares of d3 d4, to the sums of their segments.
 
     `details` (LEVELS, CHUNK, WIDTH): details of the samples from `first` on; `bounds` (segments + 1,): samples at
-    which the segments begin, and the end. Segment k has QUANTITIES rows of `sums`, from `sums_row` + k QUANTITIES on.
+    which the segments begin, and the end. The sums of segment k are QUANTITIES rows of `sums`, the first of which
+    is `sums_row` + k QUANTITIES.
     """
     for segment in range(bounds.size - 1):
         row = sums_row + segment * QUANTITIES
@@ -121,14 +122,18 @@ def add_reading_squares(
 ) -> None:
     """Compute the readings of p_A and p_B for some groups of runs, and add their squared wavelet details to `sums`.
 
-    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. `pressures` (groups, outputs, CHANNELS,
-    WIDTH): simulated pressures, `factor` outputs per sample; the anti-alias filter of sample `first` begins at output
-    `first_output`; `taps` (groups, CHANNELS, taps, WIDTH): coefficients of that filter; `sensors` (groups, CHANNELS,
-    INSTRUMENT_ROWS, WIDTH): instruments at sample `first`; `keys` (groups, WIDTH): noise keys; `drifts` (groups,
-    CHANNELS, WIDTH): offset drift so far [Pa], updated; `wavelet`: coefficients (taps, WIDTH) of its low-pass and
-    high-pass filters; `buffers` (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels,
-    updated; `bounds` (segments + 1,): samples at which the segments of the sums begin, and the end; `sums`: (groups,
-    CHANNELS, segments, QUANTITIES, WIDTH).
+    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. The arrays are:
+
+    `pressures` (groups, outputs, CHANNELS, WIDTH): simulated pressures, `factor` outputs per sample. The anti-alias
+    filter of sample `first` begins at output `first_output`.
+    `taps` (groups, CHANNELS, taps, WIDTH): coefficients of that filter.
+    `sensors` (groups, CHANNELS, INSTRUMENT_ROWS, WIDTH): parameters of the instruments at sample `first`.
+    `keys` (groups, WIDTH): keys of the runs' noise.
+    `drifts` (groups, CHANNELS, WIDTH): drift of the offset so far [Pa], updated.
+    `wavelet`: coefficients (taps, WIDTH) of the low-pass and of the high-pass filter.
+    `buffers` (groups, CHANNELS, LEVELS, history + CHUNK, WIDTH): inputs of the wavelet's levels, updated.
+    `bounds` (segments + 1,): samples at which the segments of the sums begin, and the end.
+    `sums` (groups, CHANNELS, segments, QUANTITIES, WIDTH): sums of the squared details, updated.
     """
     n_taps, stride, sum_rows = taps.shape[2], factor * CHANNELS, (bounds.size - 1) * QUANTITIES
     low, high = wavelet
@@ -169,8 +174,8 @@ def add_reading_squares(
 
 @kernel
 def sense_lanes(*run: Any) -> None:
-    """Add the squared wavelet details of the readings of some groups of runs to their sums, in compiled code.
+    """Read some groups of runs with their instruments, and add the squared wavelet details of the readings to sums.
 
-    The arguments are those of `add_reading_squares`.
+    This is `add_reading_squares` in compiled code, with the same arguments.
     """
     add_reading_squares(*run)

@@ -150,7 +150,10 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse a nuisance from an entry of a profile's file; raise InputError, which names it, if it breaks a rule."""
+    """Parse an entry of a profile's file as a nuisance, that is a difference between healthy machines.
+
+    Raises InputError, which names the entry, if it breaks a rule.
+    """
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)
@@ -159,7 +162,10 @@ def _parse_nuisance(table: Any) -> AnyNuisance:
 
 
 def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
-    """Convert a file's entry to a nuisance in SI units; raise InputError if its fields do not fit together."""
+    """Convert an entry of a profile's file to a nuisance (a difference between healthy machines) in SI units.
+
+    Raises InputError if the fields of the entry do not fit together.
+    """
     parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
@@ -190,9 +196,10 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 
 
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Convert the values of a file's entry to SI units; texts of a choice are returned as they are.
+    """Convert the possible values of a parameter in a profile's entry to SI units; texts are returned unchanged.
 
-    `choices`: texts that the parameter may have, () for a number. Raises InputError for a value that it cannot have.
+    `choices`: texts that the parameter may have, () for a number. Raises InputError for a value that it cannot
+    have.
     """
     values = entry.values or ()
     for value in values:
@@ -206,9 +213,10 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert the drift in a file's entry to SI units, or to a fraction of the parameter for a relative drift.
+    """Convert the drift in a profile's entry to SI units.
 
-    Raises InputError for a drift that the parameters cannot have.
+    The size of a relative drift becomes a fraction of the parameter. Raises InputError for a drift that the
+    parameters cannot have.
     """
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
@@ -224,7 +232,7 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
 
 
 def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ...]:
-    """Check that no two nuisances share a parameter or a name, and return them.
+    """Check that no two nuisances (differences between machines) share a parameter or a name, and return them.
 
     Raises InputError otherwise.
     """
@@ -294,7 +302,7 @@ class Profile:
     def of_family(self, name: str) -> Profile:
         """Build the profile of one family's machines from this profile.
 
-        The family's nuisances and duty replace those of this profile.
+        The nuisances (differences between machines) and the duty of the family replace those of this profile.
         """
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
@@ -304,7 +312,11 @@ class Profile:
 def _replace_nuisances(
     nuisances: tuple[AnyNuisance, ...], replacing: tuple[AnyNuisance, ...]
 ) -> tuple[AnyNuisance, ...]:
-    """Return `nuisances` without the parameters that `replacing` draws, followed by `replacing`."""
+    """Return the nuisances of a profile with some of them replaced.
+
+    A nuisance is a difference between healthy machines. The parameters that `replacing` draws are removed from
+    `nuisances`, and then `replacing` is appended.
+    """
     replaced_parameters = {parameter for nuisance in replacing for parameter in nuisance.parameters}
     remaining: list[AnyNuisance] = []
     for nuisance in nuisances:
@@ -319,9 +331,10 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Read a packaged profile by its name, or a TOML file laid out like `profiles/bench.toml`.
+    """Read a profile, which describes how healthy machines differ from each other.
 
-    Raises InputError if the file cannot be read, a name or unit is unknown, a range is empty or a reason is missing.
+    `name_or_path`: name of a packaged profile, or path of a TOML file laid out like `profiles/bench.toml`. Raises
+    InputError if the file cannot be read, a name or unit is unknown, a range is empty or a reason is missing.
     """
     text = os.fspath(name_or_path)
     if text in profile_names():
@@ -348,9 +361,11 @@ class _File(BaseModel):
 
 
 def _read_profile(path: Path, place: str) -> Profile:
-    """Read a profile from its TOML file, merged with the profile that it extends if it names one.
+    """Read a profile of machines from its TOML file.
 
-    `place` names the file in messages. Raises InputError if the file breaks a rule.
+    If the file names a profile that it extends, it inherits the nuisances of that profile, and its duty unless it
+    states one, but not its families. `place` names the file in messages. Raises InputError if the file breaks a
+    rule.
     """
     tree = read_toml(path, "a profile", place)
     try:

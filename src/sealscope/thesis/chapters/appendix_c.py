@@ -21,9 +21,11 @@ def _percent_change(pairs: Array) -> Array:
 
 
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
-    """Tabulate one chamber's simulated and measured RMS as the thesis does: without leak, with leak, change [%].
+    """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis.
 
-    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given.
+    A detail has six columns: RMS without the leak, RMS with it, and the change [%], simulated and then measured.
+    `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, for which the cells are empty;
+    `chamber`: "p_A" or "p_B"; `item`: item of the reproduction to which the table belongs.
     """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -71,7 +73,8 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate how well the simulated data sheet agrees with the measured one.
 
-    The first table compares the sheets, two more show both in the form of the thesis's tables.
+    The first table compares the sheets (`compare_sheets`). The other two list both sheets, a table for each chamber,
+    in the form of the thesis.
     """
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
@@ -80,9 +83,10 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw how much a leak changes the RMS of a wavelet detail, over the mean leak of each test.
+    """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
 
-    The figure shows the change measured, simulated, and simulated without a leak; the item names chamber and detail.
+    The points are the measured change, the simulated change, and the change simulated without a leak. One panel shows
+    it in the unit of the RMS, the other in %. The item names chamber and detail.
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

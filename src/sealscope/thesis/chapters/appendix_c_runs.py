@@ -38,10 +38,11 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw at random how the rig's parameters step at half time of a test that simulates drift.
+    """Draw random steps of the rig's parameters at half time, for a test that simulates drift.
 
-    The relative sizes are uniform in the ranges of `cases.toml`, the signs random, and all are independent. `number`:
-    number of the test; `half`: half time [s]; `draw`: index of the draw, which is part of the seed.
+    Each entry `drifts` of `cases.toml` lists parameters and a range of relative sizes. One size is drawn uniformly
+    from this range, with a random sign, and all parameters of the entry step by it. `number`: number of the test;
+    `half`: half time [s]; `draw`: index of the draw. Number and index are part of the seed.
     """
     rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
@@ -56,10 +57,10 @@ def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift
 def leak_test(
     condition: Condition, half: float, seed: int, *, leak: bool = True, drifts: tuple[ParameterDrift, ...] = ()
 ) -> Experiment:
-    """Build the experiment of a test of Appendix C on the rig fitted to it, with the test's leak in the second half.
+    """Build the experiment of one test of Appendix C, on the rig that was fitted to these tests.
 
-    `half`: half the duration [s]; `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of
-    parameters.
+    The leak of the test is open in the second half. `condition`: inputs of the test; `half`: half the duration [s];
+    `seed`: seed of the noise; `leak`: False for no leak; `drifts`: steps of parameters (`draw_drifts`).
     """
     return Experiment.of(
         rig=BENCH_RIG,
@@ -73,10 +74,11 @@ def leak_test(
 
 
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
-    """Build the experiments of all tests of Appendix C with what `kind` names: a leak, no change, or drift.
+    """Build the experiments of all tests of Appendix C, as pairs (inputs of the test, experiment).
 
-    `half`: half the duration [s]. With drift each test is built twice, with two draws of the drift, or once if
-    `quick`.
+    `kind`: what changes at half time, "leak" (the leak opens), "no-leak" (nothing) or "drift" (parameters of the rig
+    step, without a leak); `half`: half the duration [s]. With drift each test occurs twice, with two random draws of
+    the steps, or once if `quick`.
     """
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
@@ -101,8 +103,9 @@ def _describe_change(experiment: Experiment) -> str:
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
     """Compute the RMS of the wavelet details of both chamber pressures in each part (from, to) [s] of a recording.
 
-    Returns those of d1..d4 [psi] and d3d4 [psi^2] by chamber and detail, one for each part. A part is narrowed by the
-    reach of the wavelet's filters, so that no detail depends on samples outside of it.
+    Returns, by chamber and detail, a tuple with one RMS for each part: of d1..d4 [psi], and of the product d3d4
+    [psi^2]. Each part is shortened at both ends by the reach of the wavelet's filters, so that no detail depends on
+    samples outside of it.
     """
     before, after = reach("db8", 4)[-1]
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -137,7 +140,9 @@ def make_row(
 ) -> tuple[Cell, ...]:
     """Build the row of a test in a table with the columns `COLUMNS`.
 
-    `change`: description of what changes at half time; `ranges_MPa`: range of p_A and of p_B without a leak.
+    `condition`: inputs of the test; `change`: description of what changes at half time; `mean_leak_lpm`: mean leak
+    [L/min]; `ranges_MPa`: range of p_A and of p_B without a leak; `rms`: RMS of each wavelet detail before and after
+    half time, by chamber and detail.
     """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
@@ -156,10 +161,11 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 
 
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Simulate and tabulate the 41 tests of Appendix C; the item names what changes at half time.
+    """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details before and after half time.
 
-    That is the opening of the leak, nothing, or a step of the rig's parameters (drift). With the leak, the first test
-    of each operating condition is checked by halving the solver's step, except in a quick reproduction.
+    The item names what changes at half time: the leak opens, nothing, or parameters of the rig step (drift). With the
+    leak, the first test of each operating condition is repeated with half the solver's step, except in a quick
+    reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows, proved = [], dict[tuple[str, float], bool | None]()  # condition -> whether its proved run is resolved

@@ -286,9 +286,10 @@ def _width(t: Array, values: Array) -> float:
 
 
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the wavelet transform of a simulated chamber pressure p_A, which rings, before and with a leak.
+    """Draw the wavelet transform of a simulated, ringing chamber pressure p_A without and with a leak.
 
-    The transform is that of eqs. (3.4)-(3.6), of p_A as recorded and without the instruments' noise.
+    The transform is that of eqs. (3.4)-(3.6). It is drawn of p_A as recorded, and of p_A without the instruments'
+    noise.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t

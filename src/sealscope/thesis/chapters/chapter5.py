@@ -55,12 +55,12 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C with this command and level of the leak; the printed test is one of them."""
+        """The tests of Appendix C with the command and leak level of this test of chapter 5, which is one of them."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
     def condition(self) -> Condition:
-        """The test of Appendix C that this test is taken to be, which the thesis does not say.
+        """The test of Appendix C for which this test of chapter 5 is taken; the thesis does not name it.
 
         It is the candidate whose mean leak is nearest to the level's nominal leak (section 5.1).
         """
@@ -130,7 +130,7 @@ class FigureView:
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""
+        """Return (mask, label) of the part of the test without the leak, after the start-up, and of that with it."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
 

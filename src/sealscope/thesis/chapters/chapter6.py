@@ -67,7 +67,10 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under the load `LOAD`."""
+    """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
+
+    The pressure difference is the load over the piston's area A_A.
+    """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
@@ -92,11 +95,11 @@ def supply_flow(run: Trajectory) -> Array:
 
 @dataclass(frozen=True)
 class ControlledRig:
-    """A rig whose piston a controller positions, with a leak that passes `lpm` [L/min] under the load `LOAD`.
+    """A rig whose piston a controller positions, with a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
     The rig's parameters differ from those that the controller assumes (`PLANT_MISMATCH`). `controller`: name of the
     controller, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `rig`: name of the rig;
-    `values`: further parameters.
+    `values`: further parameters, as pairs (name, value).
     """
 
     controller: str
@@ -105,9 +108,9 @@ class ControlledRig:
     values: tuple[tuple[str, float], ...] = ()
 
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
-        """Simulate the rig for `duration` [s] under the load `LOAD` plus `load`.
+        """Simulate the controlled rig for `duration` [s] under the load `LOAD` (2 kN) plus `load`.
 
-        `command`: text of a position target or, in an open loop, of a voltage command.
+        `command`: text of a position target or, in an open loop, of a voltage command; `load`: text of a force.
         """
         rig = _rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
@@ -167,11 +170,11 @@ class ControlledRig:
         return float(frequencies[k - 1] * (frequencies[k] / frequencies[k - 1]) ** fraction)
 
     def efficiencies(self) -> tuple[float, float]:
-        """Compute the electrical and the hydraulic efficiency on the duty with a damper as the only load.
+        """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        They are the damper's work over the electrical energy of the motor, and over the hydraulic energy delivered.
-        The latter is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the
-        supply's pressure.
+        They are the damper's work over the electrical energy of the motor, and over the hydraulic energy. The latter
+        is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the supply's
+        pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
@@ -182,10 +185,10 @@ class ControlledRig:
 
 
 class Tracking(NamedTuple):
-    """Result of a run on the duty: rms error of the position, energy, and compensated leakage.
+    """Result of a run in which the piston follows a sine of the position (`DUTY`).
 
-    `energy_J`: electrical energy of the motor in a cycle; `compensated_lpm`: mean leakage flow that the controller
-    compensates.
+    `error_mm`: rms error of the position; `energy_J`: electrical energy of the motor in a cycle; `compensated_lpm`:
+    mean leakage flow [L/min] that the controller compensates.
     """
 
     error_mm: float
@@ -194,9 +197,10 @@ class Tracking(NamedTuple):
 
 
 def tracking(run: Trajectory, mask: Array) -> Tracking:
-    """Compute error, energy and compensated leakage of a run on the duty, over the whole cycles that a mask selects.
+    """Compute the tracking error, energy and compensated leakage of a run that follows the position sine `DUTY`.
 
-    The compensated flow is 0 if the controller reports none.
+    `mask`: samples of whole cycles of the sine, which are evaluated. The compensated flow is 0 if the controller
+    reports none.
     """
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
@@ -277,7 +281,10 @@ def load_head(controller: str, lpm: float, quantity: str) -> str:
 
 
 def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate tracking error and energy on the duty over the load, for three controllers without and with a leak."""
+    """Tabulate tracking error and energy over the load, for three controllers without and with a leak.
+
+    The piston follows a sine of the position (`DUTY`).
+    """
     loops = [ControlledRig(name, lpm) for name in LOAD_CONTROLLERS for lpm in (0.0, 0.05)]
     heads = ["load [N]"]
     for loop in loops:
@@ -292,7 +299,7 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column is the change of the lower chamber pressure from the third to the fifth cycle.
+    The last column is the change [kPa] of the lower of both chamber pressures from the third to the fifth cycle.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}

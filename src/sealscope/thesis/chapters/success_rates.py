@@ -27,10 +27,11 @@ _Row = tuple[Cell, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of Table 5.1: it fires in a test if the RMS of all its wavelet details moves as a leak should move it.
+    """A rule of Table 5.1, by which the RMS of some wavelet details indicates a leak.
 
-    That is down for p_A and up for p_B (`DIRECTION`). `details`: (chamber, detail) pairs; `printed`: rates [%] in the
-    thesis, empty for a rule that it does not claim.
+    It fires in a test if, with the leak, the RMS of all its details of p_A fall and those of p_B rise (`DIRECTION`).
+    `details`: (chamber, detail) pairs; `printed`: success rates [%] in the thesis, "" for a rule that it does not
+    claim.
     """
 
     name: str
@@ -67,9 +68,10 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of the four columns of `_format_count`.
+    """Build the column heads of the four cells in which a table states a count.
 
-    `source`: name of the sheet, with which each head begins; `count`: name of the first column.
+    They are the count, the rate [%], and both limits of its 95 % interval [%]. `source`: name of the data sheet, with
+    which each head begins; `count`: name of the first column.
     """
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
@@ -90,10 +92,10 @@ THRESHOLDS = (
 
 
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count how often each rule of Table 5.1 fires, as rows with the columns `RATES`.
+    """Count in how many tests each rule of Table 5.1 fires, as rows with the columns `RATES`.
 
     The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
-    leak but with drifting parameters. The last two rows are rules that always and never fire.
+    leak but with drifting parameters. Two more rows are for a rule that always fires and one that never does.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -110,10 +112,11 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 
 
 def column_tests(sheet: DataSheet) -> list[_Row]:
-    """Test each column of a data sheet for a change with the leak, by a sign test.
+    """Test each column of a data sheet, a chamber's wavelet detail, for a change with the leak by a sign test.
 
-    Returns rows with the columns `TESTS` except the first, the source. Holm's correction covers all ten columns,
-    since Table 5.1 chose among them.
+    Returns rows of chamber, detail, number of tests with a fall and with a rise, geometric mean of the change [%],
+    p-value, corrected p-value, and "yes" if the latter is below 0.05, else "no". Holm's correction covers all ten
+    columns, since Table 5.1 chose among them.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -139,8 +142,8 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
     """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    `drift`: the sheet of tests simulated with drifting parameters and no leak. Only changes in the direction in which
-    a leak moves the chamber (`DIRECTION`) count as positive.
+    `drift`: the sheet of tests simulated with drifting parameters and no leak. A change counts as positive in the
+    direction in which a leak should move the RMS, down for p_A and up for p_B (`DIRECTION`).
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 

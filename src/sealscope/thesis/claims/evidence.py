@@ -78,8 +78,9 @@ SheetTest = Callable[[DataSheet], Iterable[Finding]]
 class SheetClaim:
     """A claim that is tested on a data sheet, measured or simulated.
 
-    `test`: yields the findings on a sheet; `head`, `separator`: text before and between the texts of the findings;
-    `values`: computes the values of placeholders in the claim's other texts.
+    `test`: yields the findings on a sheet, each a text and a True or False for each part of the claim; `head`,
+    `separator`: text before and between the texts of the findings; `values`: computes the values of placeholders in
+    the claim's other texts.
     """
 
     test: SheetTest
@@ -95,7 +96,7 @@ class SheetClaim:
         """
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
-            """Return the text of all findings on a sheet, and which parts of the claim are true."""
+            """Return the text of all findings on a sheet, and True or False for each part of the claim."""
             texts, parts = zip(*self.test(sheet), strict=True)
             return self.head + self.separator.join(texts), list(itertools.chain.from_iterable(parts))
 
@@ -112,7 +113,7 @@ def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
 
 
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format how many of the tests are true, as `k/n = rate % (low to high %)` with the exact 95 % interval."""
+    """Format the number of tests that passed, as `k/n = rate % (low to high %)` with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"

@@ -71,7 +71,10 @@ def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
 
 
 def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim that a rule of Table 5.1 has its printed success rate; `where`: its place in the thesis."""
+    """Build the claim that a rule of Table 5.1 has its printed success rate.
+
+    `where`: place of the claim in the thesis, such as "Fig. 5.90".
+    """
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
@@ -154,9 +157,10 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 6.1.1: the product d3d4 moves in both chambers for leaks from 0.0048 L/min on.
+    """Test claim 6.1.1: for leaks from 0.0048 L/min on, the RMS of d3d4 falls in p_A and rises in p_B.
 
-    The smallest leak with this result must be 0.0048 L/min, and more than 80 % of all tests must have it.
+    The smallest leak for which this is the case must be 0.0048 L/min, and it must be the case in more than 80 % of
+    the tests.
     """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
     min_leak = float(leak[fires].min()) if fires.any() else math.nan
@@ -165,7 +169,11 @@ def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim a.1: in each chamber the best detail changes beyond the noise in at least 80 % of the tests."""
+    """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
+
+    It reveals the leak if its RMS changes by more than the noise, down in p_A and up in p_B. The best detail is the
+    one that does so most often.
+    """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
         exceeds = _exceeds_noise(sheet, chamber, best)
@@ -189,9 +197,10 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 
 
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format results on the fall of d3 of p_A for the texts of claim 5.6.1.
+    """Format two results on the rule that d3 of p_A falls, for the texts of claim 5.6.1.
 
-    They are the false alarms of the rule in simulation, and how often d3 falls beyond the noise on the sheet.
+    They are the rule's false alarms in simulation, and the rate of tests on the sheet in which d3 falls by more than
+    the noise.
     """
     rate_beyond_noise = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
     return {"controls": _format_controls(evidence, _A_D3), "finds": rate_beyond_noise}
@@ -340,10 +349,10 @@ def leak_level_claims() -> Iterator[Claim]:
 def _test_rows(
     sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test in the data sheet's row of a printed test whether wavelet details change by more than the noise.
+    """Test that wavelet details change by more than the noise in the row of the data sheet of a test of chapter 5.
 
-    `names`: the details; `statement`: "fall" or "change", as the thesis says. Returns a text, and a result for each
-    detail. If several rows can be the printed test, the text also counts those with a change beyond the noise.
+    `names`: the details; `statement`: "fall" or "change", as the thesis says. Returns a text, and True or False for
+    each detail. If several rows can be the printed test, the text also counts those with a change beyond the noise.
     """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}

@@ -69,7 +69,7 @@ class ItemRow:
     trace: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the row to plain values that JSON can store."""
+        """Convert the stored result of an item to a dict of plain values, which JSON can store."""
         return asdict(self)
 
 
@@ -116,7 +116,7 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the job of each item in `ready`, i.e. of items that depend on no unfinished item.
+            """Yield the job of each item in `ready`, the ids of items whose needed items are all finished.
 
             A job consists of the item, the key of its inputs, and the products of the items it needs. When a job is
             requested, its item is reported as in work.
@@ -178,9 +178,10 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 
 
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Build the stored row of an item from JSON values; return None if it was made from other inputs.
+    """Build the stored result of an item from JSON values; return None if it was made from other inputs.
 
-    `keys`: present digest of each item's inputs. Raises ValueError if the values are no row.
+    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are not those of a
+    result.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")
@@ -212,7 +213,12 @@ def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> G
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make one item and write its files; return its row, with the error if an exception was raised."""
+    """Make one item and write its files; return the result to be stored, with the error if an exception was raised.
+
+    `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the products as
+    files, None to write none; `folder`: folder of the results; `runs`: folder of simulated runs; `job`: the item, the
+    key of its inputs, and the products of the items it needs.
+    """
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)
     try:

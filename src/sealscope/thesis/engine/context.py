@@ -50,7 +50,7 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    `prove`: True to test the run with half the solver's step.
+    `prove`: True to repeat the run with half the solver's step and compare both.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -81,8 +81,8 @@ class Context:
     def run(self, experiment: Experiment, *, prove: bool = True) -> SimulatedRun:
         """Simulate an experiment, or load its run if another item of this reproduction has simulated it.
 
-        `prove`: True to test the run with half the solver's step. Other processes that ask for the same run wait for
-        it.
+        `prove`: True to repeat the run with half the solver's step and compare both. Other processes that ask for the
+        same run wait for it.
         """
         path = self.runs / f"{experiment.key()}{'-proved' if prove else ''}.run"
         with lock_file(path.with_suffix(".lock"), None):
@@ -93,9 +93,9 @@ class Context:
         return run
 
     def product(self, name: str) -> Products:
-        """Return the products of a needed item; () if that item was left out.
+        """Return the products of the needed item `name`; () if that item was left out.
 
-        Raises InputError if the item failed, or if it is not among this item's needs.
+        Raises InputError if that item failed, or if the item to be made does not name it among its needs.
         """
         if name not in self.needs:
             raise InputError(f"{self.name} must name {name} among its needs to ask for its products")

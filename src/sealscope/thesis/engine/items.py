@@ -49,7 +49,8 @@ class Item:
     ) -> Figure:
         """Build the figure of this item, with its id, title and claims.
 
-        `numbers`: numbers reported with the figure; `resolved`: see `Figure`.
+        `numbers`: numbers reported with the figure; `resolved`: True if all its runs passed the test with half the
+        solver's step, False if one did not, None if nothing was tested.
         """
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
@@ -65,8 +66,8 @@ class Item:
     ) -> ThesisTable:
         """Build a table of this item, with its claims.
 
-        `tail` is appended to the item's id; `title` and `columns` replace the item's if stated; `resolved`: see
-        `ThesisTable`.
+        `tail` is appended to the item's id; `title` and `columns` replace the item's if stated; `resolved`: True if
+        all its runs passed the test with half the solver's step, False if one did not, None if nothing was tested.
         """
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title

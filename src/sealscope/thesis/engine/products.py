@@ -25,7 +25,7 @@ Values = Annotated[Array, PlainValidator(np.asarray)]
 class FigureCurve:
     """One series of points (x, y) in a panel of a figure, in the panel's units.
 
-    `role`: meaning of the curve, which determines its line style; `kind`: how it is drawn.
+    `role`: meaning of the curve, which determines its line style; `kind`: drawn as a line, as points or as stems.
     """
 
     x: Values
@@ -97,8 +97,9 @@ class Figure:
 class ThesisTable:
     """A table that reproduces one of the thesis, or summarises results.
 
-    `columns`: heads, with units in brackets; `rows`: texts and numbers, None for an empty cell; `claims`, `resolved`:
-    as of a `Figure`.
+    `columns`: heads, with units in brackets; `rows`: texts and numbers, None for an empty cell; `claims`: ids of
+    claims that it supports or refutes; `resolved`: True if all its simulated runs passed the test with half the
+    solver's step, False if one did not, None if nothing was tested.
     """
 
     id: str

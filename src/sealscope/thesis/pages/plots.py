@@ -219,7 +219,7 @@ def _use_plain_numbers(axis: Axis) -> None:
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
     """Select the points (x, y) of a curve that are drawn.
 
-    Of a long curve these are the points in `x_range` and one on each side, all if `x_range` is None; a line is then
+    A long curve is cut to `x_range` plus one point on each side, or not cut if `x_range` is None. A line is then
     thinned to about `_MAX_POINTS` points.
     """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
@@ -258,9 +258,9 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
 
 
 def _has_shared_legend(panels: Sequence[Panel]) -> bool:
-    """Return True if a figure has one legend for all panels.
+    """Return True if one legend serves all panels of a figure.
 
-    That is if there are several panels with the same curves, several of them, whose labels fit on one line.
+    It does if there are several panels, all with the same two or more curves, and if the labels fit on one line.
     """
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
     labels = [curve.label for curve in panels[0].curves] if panels else []

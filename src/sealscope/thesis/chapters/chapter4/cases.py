@@ -131,9 +131,11 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build the long experiment, with the command of section 4.3, in which the drift of the piston is measured.
+    """Build the long experiment in which the drift of the piston is measured, with the command of section 4.3.
 
-    The arguments are those of `make_experiment`.
+    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: reading of the thesis's equations of
+    the throttles; `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that replace the
+    reading's.
     """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
@@ -144,28 +146,29 @@ def run_both_solvers(
 ) -> Runs:
     """Simulate a command with the thesis's solver and with a converged one; return both runs by solver.
 
-    `closed_pct`, `reading`: as in `make_experiment`.
+    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: reading of the thesis's equations of
+    the throttles.
     """
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
 def all_resolved(runs: Runs) -> bool:
-    """Return True if all runs passed the test with half the solver's step."""
+    """Return True if all runs changed little when the solver's step was halved."""
     return all(run.resolved for run in runs.values())
 
 
 def completed_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
-    """List the runs of a case that did not diverge, as (solver, label in legends, run)."""
+    """List the runs that did not diverge, as (solver, the solver's label in legends, run)."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 
 def steady_mask(run: SimulatedRun) -> np.ndarray:
-    """Return the mask (n,) of the samples of a run within its steady part, the interval `STEADY`."""
+    """Return the mask (n,) of the samples of a run within its steady part, from pi to 2 pi seconds (`STEADY`)."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
 def steady_output(run: SimulatedRun, name: str) -> Array:
-    """Return the values of an output in the steady part of a run, the interval `STEADY`.
+    """Return the values of an output in the steady part of a run, from pi to 2 pi seconds (`STEADY`).
 
     Returns a single nan if the run diverged.
     """
@@ -173,7 +176,7 @@ def steady_output(run: SimulatedRun, name: str) -> Array:
 
 
 def steady_range(run: SimulatedRun, name: str) -> float:
-    """Compute the maximum minus the minimum of an output in the steady part of a run, the interval `STEADY`."""
+    """Compute the maximum minus the minimum of an output from pi to 2 pi seconds of a run (`STEADY`)."""
     return float(np.ptp(steady_output(run, name)))
 
 
@@ -201,7 +204,7 @@ def summarise_run(run: SimulatedRun) -> dict[str, float]:
 
 
 def piston_drift(run: SimulatedRun) -> float:
-    """Compute the drift [m] of the piston in a run: its mean position in the last whole period minus the first.
+    """Compute the drift [m] of the piston: its mean position in the last whole period of the command minus the first.
 
     It is nan if the run diverged.
     """

@@ -174,10 +174,11 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` by the converged runs under both readings of the equations.
+    """Judge claim 4.`number` of the thesis by converged runs under both readings of the throttles' equations.
 
-    The results of both solvers are stated. `numbers`: results of the runs by solver and reading; `test`: tests the
-    results of one reading; `format_numbers`: formats the results of all readings.
+    The claim's text states the results of both solvers. `numbers`: results of the runs by solver and reading; `test`:
+    yields the outcomes of the tests on the results of one reading; `format_numbers`: formats the results of all
+    readings.
     """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
@@ -199,7 +200,8 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the range [kPa] of some numbers over all readings of the equations.
 
-    `head`: text before the range; `values`: takes these numbers [Pa] from the rows of one reading.
+    `head`: text before the range; `values`: computes these numbers [Pa] from the summaries of the runs of one reading
+    (`summarise_run`).
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
@@ -217,7 +219,7 @@ def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> li
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
     """Simulate some cases, given as (command, closing [%]), under both readings and with both solvers.
 
-    Returns a summary of each run (`summarise_run`) by solver and reading.
+    Returns, by solver and reading, a list with the summary of each case's run (`summarise_run`).
     """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
@@ -263,21 +265,27 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
 
     def range_changes_to_last(rows: Rows) -> list[float]:
-        """Compute the changes of all pressures' ranges [Pa] from the first row to the last."""
+        """Compute the changes of all pressures' ranges [Pa] from the first run to the last.
+
+        `rows`: summaries of the runs.
+        """
         return _changes([rows[0], rows[-1]], "range")
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Test for each pressure that its range grows with the closing, and visibly so from 25 to 75 % closed."""
+        """Yield for each pressure True if its range grows with the closing, and visibly so from 25 to 75 % closed."""
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
     def chamber_peak_changes(rows: Rows) -> list[float]:
-        """Compute the changes of the chamber pressures' peaks [Pa] from the first row to each later row."""
+        """Compute the changes of the chamber pressures' peaks [Pa] from the first run to each later one.
+
+        `rows`: summaries of the runs.
+        """
         return _changes(rows, "peak", CHAMBERS)
 
     def largest_drops(rows: Rows) -> list[float]:
-        """List the largest pressure drop [Pa] at the orifices in each row."""
+        """List the largest pressure drop [Pa] at the orifices in each run; `rows`: summaries of the runs."""
         return [row["largest drop"] for row in rows]
 
     changes = _range_text(f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges", range_changes_to_last)
@@ -305,7 +313,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     }
 
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build the function that formats the drift that orifices add at each closing.
+        """Build a function that formats the piston's additional drift with orifices, at each closing.
 
         It states the range over both readings of the equations; `head`: text before it.
         """
@@ -319,11 +327,17 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Test at each closing that the drift differs from that without orifices."""
+        """Yield for each closing True if the piston's drift differs from that without orifices.
+
+        `row`: the drift [m] at each closing.
+        """
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Test that the drift is larger at each closing than at the one before."""
+        """Yield for each closing but the first True if the piston drifts more than at the closing before.
+
+        `row`: the drift [m] at each closing.
+        """
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 
     head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"
@@ -343,7 +357,10 @@ _HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 
 
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
-    """Judge the claims of chapter 4, and tabulate the numbers of one command by reading, solver and closing."""
+    """Judge the claims of chapter 4, and tabulate summaries of the runs with one command.
+
+    The table has a row for each reading of the throttles' equations, solver and closing of the orifices.
+    """
     without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
     with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)
     judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]

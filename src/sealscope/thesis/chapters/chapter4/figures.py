@@ -65,9 +65,10 @@ def item_reading(item: Item) -> Reading:
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Simulate the case of Table 4.2 or 4.3 that an item shows, with both solvers.
+    """Simulate a case of Table 4.2 or 4.3 with the thesis's solver and with a converged one.
 
-    Returns the runs by solver, and the notes on them.
+    The item names the case, and may name a reading of the throttles' equations. Returns the runs by solver, and the
+    notes for the figure or table.
     """
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
@@ -103,14 +104,14 @@ def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureC
 
 
 def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of an output as a few marks, for one that coincides with another curve."""
+    """Build the curve of an output as a few marks, below which another curve with the same values stays visible."""
     thinned = slice(None, None, max(1, run.t.size // _N_MARKS))
     values = run.outputs[name][thinned] * FIGURE_UNITS[name].scale
     return FigureCurve(run.t[thinned], values, f"{label} (the same)", role, "points")
 
 
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
-    """Build the curves of an output with both solvers.
+    """Build the curves of an output over time, one for each solver whose run did not diverge.
 
     If they coincide, that of the thesis's solver is drawn as a few marks.
     """
@@ -123,16 +124,19 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 
 
 def _rms_difference(runs: Runs, name: str) -> float:
-    """Compute the rms difference of an output between the runs with both solvers, in the figures' unit.
+    """Compute the rms difference of an output between the runs with the thesis's solver and with a converged one.
 
-    It is computed over the steady part of the runs; nan if one of them diverged.
+    It is in the figures' unit, and computed over the steady part of the runs; nan if one of them diverged.
     """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
 
 
 def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate minimum, maximum and standard deviation of each quantity in a case, with both solvers."""
+    """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3.
+
+    The case is simulated with the thesis's solver and with a converged one.
+    """
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []
     for name in list(FIGURE_UNITS)[1:]:  # without the command
@@ -148,7 +152,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the quantities that the item names over time, each with both solvers."""
+    """Draw the quantities that the item names over time, each with the thesis's solver and with a converged one."""
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
     t = runs["converged"].t
@@ -167,7 +171,10 @@ def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the pressures on both sides of an orifice and their difference, with both solvers (Figs. 4.13, 4.14)."""
+    """Draw the pressures on both sides of an orifice and their difference over time (Figs. 4.13, 4.14).
+
+    The case is simulated with the thesis's solver and with a converged one.
+    """
     runs, notes = _run_case(context, item)
     pump, chamber = item.inputs["quantities"]
     panels, differences, numbers = [], [], []
@@ -198,10 +205,10 @@ def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureC
 def _sweep_curves(
     template: str, sweep: Mapping[float, Runs], measure: Callable[[SimulatedRun], float], solvers: Sequence[Solver]
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
-    """Build the curve of a measure over a varied parameter for each solver, and list its points as numbers [MPa].
+    """Build a curve of a measure over a varied parameter for each solver, and list the curves' points as numbers.
 
-    `sweep`: runs by value of the parameter; `measure`: computes the measure [Pa] of a run; `template`: name of a
-    number, with a placeholder for the parameter's value.
+    Both are in MPa. `sweep`: runs by value of the parameter; `measure`: computes the measure [Pa] of a run;
+    `template`: name of a number, with a placeholder for the parameter's value.
     """
     curves, numbers = [], []
     for solver in solvers:
@@ -215,7 +222,7 @@ def _sweep_curves(
 def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one pressure with orifices that are 25, 50 and 75 % closed, and its range over the closing.
 
-    Both are drawn with both solvers; the item names the pressure.
+    Both are drawn with the thesis's solver and with a converged one; the item names the pressure.
     """
     name, reading = item.inputs["quantity"], item_reading(item)
     sweep = {closed: run_both_solvers(context, COMMAND, closed, reading) for closed in CLOSINGS}
@@ -256,6 +263,9 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the figures of chapter 4 that show only measured curves, and the simulated figures in their place."""
+    """Tabulate the figures of chapter 4 that show only measured curves.
+
+    Each row names such a figure, its content, and the simulated figure that replaces it.
+    """
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)
