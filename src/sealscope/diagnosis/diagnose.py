@@ -97,9 +97,10 @@ class Examination:
         return replace(self, recording=recording, baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Return the report of the detector called `name`, which runs at the first call only.
+        """Run the detector called `name` on the recording, and return its observations.
 
-        Raises KeyError if no detector of this name is registered.
+        Later calls return the same result without running the detector again. Raises KeyError if no detector of this
+        name is registered.
         """
         if name not in self._reports:
             rig = load_rig(self.rig)
@@ -113,29 +114,28 @@ class Examination:
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Distribution of each detector's statistics in the healthy recordings, without a leak.
+        """Scores that the detectors' statistics take in the healthy recordings, which have no leak.
 
-        If the volume balance found that valves cut the pump off while the machine rests, the healthy recordings are
-        evaluated under the same hypothesis.
+        Other scores are judged by them. If the volume balance found that valves cut the pump off while the machine
+        rests, the healthy recordings are evaluated with the same assumption.
         """
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut
         return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
 
     def evidence(self, name: str) -> Evidence:
-        """Decide whether the machine leaks from the report of one detector alone.
+        """Decide from the observations of one detector alone if the machine leaks.
 
-        Other causes of a change are weighed against a leak, except for the detector `rms change`, whose alarm is
-        taken as it is.
+        Other causes of a change compete with a leak as its explanation. They are not considered for the detector `rms
+        change`, whose alarms count as leaks.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 
     def decide_by_all(self) -> Evidence:
-        """Decide whether the machine leaks from the reports of all registered detectors.
+        """Decide from the observations of all registered detectors if the machine leaks.
 
-        The detectors that measure the size of a leak (`ORDER`) are asked one after the other until one of them
-        reaches a decision; all other detectors are always asked. If a measuring detector fails, the verdict cannot be
-        "no leak".
+        The detectors that measure the size of a leak (`ORDER`) run one after the other until one of them reaches a
+        decision; all other detectors always run. If a measuring detector fails, the verdict cannot be "no leak".
         """
         names = sorted(detectors(), key=rank)
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
@@ -147,10 +147,10 @@ class Examination:
         return combine(list(decisions.values()), self.refusal or next(iter(failures), None))
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
-        """Decide whether the machine leaks from the report of the detector called `name`.
+        """Decide from the observations of the detector called `name` if the machine leaks.
 
-        `reports` are further observations that may explain an alarm of this detector. With `weigh_rivals`, these
-        other explanations compete with a leak.
+        `reports` are observations of other detectors that may explain an alarm of this one. With `weigh_rivals`,
+        these explanations compete with a leak.
         """
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, self.false_alarm_probability, weigh_rivals)

@@ -56,7 +56,8 @@ Healthy = Recording | SummarisedRecording
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
     """Collect one detector's summaries of healthy recordings, either stored or computed now.
 
-    Recordings of which the detector has no summary are skipped.
+    `detector` has a `name` and a method `learn`, which summarises a recording or returns None. Recordings without a
+    summary are skipped.
     """
     summaries = (
         recording.summaries.get(detector.name)

@@ -59,7 +59,7 @@ class Inspection:
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Unit of each channel of `part`."""
+        """Unit of each channel of the corrected recording."""
         return self.part.units
 
     @property
@@ -84,7 +84,10 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 
 
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
-    """Correct the samples of a recording, check the channels `names`, and judge if the pressures can be trusted."""
+    """Correct the samples of a recording, find the defects of its channels, and test if the pressures can be trusted.
+
+    `names` are the channels to search for defects.
+    """
     chambers, (part, corrections, stuck, share) = chambers_of(recording), correct_samples(recording)
     findings = (*inspect(recording.only(names)), *corrections)
     on_chambers = [finding for finding in findings if finding.channel in chambers]

@@ -22,13 +22,14 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s]; None if nothing repeats.
 
-    The signal examined is the command if it moves, else the difference of the chamber pressures, or the only one. The
-    result is cached with the recording, and shared by its views with fewer channels (`Recording.only`).
+    It is estimated from the command if that moves, else from the difference of the chamber pressures, or from the
+    only one recorded. The result is cached with the recording, and shared by its copies with fewer channels
+    (`Recording.only`).
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
 
     def compute(recording: Recording) -> float | None:
-        """Estimate the period of the duty signal of a recording."""
+        """Estimate the period [s] of the command or the pressure difference; None if nothing repeats."""
         return estimate_period(duty_signal([recording[name] for name in names]), recording.rate)
 
     return compute_once(recording, "cycle", compute, names) if names else None
@@ -37,8 +38,8 @@ def find_cycle(recording: Recording) -> float | None:
 def duty_signal(channels: Sequence[Array]) -> Array:
     """Compute the signal (n,) in which the duty cycle shows.
 
-    `channels`: the command, or one or both chamber pressures (n,). The signal is the only channel, or the first minus
-    the second.
+    `channels`: the command alone, or one or both chamber pressures (n,). The signal is the only channel, or the first
+    minus the second.
     """
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 

@@ -49,7 +49,10 @@ _MAX_NESTING = 3
 
 
 def _detect_format(path: Path) -> str:
-    """Detect the format, or kind of archive, of a file from its content; raise UnreadableFile if it cannot be read."""
+    """Detect the format of a file, or its kind of archive, from its content.
+
+    Raises UnreadableFile if the file cannot be read, or has a format that is not supported.
+    """
     try:
         with open_regular(path, "a recording") as file:
             head = file.read(SNIFF)
@@ -77,13 +80,16 @@ def _detect_format(path: Path) -> str:
 
 
 def _format_function(kind: str, verb: str) -> Callable[..., Any]:
-    """Import ``read_KIND`` or ``write_KIND`` from the module of the format `kind`; `verb`: "read" or "write"."""
+    """Import the function that reads or writes files of a format.
+
+    Its name is ``read_KIND`` or ``write_KIND``, by `kind`, the format, and `verb`, "read" or "write".
+    """
     module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind]['module']}")
     return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
 
 
 def _read_by_format(file: Path, kind: str, request: Request) -> RecordingFields:
-    """Read a file by the reader of its format."""
+    """Read a file of the format `kind` to the fields of a recording; `request` chooses the columns."""
     return _format_function(kind, "read")(file, request)  # type: ignore[no-any-return]
 
 
@@ -187,7 +193,10 @@ def read_parts(
 
 
 def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recording]:
-    """Yield the parts of `read_parts`; formats other than text are read as a whole and cut."""
+    """Yield a recording in parts of `every` [s], as `read_parts` does.
+
+    `request` chooses the columns. Formats other than text are read as a whole and cut.
+    """
     with _unpacked_file(file) as (inner, kind):
         if kind != "text":
             recording = _read_unpacked(inner, kind, request)
@@ -202,9 +211,9 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the path and format of a file, unpacked first if it is an archive.
+    """Yield the path and the format of a file, which is unpacked first if it is an archive.
 
-    Errors then also name the archive.
+    The unpacked file is removed at the end. Error messages name both the unpacked file and the archive.
     """
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)

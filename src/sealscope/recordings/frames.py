@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 def to_pandas(
     values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> pandas.DataFrame:
-    """Make a data frame with the index `t [s]` and columns such as `p_A [Pa]`.
+    """Make a data frame of a recording's samples, with the index `t [s]` and columns such as `p_A [Pa]`.
 
-    Arguments as from `Recording.series`. The `attrs` of the frame contain the units by column, the rate, the
-    provenance and the history. Raises MissingExtra without pandas.
+    `values`, `units`, `description`: as from `Recording.series`. The `attrs` of the frame contain the units by
+    column, the rate, the provenance and the history. Raises MissingExtra without pandas.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
@@ -89,9 +89,10 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set of variables over the coordinate `t`, with `units` and `long_name` as in the NetCDF files.
+    """Make a data set of a recording's samples, as variables over the coordinate `t`.
 
-    Arguments as from `Recording.series`. Raises MissingExtra without xarray.
+    `values`, `units`, `description`: as from `Recording.series`. The variables have the attributes `units` and
+    `long_name` as in the NetCDF files. Raises MissingExtra without xarray.
     """
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {

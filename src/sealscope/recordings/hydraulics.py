@@ -60,7 +60,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array) -> bool:
-    """Test whether a signal (n,) is mostly white noise.
+    """Return True if a signal (n,) is mostly white noise.
 
     The mean square of the third difference of white noise is 20 times its variance. The signal is noise if this mean
     square exceeds 20 times its variance times the prior `noise`, or if samples are missing.
@@ -70,7 +70,10 @@ def _is_noise(values: Array) -> bool:
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Describe the lack of chamber pressures, with the unused columns of the file; None if a pressure is present."""
+    """Describe in words that a recording has no chamber pressure; None if one is present.
+
+    The text names the unused columns of the file.
+    """
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

@@ -40,7 +40,7 @@ def is_moving(values: Array) -> bool:
 
 
 class Holds(NamedTuple):
-    """Samples at which a pressure is held, i.e. stays identical for too long to be a reading.
+    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading.
 
     `flags` (n,): True for held samples. `pending`: index of the first sample whose flag may still change when later
     samples are appended.
@@ -51,12 +51,12 @@ class Holds(NamedTuple):
 
 
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
-    """Find the samples of a pressure `values` (n,) that stay identical for longer than its noise allows.
+    """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and is
-    not flagged. If a hold at the value `before` precedes the samples (NaN: none), a run of this value at their
-    beginning continues it and is flagged as a whole. A run at the end that is still too short is pending. `rate`
-    [Hz].
+    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples; `rate` [Hz]. Its first sample is a
+    reading and is not flagged. If a hold at the value `before` precedes the samples (NaN: none), a run of this value
+    at their beginning continues it and is flagged as a whole. A run at the end that is still too short may become a
+    hold with later samples.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -71,10 +71,11 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
 
 def describe_hold(recording: Recording) -> str | None:
-    """Describe the longest stretch over which a chamber pressure does not move; None if there is none.
+    """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    A pressure does not move while it is held (`find_holds`), or if it is a straight line to within `ROUNDING`. No
-    sample may be missing. Short recordings and constant channels, which `inspect` reports, are not described.
+    It repeats one value for too long (`find_holds`), in which case the longest such time is stated, or it is a
+    straight line to within `ROUNDING`. No sample may be missing. Short recordings and constant channels, which
+    `inspect` reports, are not described.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -114,9 +115,9 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
     Let p be the fraction of unchanged samples among the 100 samples before or after a run, whichever is larger. A run
-    of length m then begins at a given sample with the probability p^(m-1). It is stuck if fewer than 1e-6 such runs
-    are expected in the channel, and if the value jumps by more than three quantisation steps at its beginning or end.
-    A slow quantised signal at a turning point does not move either, but leaves in single steps.
+    of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such
+    runs are expected in the channel `values` (n,), and if the value jumps by more than three quantisation steps at
+    its beginning or end. A slow quantised signal at a turning point does not move either, but leaves in single steps.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
@@ -134,9 +135,9 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of unchanged samples between indices `begin` and `end` (k,).
+        """Estimate the fraction of samples between the indices `begin` and `end` (k,) that equal the one before.
 
-        It is (m + 1) / (n + 2) if m of n samples equal the one before.
+        It is (m + 1) / (n + 2) for m of n samples.
         """
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)

@@ -8,10 +8,11 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class ClockPriors(PriorTable):
     """Assumptions on the clock of a data logger.
 
-    `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular; `rate`: largest
-    relative error of the stated rate; `near` [usual intervals]: longest interval in which no sample is missing;
-    `lost`: largest fraction of lost samples in one recording; `late`: largest fraction of samples with a time before
-    an earlier one.
+    - `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular.
+    - `rate`: largest relative error of the stated rate.
+    - `near` [usual intervals]: longest interval in which no sample is missing.
+    - `lost`: largest fraction of lost samples in one recording.
+    - `late`: largest fraction of samples with a time before an earlier one.
     """
 
     scatter: float
@@ -22,14 +23,22 @@ class ClockPriors(PriorTable):
 
 
 class StalePriors(PriorTable):
-    """Assumptions on samples that repeat the previous sample.
+    """Assumptions on samples that repeat the previous sample instead of a new reading.
 
-    To estimate the time for which a channel repeats its samples: `runs`: fewest runs of equal values; `spread`:
-    largest relative deviation of a run's duration from the median; `share`: fraction of the runs that must be within
-    it; `shortest` [s]: shortest time that matters. Rows are repeated if they are `repeats` times as many as expected
-    by chance, which is at least the fraction `fewest` of all rows. `moves`: smallest range over a run that counts as
-    motion, as a fraction of the channel's range; `leap`: quantile of a channel's changes that a jump exceeds;
-    `stuck`: largest fraction of stuck samples in a pressure that is used.
+    The time for which a channel repeats its samples is estimated from runs of equal values:
+
+    - `runs`: fewest runs.
+    - `spread`: largest relative deviation of a run's duration from the median.
+    - `share`: fraction of the runs that must be within this deviation.
+    - `shortest` [s]: shortest time that matters.
+
+    Repeated rows and stuck channels:
+
+    - `repeats`: rows are repeated if they are this many times as many as expected by chance.
+    - `fewest`: smallest fraction of all rows that is assumed to be expected by chance.
+    - `moves`: smallest range over a run that counts as motion, as a fraction of the channel's range.
+    - `leap`: quantile of a channel's changes that a jump exceeds.
+    - `stuck`: largest fraction of stuck samples in a pressure that is used.
     """
 
     runs: int
@@ -44,9 +53,10 @@ class StalePriors(PriorTable):
 
 
 class SpikePriors(PriorTable):
-    """Assumptions on spikes, samples that leap and return at once; both fields are dimensionless.
+    """Assumptions on spikes, i.e. single samples that leap and return at once.
 
-    `times`: smallest ratio of a spike to the changes around it; `share`: largest fraction of spikes in a channel.
+    - `times`: smallest ratio of a spike to the changes around it.
+    - `share`: largest fraction of spikes in a channel.
     """
 
     times: float
@@ -54,13 +64,15 @@ class SpikePriors(PriorTable):
 
 
 class UnsignedPriors(PriorTable):
-    """Assumptions on a motor speed that is recorded without its sign.
+    """Assumptions on a motor speed or flow that is recorded without its sign.
 
-    `noise`: largest speed of the other sign, relative to the largest speed; `half` [s]: time on either side of a
-    sample over which the piston speed is taken; `nearby` [s]: time on either side over which noise is averaged;
-    `error`: relative error of the flow computed from the position; `changes` [1/s]: usual number of reversals per
-    second; `least`: smallest ratio of the motions in the two directions; `correlation`: smallest correlation of speed
-    and motion.
+    - `noise`: largest value of the other sign, relative to the largest value.
+    - `half` [s]: time on either side of a sample over which the piston speed is taken.
+    - `nearby` [s]: time on either side of a sample over which noise is averaged.
+    - `error`: relative error of the flow computed from the position.
+    - `changes` [1/s]: usual number of reversals per second.
+    - `least`: smallest ratio of the motions in the two directions.
+    - `correlation`: smallest correlation of the magnitude with that of the piston speed or command.
     """
 
     noise: float
@@ -73,12 +85,14 @@ class UnsignedPriors(PriorTable):
 
 
 class HumPriors(PriorTable):
-    """Assumptions on hum of the mains in a channel.
+    """Assumptions on hum of the electric mains in a channel.
 
-    `lowest` [Hz]: frequency from which the power of the channel is counted; `loud`: fraction of this power from which
-    hum is a warning; `alone`: fraction from which the sensor may be disconnected; `around` [Hz]: distance on either
-    side of a line over which the spectrum is its background; `over_rest`, `over_median`: smallest ratios of a line to
-    the largest and to the median amplitude of the background.
+    - `lowest` [Hz]: frequency from which the power of the channel is counted.
+    - `loud`: fraction of this power from which hum is a warning.
+    - `alone`: fraction of this power from which the sensor may be disconnected.
+    - `around` [Hz]: the spectrum up to this distance from a line of hum is its background.
+    - `over_rest`, `over_median`: smallest ratios of the line to the largest and to the median amplitude of the
+      background.
     """
 
     loud: float
@@ -90,9 +104,10 @@ class HumPriors(PriorTable):
 
 
 class CreepPriors(PriorTable):
-    """Assumptions on a mean chamber pressure that drifts steadily.
+    """Assumptions on a steady drift of the mean chamber pressure.
 
-    `rate` [Pa/s]: smallest drift that is reported; `seconds` [s]: shortest recording in which it is searched for.
+    - `rate` [Pa/s]: smallest drift that is reported.
+    - `seconds` [s]: shortest recording in which it is searched for.
     """
 
     rate: float
@@ -100,18 +115,27 @@ class CreepPriors(PriorTable):
 
 
 class HoldPriors(PriorTable):
-    """Lengths beyond which equal samples of a pressure are no reading: both `seconds` [s] and `samples` [samples]."""
+    """Lengths beyond which equal samples of a pressure are no readings; a run must exceed both.
+
+    - `seconds` [s]: time.
+    - `samples` [samples]: number of samples.
+    """
 
     seconds: float
     samples: int
 
 
 class ReadingPriors(PriorTable):
-    """Assumptions on pressures and speeds that come from one machine.
+    """Limits beyond which pressures and speeds cannot come from one hydraulic machine.
 
-    `noise` [share of the variance]: white noise above which a pressure contains nothing else. The motor speed is
-    compared with the rate of the motor angle, both averaged to `rate` [Hz], if there are `samples` [samples] or more:
-    `correlation`: smallest correlation of the two; `misfit`: ratio of the two above which a unit is wrong.
+    - `noise` [share of the variance]: white noise above which a pressure contains nothing else.
+
+    The motor speed is compared with the rate of the motor angle:
+
+    - `rate` [Hz]: both are averaged to this rate.
+    - `samples` [samples]: fewest samples for the comparison.
+    - `correlation`: smallest correlation of the two.
+    - `misfit`: ratio of the two above which a unit is wrong.
     """
 
     noise: float
@@ -122,7 +146,10 @@ class ReadingPriors(PriorTable):
 
 
 class OilRange(PriorTable):
-    """Range of temperatures that oil can have, from `coldest` [K] to `hottest` [K]."""
+    """Range of temperatures that hydraulic oil can have.
+
+    - `coldest`, `hottest` [K]: limits of the range.
+    """
 
     coldest: float
     hottest: float
@@ -131,8 +158,9 @@ class OilRange(PriorTable):
 class CyclePriors(PriorTable):
     """Assumptions on the duty cycle of a machine.
 
-    `longest` [s]: longest period; `correlation`: smallest autocorrelation at a lag of one period; `rate` [Hz]: rate
-    to which the signal is averaged before it is analysed.
+    - `longest` [s]: longest period.
+    - `correlation`: smallest autocorrelation at a lag of one period.
+    - `rate` [Hz]: rate to which the signal is averaged before it is analysed.
     """
 
     longest: float
@@ -143,8 +171,8 @@ class CyclePriors(PriorTable):
 class GapPriors(PriorTable):
     """Assumptions on gaps in a recording.
 
-    `motion` [s]: longest gap that is interpolated by a line in positions, angles, speeds and flows; `hole` [s]:
-    length above which a bridged gap has less weight in the diagnosis.
+    - `motion` [s]: longest gap that is interpolated by a line in positions, angles, speeds and flows.
+    - `hole` [s]: length above which a filled gap has less weight in the diagnosis.
     """
 
     motion: float
@@ -152,9 +180,10 @@ class GapPriors(PriorTable):
 
 
 class RecordingPriors(PriorTable):
-    """All tables of `recordings/priors.toml`.
+    """All tables of `recordings/priors.toml`, the assumptions on loggers, sensors and machines.
 
-    `possible`: SI unit -> largest magnitude that any sensor reads in it; "any" stands for all other units.
+    The table `possible` is a mapping from SI unit to the largest magnitude that any sensor reads in it; "any" stands
+    for all other units.
     """
 
     clock: ClockPriors

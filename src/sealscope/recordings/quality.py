@@ -102,13 +102,16 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 
 
 def _sample_time(recording: Recording, index: int) -> float | None:
-    """Return the time of the sample `index` [s]; None if it has no time."""
+    """Return the time [s] of the sample with the number `index`; None if it has none."""
     t = float(recording.t[index]) if index < recording.t.size else np.nan
     return t if np.isfinite(t) else None
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
-    """Find missing, reversed and repeated times, gaps, irregular intervals, a wrong rate and too few samples."""
+    """List the defects of a recording's times.
+
+    They are missing, reversed and repeated times, gaps, irregular intervals, a wrong rate and too few samples.
+    """
     t, findings, step = recording.t, list[Finding](), 1.0 / recording.rate
 
     def add(code: str, where: NDArray[Any], text: str, severity: Severity = "warning") -> None:
@@ -156,12 +159,12 @@ def _time_findings(recording: Recording) -> list[Finding]:
 
 
 def _format_repetitions(count: int) -> str:
-    """Format the number of times that something happens: `once`, `2 times`."""
+    """Format the number of times that something happens, such as `once` or `2 times`."""
     return "once" if count == 1 else f"{count} times"
 
 
 def _creep_findings(recording: Recording) -> list[Finding]:
-    """Find a steady drift of the mean chamber pressure over the whole recording; a sealed circuit shows none.
+    """Find a steady drift of the mean chamber pressure over a whole recording, which a sealed circuit does not show.
 
     The list is empty if there is no drift, if the recording is too short, or if a chamber pressure is not in Pa.
     """
@@ -250,9 +253,10 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 
 
 def _report_missing(report: _ChannelReport, values: Array) -> None:
-    """Add a finding on missing samples, or on a channel that has a value on every k-th row only.
+    """Add a finding on missing samples to a channel's report, if there are any.
 
-    `values` (n,): samples of the channel, NaN where missing. Nothing is added if none is missing.
+    `values` (n,): samples of the channel, NaN where missing. If it has a value on every k-th row only, the finding
+    says so.
     """
     is_missing, rate = np.isnan(values), report.recording.rate
     if not is_missing.any():
@@ -282,7 +286,7 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 def _row_period(present: NDArray[np.intp]) -> int:
     """Find the k >= 2 for which a channel has a value on every k-th row only; 0 if there is none.
 
-    `present`: indices of the rows with a value.
+    `present`: indices of the rows with a value, in increasing order.
     """
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
@@ -291,13 +295,13 @@ def _row_period(present: NDArray[np.intp]) -> int:
 
 
 def _format_ordinal(number: int) -> str:
-    """Format an ordinal number: `1st`, `12th`."""
+    """Format an ordinal number, such as `1st` or `12th`."""
     ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{ending}"
 
 
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
-    """Split a recording into stretches, as slices, with even sampling and no missing values.
+    """Split a recording into stretches with even sampling and no missing values; return them as slices.
 
     Rows with missing values are in no stretch. `channels`: names of the channels that must be complete, by default
     all but the slow ones. Each interval of a stretch lasts between half and one and a half sampling steps. Raises
@@ -325,7 +329,7 @@ def _flag_even_steps(recording: Recording) -> NDArray[np.bool_]:
 class Rail(NamedTuple):
     """An end of a channel's range at which its samples are clipped.
 
-    `side`: `low` or `high`; `value`: the value at this end; `samples`: number of samples with this value; `first`:
+    `side`: "low" or "high"; `value`: the value at this end; `samples`: number of samples with this value; `first`:
     index of the first of them.
     """
 
@@ -342,13 +346,13 @@ def is_mostly_clipped(values: Array) -> bool:
 
 
 def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
-    """Find the ends of the range at which finite values (n,) are clipped; the low end only if `low_end`.
+    """Find the ends of a channel's range at which its finite values (n,) are clipped; the low end only if `low_end`.
 
     At a clipped end many samples have the same value: far more than any of the five nearest values has. They form
     runs which the signal enters or leaves by a jump of more than three quantisation steps, or one and a half for a
     long run. The crest of a slow quantised signal does not count: its neighbours have nearly as many samples, and it
     is entered step by step. Nor does a square wave, which has as many samples at its other level. An end is also
-    clipped if one of the runs `stuck`, as from `find_stuck`, lies there.
+    clipped if one of the runs `stuck` (first index and length, as from `find_stuck`) has this value.
     """
     if not values.size:
         return []
@@ -378,9 +382,9 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
 @lru_cache(maxsize=16)
 def fast_length(count: int) -> int:
-    """Find the smallest length n >= `count` of a fast Fourier transform, with no prime factor above 5.
+    """Find the smallest length n >= `count` for which a fast Fourier transform is fast.
 
-    Equals `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
+    It has no prime factor above 5. Equals `scipy.fft.next_fast_len(count, real=True)`, without loading scipy.fft.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
     # times the smallest power of two >= count / factor

@@ -40,7 +40,10 @@ _PLOT_UNITS = {"m": "mm", "rad/s": "rpm", "m^3/s": "L/min", "K": "degC"}
 
 
 def _freeze(values: Any) -> Array:
-    """Copy values to a read-only array of doubles, unless they already are such an array that owns its memory."""
+    """Convert values to a read-only array of doubles.
+
+    They are copied, unless they already are such an array that owns its memory.
+    """
     if type(values) is np.ndarray and values.dtype == np.float64 and values.base is None and not values.flags.writeable:
         return values
     array = np.array(values, dtype=np.float64)
@@ -50,7 +53,10 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A cached result, which one thread computes while others wait for it; `known` is True once it is computed."""
+    """A result that one thread computes while others wait for it.
+
+    `known` is True once `value` is computed.
+    """
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -183,7 +189,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Number of samples over the nominal rate [s]."""
+        """Duration [s], the number of samples over the nominal rate."""
         return self.t.size / self.rate
 
     @property
@@ -232,7 +238,10 @@ class Recording:
         return self._select(rows, f"cut to samples {rows.start} to {rows.stop}")
 
     def _select(self, rows: Any, note: str) -> Recording:
-        """Return a recording of the selected rows, a slice or a mask (n,), and add `note` to its history."""
+        """Return a recording of the selected rows; `note` is added to its history.
+
+        `rows`: a slice, or a mask (n,) of bool.
+        """
         channels = {name: values[rows] for name, values in self.channels.items()}
         bridged = None if self.bridged is None else self.bridged[rows]
         return replace(self, t=self.t[rows], channels=channels, history=(*self.history, note), bridged=bridged)
@@ -358,16 +367,16 @@ class Recording:
 
 
 def make_recording(fields: RecordingFields) -> Recording:
-    """Make a recording from the fields of a file that a reader returns."""
+    """Make a recording from the fields that a reader of a file format returns."""
     return Recording(*fields[:-1])  # without the `kind` of the file
 
 
 def compute_once(
     recording: Recording, key: Hashable, compute: Callable[[Recording], _T], channels: Iterable[str] | None = None
 ) -> _T:
-    """Return `compute(recording)`, computed once for each `key` and then cached with the recording.
+    """Return `compute(recording)`, which is computed once for each `key` and then cached with the recording.
 
-    `channels`: the channels on which the result depends, by default all. Views of the recording with fewer channels
+    `channels`: the channels on which the result depends, by default all. Copies of the recording with fewer channels
     (`Recording.only`) share the result if they have these channels.
     """
     all_channels = frozenset(recording.channels)

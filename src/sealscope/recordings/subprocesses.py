@@ -67,7 +67,7 @@ class _Process:
 
     @property
     def is_alive(self) -> bool:
-        """True while the process is running."""
+        """True while the subprocess is running."""
         return self._process.poll() is None
 
     def send(self, request: bytes, limit: float) -> tuple[Any, str | None, bool]:
@@ -98,7 +98,7 @@ class _Process:
         return value, remote_traceback, is_spent
 
     def end(self) -> None:
-        """Kill the process and remove its temporary folder."""
+        """Kill the subprocess and remove its temporary folder."""
         self._process.kill()
         self._process.communicate()
         self._folder.cleanup()
@@ -161,7 +161,7 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit the time [s] (0: no limit), memory [bytes] and file size [bytes] of this process.
+    """Limit the time [s] (0: no limit), memory [bytes] and size of written files [bytes] of this process.
 
     A timer of the operating system ends the process when the time is over, even if its parent is dead. Systems
     without such limits are left without.
@@ -189,9 +189,9 @@ def _is_spent() -> bool:
 
 
 def _serve() -> None:
-    """Serve requests from standard input, one after the other, until it ends.
+    """Run requests from standard input in this process, one after the other, until the input ends.
 
-    The answers go to standard output; what libraries print there is discarded.
+    The answers go to standard output; text that libraries print there is discarded.
     """
     responses = os.fdopen(os.dup(1), "wb")
     discard = os.open(os.devnull, os.O_WRONLY)
@@ -212,7 +212,10 @@ def _serve() -> None:
 
 
 def _run_work(work: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, str | None]:
-    """Run `work`; return (result, None), or (error, traceback) with an error that the program can unpickle."""
+    """Call `work` in this process; return (result, None), or (error, traceback as text) if it fails.
+
+    The error is one that the program can unpickle.
+    """
     try:
         return work(*arguments), None
     except (SealscopeError, MemoryError) as error:

@@ -45,7 +45,7 @@ def cross_check(
 
 
 def _add_problem(recording: SummarisedRecording, problem: str | None) -> SummarisedRecording:
-    """Return a recording with a text added to its list of problems; unchanged if `problem` is None."""
+    """Return a copy of a healthy recording with `problem` added to its list of problems; unchanged if it is None."""
     if problem is None:
         return recording
     return replace(recording, about={**recording.about, "wrong": [*recording.about.get("wrong", ()), problem]})

@@ -54,7 +54,10 @@ _DIGITS = 64
 
 
 class Line(NamedTuple):
-    """One line of the file: the `checksum` it states, and `data`, the JSON of a summary, not yet parsed."""
+    """One line of a file of summaries of healthy recordings.
+
+    `checksum` is the SHA-256 that the line states, and `data` the JSON of a summary, not yet parsed.
+    """
 
     checksum: str
     data: bytes
@@ -78,7 +81,7 @@ def uniform_table_type(value_type: Any) -> Any:
     """
 
     def check_values(table: Any) -> Any:
-        """Return the table unchanged; raise ValueError at the first value that is not of the expected type."""
+        """Return the table unchanged; raise ValueError if it is no table, or at the first value of another type."""
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {table!r:.60}")
         for name, value in table.items():
@@ -100,7 +103,7 @@ def list_type(value_type: Any, min_length: int = 0) -> Any:
 
 
 def _check_array(value: Any) -> Any:
-    """Return the value if it is an array of numbers smaller than 1e100 in size; raise ValueError otherwise."""
+    """Return the value if it is an array of finite numbers below 1e100 in magnitude; raise ValueError otherwise."""
     if not isinstance(value, np.ndarray):
         raise ValueError("must be an array of numbers")
     if not (np.abs(value) < _MAX_NUMBER).all():
@@ -109,16 +112,19 @@ def _check_array(value: Any) -> Any:
 
 
 def _check_statistic(value: Any) -> Any:
-    """Return the value if it is a number, or an array of numbers, below 1e100 in size; raise ValueError otherwise."""
+    """Return the value if it is a number or an array of numbers; raise ValueError otherwise.
+
+    The numbers must be below 1e100 in magnitude.
+    """
     _check_array(np.array(value) if isinstance(value, float) else value)
     return value
 
 
 def _check_sums(summary: Any) -> Any:
-    """Return a volume balance's summary if its arrays are consistent; raise ValueError otherwise.
+    """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
 
-    The arrays must have shapes that match the number of terms, and the sums of squares and products of leak and flow
-    must obey Cauchy's inequality.
+    Its terms must include the leak, and its arrays must have shapes that match the number of terms. The sums of
+    squares and products of leak and flow must obey Cauchy's inequality.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -143,7 +149,8 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return the summary of a recording's ringing if its `levels` and `duty` are valid; raise ValueError otherwise.
 
-    Their shapes must match the number of chambers. Their numbers are logarithms and must be below 750 in size.
+    The length of `levels` must match the number of chambers, and that of `duty` the number of its quantities. Their
+    numbers are logarithms and must be below 750 in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -219,7 +226,7 @@ _ABOUT = {
 def _restore_arrays(value: Any, name: str) -> Any:
     """Convert packed arrays in a parsed JSON value, at any depth, to numpy arrays.
 
-    Raises ValueError with the `name` of an array that cannot be restored.
+    `name` is the name of the value. Raises ValueError with the name of an array that cannot be restored.
     """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
@@ -250,7 +257,10 @@ _RECORDING = table_type(
 
 
 def _pack_arrays(value: Any) -> Any:
-    """Convert a value for JSON: drop entries that are None, and pack arrays and lists of fractional numbers."""
+    """Convert a value for JSON: drop entries that are None, and pack numbers compactly.
+
+    Arrays, and lists of fractional numbers, are packed by `storage.plain_state.plain_array`.
+    """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
     if isinstance(value, np.generic):
@@ -274,7 +284,7 @@ def _format_json(value: Any) -> bytes:
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Check that a detector's summary can be stored and read back; raise ArithmeticError otherwise.
+    """Raise ArithmeticError unless a detector's summary can be stored and read back.
 
     For example, infinite numbers cannot be stored. `method` is the name of the detector.
     """
@@ -285,7 +295,7 @@ def check_summary(method: str, summary: Summary) -> None:
 
 
 def format_summary(recording: SummarisedRecording) -> Line:
-    """Convert a healthy recording's summaries to a line of the file.
+    """Convert a healthy recording's summaries to a line of the file of summaries.
 
     Raises InputError if the line could not be read back.
     """
@@ -300,7 +310,7 @@ def format_summary(recording: SummarisedRecording) -> Line:
 
 
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
-    """Parse a line of the file as the summaries of the recording called `file`.
+    """Parse a line of a file of summaries as those of the recording called `file`.
 
     `place` is the path of the file of summaries, for error messages. Raises InputError if the checksum does not match
     or a value is not valid.

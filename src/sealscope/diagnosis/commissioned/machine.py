@@ -87,9 +87,9 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Path of the file that a machine was loaded from, and hashes of its parts.
+    """Path of the file that a machine was loaded from, and hashes of the parts of its content.
 
-    The hashes reveal whether another process has changed the file since.
+    The hashes reveal if another process has changed the file since.
     """
 
     path: Path
@@ -97,7 +97,7 @@ class Origin(NamedTuple):
 
 
 def _format_date(moment: float) -> str:
-    """Format a time [s since 1970] to the minute."""
+    """Format a time [s since 1970] as date, hour and minute."""
     return datetime.fromtimestamp(moment, UTC).isoformat(" ", "minutes").removesuffix("+00:00")
 
 
@@ -287,7 +287,7 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
 
 
 def _is_own_output(file: Path) -> bool:
-    """Test whether a file begins like a verdict or a trend that this program wrote; False if it cannot be read."""
+    """Return True if a file begins like a verdict or a trend that this program wrote; False if it cannot be read."""
     try:
         with file.open("rb") as content:
             return _OWN_OUTPUT.match(content.read(200)) is not None
@@ -296,10 +296,10 @@ def _is_own_output(file: Path) -> bool:
 
 
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
-    """Compute every detector's summary of a healthy recording; raise InputError if it cannot be trusted or used.
+    """Compute the summaries of a healthy recording by all detectors that can read its channels.
 
     `file` is the name of the recording and `checksum` the SHA-256 of its file. A detector that fails is left out, and
-    its error is logged.
+    its error is logged. Raises InputError if the recording cannot be trusted, or if no detector can use it.
     """
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
@@ -412,7 +412,7 @@ def commission(
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
-        """Diagnose one healthy recording against the healthy recordings `reference`."""
+        """Diagnose one healthy recording, with the other healthy recordings `reference` as its baseline."""
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 

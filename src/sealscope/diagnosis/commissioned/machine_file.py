@@ -62,7 +62,7 @@ _HEAD = """\
 
 
 def _parse_moment(text: Any) -> float:
-    """Parse a time in ISO 8601 format to seconds since 1970; raise ValueError for any other text."""
+    """Parse a time in ISO 8601 format to seconds since 1970; raise ValueError for any other value."""
     try:
         moment = datetime.fromisoformat(text).timestamp()
         datetime.fromtimestamp(moment, UTC)
@@ -77,7 +77,7 @@ _Moment = Annotated[float, BeforeValidator(_parse_moment)]
 
 
 def _check_format(number: int) -> int:
-    """Return the format number if it is the one this version reads; raise ValueError otherwise."""
+    """Return the format number of a machine's file; raise ValueError unless it is the one that this version reads."""
     if number != _FORMAT:
         raise ValueError(f"must be {_FORMAT}, got {number}: commission it anew")
     return number
@@ -235,9 +235,10 @@ def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
 
 
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
-    """Parse the tables of `[[alarms]]`; raise ValueError with the number of the first one that is not valid.
+    """Parse the tables of persons' judgements of alarms, `[[alarms]]` in a machine's file.
 
-    They are parsed one at a time, which saves memory.
+    Raises ValueError with the number of the first table that is not valid. They are parsed one at a time, which saves
+    memory.
     """
     if not isinstance(rows, list):
         raise ValueError(f"alarms must be tables, got {rows!r:.60}")
@@ -251,10 +252,10 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 
 
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
-    """Hash each part of a machine's file, and describe in words how a change of that part would be reported.
+    """Hash each part of a machine's file; return a mapping from hash to the description of a change of that part.
 
-    A part is anything that another process may change: the statements about the machine, one healthy recording, or
-    one judged alarm. Returns a mapping from hash to description.
+    `tree` holds the tables of the file. A part is anything that another process may change: the statements about the
+    machine, one healthy recording, or one judged alarm.
     """
 
     def hash_value(value: Any) -> bytes:
@@ -282,16 +283,17 @@ def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[
 
 
 def _read_checked(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's text and check all but the rig's; raise InputError if a value is not valid."""
+    """Read the tables of a machine's file and check all but the rig's; raise InputError if a value is not valid."""
     tree = _read_tree(path, str(path))
     _convert_tree(tree, str(path))
     return tree
 
 
 def _read_tree(path: Path, place: str) -> dict[str, Any]:
-    """Read the tables of a machine's text without checking them; `place` is its path for error messages.
+    """Read the tables of a machine's file without checking them.
 
-    Keys from before version 0.1 get their present names.
+    `place` is its path for error messages. Keys from before version 0.1 get their present names. Raises InputError if
+    the file cannot be read.
     """
     tree = read_toml(path, "a machine's file", place)
     rows = tree.get("healthy")
@@ -303,7 +305,7 @@ def _read_tree(path: Path, place: str) -> dict[str, Any]:
 
 
 def _read_if_valid(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's text without checking them; an empty mapping if the text cannot be read."""
+    """Read the tables of a machine's file without checking them; an empty mapping if it cannot be read."""
     try:
         return _read_tree(path, str(path))
     except InputError:
@@ -311,17 +313,20 @@ def _read_if_valid(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of the summaries that a machine's text names, even if parts of the text are not valid."""
+    """List the checksums of the healthy recordings' summaries that a machine's file names.
+
+    `tree` holds the tables of the file, parts of which may not be valid.
+    """
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the path of a machine's file of summaries.
+    """Return the path of the file with the summaries of a machine's healthy recordings.
 
-    It has the name of the text at `path` with another suffix. If there is no such file, it is the one that the text
-    names.
+    It has the name of the machine's file at `path` with another suffix. If there is no such file, it is the one named
+    in the tables `tree` of the machine's file.
     """
     machine_table = tree.get("machine")
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -460,7 +465,10 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 
 
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
-    """Check and convert the tables of a machine's text; raise InputError with the `place` if a value is not valid."""
+    """Check the tables of a machine's file and convert their values, for example times to seconds.
+
+    Raises InputError if a value is not valid; `place` is the path of the file for the message.
+    """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)
         check_request(tables.get("map", {}), tables["machine"].get("rate"))

@@ -59,27 +59,27 @@ class LeakDetector(OutlierMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
     def fit(self, X: Paths, y: object = None) -> Self:
-        """Commission a machine from the files of healthy recordings `X`; `y` is ignored."""
+        """Learn the machine from the files of healthy recordings `X`, and return this detector; `y` is ignored."""
         self.machine_: CommissionedMachine = commission(X, rig=self.rig, map=self.map, rate=self.rate, limit=self.limit)
         return self
 
     def score_samples(self, X: Paths) -> Array:
-        """Compute minus the score of each file (n,): the lower, the more it leaks; nan if it cannot be judged."""
+        """Compute minus the leak score of each of n files (n,): lower for larger leaks, nan if not judged."""
         return -np.array([diagnosis.score for diagnosis in self._diagnoses(X)], dtype=float)
 
     def decision_function(self, X: Paths) -> Array:
-        """Compute threshold minus score of each file (n,): negative for a leak, nan if it cannot be judged."""
+        """Compute threshold minus leak score of each of n files (n,): negative for a leak, nan if not judged."""
         diagnoses = self._diagnoses(X)
         score: Array = np.array([diagnosis.score for diagnosis in diagnoses], dtype=float)
         return np.array([diagnosis.threshold for diagnosis in diagnoses], dtype=float) - score
 
     def predict(self, X: Paths) -> NDArray[np.int64]:
-        """Classify each file (n,): -1 for a leak, 1 for no leak, 0 if it cannot be judged."""
+        """Classify each of n files (n,): -1 for a leak, 1 for no leak, 0 if it cannot be judged."""
         labels = {LEAK: -1, NO_LEAK: 1, CANNOT_TELL: 0}
         return np.array([labels[diagnosis.verdict] for diagnosis in self._diagnoses(X)], dtype=np.int64)
 
     def _diagnoses(self, X: Paths) -> list[Diagnosis]:
-        """Diagnose each file with the commissioned machine."""
+        """Diagnose each of the files `X` with the machine that `fit` has learned."""
         check_is_fitted(self)
         p = self.false_alarm_probability
         return [self.machine_.diagnose(path, false_alarm_probability=p) for path in X]

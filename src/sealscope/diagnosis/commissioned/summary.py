@@ -35,10 +35,10 @@ _PRIORS = COMMISSIONED.smallest
 
 
 class TermEstimate(NamedTuple):
-    """Estimated coefficient of one term of the volume balance.
+    """Estimated coefficient of one term of the volume balance, such as leakage or compressed oil.
 
-    `deviation` is its standard error, `scatter` its standard deviation between recordings (None for a single
-    recording), and `unit` the unit of all three numbers.
+    `value` is the estimate, `deviation` its standard error, `scatter` its standard deviation between recordings (None
+    for a single recording), and `unit` the unit of all three numbers.
     """
 
     value: float
@@ -92,7 +92,7 @@ class MachineSummary:
     problems: list[str] = field(default_factory=list)
 
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
-        """Format the summary as a table of about ten lines.
+        """Format the summary of a machine as a table of about ten lines.
 
         `healthy` are the recordings that it summarises, and `rig` the stated sizes of the machine, None if there are
         none.
@@ -123,9 +123,10 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, 16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Make the table rows on the smallest detectable leak and on the recordings needed to halve it.
+        """Build the table rows on the smallest detectable leak and on the recordings needed to halve it.
 
-        `are_dated` tells whether the dates of the recordings are known; the number of days is then mentioned, too.
+        Each row is (heading, text). `n_healthy` is the number of healthy recordings. If `are_dated`, their dates are
+        known, and the number of days is mentioned, too.
         """
         if self.smallest is None:
             needs = "speed or angle of the pump, flow or command, and two recordings"
@@ -186,7 +187,11 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Describe a healthy recording for display: pressure, oil temperature, noise, units in the log, and problems."""
+    """Describe a healthy recording for display, by name of the quantity.
+
+    The quantities are mean pressure difference, oil temperature, noise of each channel, units in the log, and
+    problems. Unknown ones are left out.
+    """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
         description["pressure_bar"] = _round_to_4_digits(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
@@ -235,9 +240,11 @@ def summarise_machine(
 
 
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Estimate the balance's coefficients from all recordings together, and their scatter between recordings.
+    """Estimate the coefficients of a volume balance from all recordings together, and their scatter.
 
-    `sums` holds the Gram matrix (m, m) of each recording, whose rows are scaled to unit noise.
+    `sums` holds the Gram matrix (m, m) of each recording, i.e. the products of the columns of its equations, whose
+    rows are scaled to unit noise. The scatter is the standard deviation between recordings. Returns the estimates by
+    the name of the term.
     """
     equation = equations(rig, channels)[0]
     roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
@@ -253,21 +260,26 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 
 
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients of some `columns` of a volume balance by least squares, from its Gram matrix (m, m)."""
+    """Fit the coefficients of a volume balance by least squares, from the products of its columns.
+
+    `gram` (m, m) holds these products, and `roles` tells which column is the left side. `columns` are the indices of
+    the c columns to fit. Returns the coefficients (c,).
+    """
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show under the usual duty.
 
-    It is detected with the probability `power` (`priors.toml`). The rise of the leakage due to it exceeds the
-    threshold of Student's t test by the normal quantile of this probability. More healthy days lower the threshold
-    and the error of the healthy mean, but not the scatter between recordings.
+    `summaries` are those of the healthy recordings by the detector `balance`, and `channels` the names of the
+    recorded channels. The leak is detected with the probability `power` (`priors.toml`). The rise of the leakage due
+    to it exceeds the threshold of Student's t test by the normal quantile of this probability. More healthy days
+    lower the threshold and the error of the healthy mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
     def smallest_rise(n_repeats: int) -> float:
-        """Estimate the smallest detectable rise of the conductance with `n_repeats` times as many healthy days."""
+        """Estimate the smallest detectable rise of the conductance, given `n_repeats` times as many healthy days."""
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 
@@ -282,9 +294,10 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all recordings, one line for each kind, with the file's name or the number of files.
+    """List the problems of all healthy recordings, one line for each kind of problem.
 
-    Problems with the same text before the first colon are of one kind.
+    Problems with the same text before the first colon are of one kind. A line ends with the name of the file, or with
+    the number of recordings if several have the problem.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -312,7 +325,10 @@ def _estimate_noise(values: Array) -> float:
 
 
 def _describe_vacuum(part: Recording, name: str) -> str:
-    """Describe a pressure that is below vacuum in more than 1 % of the samples; "" if there is none."""
+    """Describe a pressure sensor that reads below vacuum in more than 1 % of the samples; "" if it does not.
+
+    `name` is the channel of the recording `part`.
+    """
     if part.units[name] != "Pa" or not (low_pressure := float(np.quantile(part[name], 0.01))) < -P_ATM:
         return ""
     offset = (-P_ATM - low_pressure) / BAR
@@ -320,7 +336,7 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 
 
 def _describe_glitches(part: Recording, name: str) -> str:
-    """Describe single samples that stand out from both neighbours by more than the channel's range.
+    """Describe a channel in which single samples stand out from both neighbours by more than the channel's range.
 
     The result is "" if there are none. The range is that between the 1 % and 99 % quantiles of the channel.
     """

@@ -76,7 +76,7 @@ def load_watched(rig: str) -> WatchedMachine:
 
 
 def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Test whether two rigs are equal but for the pump's displacement, which may differ by at most 5 %.
+    """Return True if two rigs differ in nothing but the pump's displacement, and in that by at most 5 %.
 
     Two measurements of one pump's displacement may differ by that much.
     """

@@ -80,20 +80,20 @@ class Case:
 
     @property
     def rarest_observable(self) -> Observable:
-        """The observable of the judging detector that is least probable in a healthy recording."""
+        """The test result (observable) of the judging detector that is least probable in a healthy recording."""
         return min(self.judge.observables, key=lambda observable: observable.chance)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Sets of events that explain the observables, with their probabilities, the most probable first."""
+        """Sets of events that explain the results of the tests, with their probabilities, the most probable first."""
         return explain(self.observables, self.null.chance, None if self.leak is None else self.leak.step_rise)
 
     def leak_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
 
-        It is 1 if rivals are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the rig's
-        file, a leak that began within the recording may have raised it: the probability is then that of an alarm of
-        that test, or 1 if there is none.
+        It is 1 if other causes are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the
+        rig's file, a leak that began within the recording may have raised it: the probability is then that of an
+        alarm of that test, or 1 if there is none.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -105,7 +105,10 @@ class Case:
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
-        """The tests for a leak that the reports allow; together they have the allowed false-alarm probability."""
+        """The tests for a leak that the detector's report allows.
+
+        Their probabilities of a false alarm add up to the allowed one of the verdict.
+        """
         return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
 
     @property
@@ -136,8 +139,7 @@ class Case:
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The observables are tried from the rarest on, as long as they are rarer than is allowed in a healthy
-        recording.
+        The changes are tried from the rarest on, until one is not rarer than is allowed in a healthy recording.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -161,12 +163,12 @@ class Case:
 
 
 def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
-    """Make the tests for a leak from measured leakage: within the recording, against healthy ones, against a limit.
+    """Make the tests for a leak from the measured leakage, as far as `leak` allows.
 
     The leakage is tested for a step (a sudden increase) within the recording, for a rise over healthy recordings, and
-    for a level above the limit in the rig's file, as far as `leak` allows. The tests share the allowed false-alarm
-    probability. If a step and a rise are tested, the fraction `questions.within` of `priors.toml` goes to the step;
-    if a step and a level are tested, it goes to the level.
+    for a level above the limit in the rig's file. The tests share the allowed false-alarm probability. If a step and
+    a rise are tested, the fraction `questions.within` of `priors.toml` goes to the step; if a step and a level are
+    tested, it goes to the level.
     """
     from scipy.special import ndtr, ndtri
 
@@ -188,7 +190,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key under which `HealthyNull` stores a detector's test of the leak for a step.
+    """Return the key of the surprisals of a detector's step test of the leak, such as "volume balance: step".
 
     `provider`: name of the detector.
     """
@@ -196,9 +198,9 @@ def step_key(provider: str) -> str:
 
 
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
-    """Make the test for a leak from a detector that does not measure leakage.
+    """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    It is the test of the rarest of its observables that a leak changes. The result is empty if a leak changes none.
+    It is the test of the rarest of its observables that a leak changes; empty if a leak changes none of them.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

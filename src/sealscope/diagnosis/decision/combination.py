@@ -29,7 +29,8 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 def rank(detector: str) -> int:
     """Return the place of a detector, by its name, in the order in which detectors may judge; 0 is the first.
 
-    All plug-ins share one place, after the detectors that measure the leak and before the change of the RMS.
+    Detectors that measure the leak come first, the most accurate one before the others. All plug-ins share the next
+    place. The change of the RMS is the last.
     """
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
@@ -37,7 +38,7 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if the evidence of a detector is usable and decides, i.e. if the detector does not abstain.
+    """Return True if a detector could use the recording and decides on it.
 
     A detector decides if it states a verdict or a cause, or if its score exceeds the threshold.
     """
@@ -45,11 +46,12 @@ def is_decided(evidence: Evidence) -> bool:
 
 
 def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
-    """Combine the decisions of several detectors into one: that of the first detector, by rank, that decides.
+    """Combine the decisions of several detectors: that of the first one counts, by rank, that decides.
 
-    All decisions become its `parts`. A verdict `no leak` becomes `cannot tell` if the end of the recording is not
-    judged, or if `refusal` gives a reason why `no leak` must not be stated (None if there is none). If no detector
-    decides, the verdict is `cannot tell`, too.
+    All decisions become the `parts` of the result. A verdict `no leak` becomes `cannot tell` if the end of the
+    recording is not judged, or if `refusal` gives a reason why `no leak` must not be stated (None if there is none).
+    If no detector decides, the verdict is `cannot tell`, too. The change of RMS decides only if no detector that
+    measures the leak can use the recording.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -73,7 +75,7 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
-    """Make the verdict `cannot tell` for the case that no detector decides, with a reason.
+    """Make the verdict `cannot tell` with a reason, as no detector decides.
 
     `ranked`: decisions of all detectors in the order of judging; `usable`: those that could use the recording. The
     reason is that of the first usable detector. If none is usable, it is that of the built-in detector which needs

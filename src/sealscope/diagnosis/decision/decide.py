@@ -34,7 +34,7 @@ def decide(
     false_alarm_probability: float,
     weigh_rivals: bool = True,
 ) -> Evidence:
-    """Decide whether a recording shows a leak, by the report of one detector.
+    """Decide on a recording by the report of one detector: leak, no leak, or cannot tell.
 
     Parameters
     ----------
@@ -71,7 +71,8 @@ def _evidence_without_leak(case: Case) -> Evidence:
     """Make the evidence of a recording in which no test found a leak, with the verdict `no leak` or `cannot tell`.
 
     The verdict is `no leak` if the upper bound of an undetected leak is small enough (`decide_without_leak`). The
-    evidence states this bound and, if something changed for another reason than a leak, the event that explains it.
+    evidence states this bound. If something changed for another reason than a leak, it states the event that explains
+    the change.
     """
     alarm, leak, other = next(iter(case.alarms), None), case.leak, case.other_event
     bound = _leak_bound(case, alarm)
@@ -175,9 +176,9 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the flow [m^3/s] of the smallest leak that would be found if it began within the recording.
+    """Compute the flow [m^3/s] of the smallest leak that would be detected if it began within the recording.
 
-    Return None if that was not tested.
+    Return None if the recording was not tested for such a leak.
     """
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
@@ -187,8 +188,9 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to the evidence the detector's name, the judged fraction, the ratio of sizes, and the results of the tests.
+    """Add the results of the tests to the evidence, with the name of the detector.
 
+    The fraction of the recording that was judged is added, too, and the measured ratio of displacement to area.
     `judging`: test whose score, threshold and chance are stated, None to add no results. If there are several tests,
     all are added as `parts`.
     """

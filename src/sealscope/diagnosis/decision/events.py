@@ -32,18 +32,24 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if a prior on the sizes of the event's changes counts (`Observable.advantage`).
+        """True if the probability of the event depends on the sizes of its changes, through a prior on them.
 
-        It does for events that a verdict may name, i.e. that have a cause.
+        It does so for events that a verdict may name, i.e. that have a cause. The prior is in `Observable.advantage`.
         """
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable."""
+        """Return True if the event changes the quantity that an observable tests.
+
+        Its "data: name" must then match one of the patterns `affected`.
+        """
         return _matches(f"{observable.data}: {observable.name}", self.affected)
 
     def may_disturb(self, observable: Observable) -> bool:
-        """Return True if the event may change an observable as a side effect."""
+        """Return True if the event may change, as a side effect, the quantity that an observable tests.
+
+        Its "data: name" must then match one of the patterns `disturbed`.
+        """
         return _matches(f"{observable.data}: {observable.name}", self.disturbed)
 
 
@@ -55,7 +61,7 @@ def _matches(key: str, patterns: tuple[str, ...]) -> bool:
 
 @cache
 def load_events() -> Sequence[Event]:
-    """Read all events from `events.toml`."""
+    """Read the events that may happen to a machine, with their prior probabilities, from `events.toml`."""
     rows = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
     return tuple(
         Event(

@@ -50,7 +50,7 @@ class Explanation:
     data: frozenset[str] = frozenset()
 
     def has(self, *names: str) -> bool:
-        """Return True if the set contains an event with one of the names."""
+        """Return True if this set of events contains one with any of the `names`."""
         return any(event.name in names for event in self.events)
 
 
@@ -63,7 +63,7 @@ def explain(
     chance: Callable[[Observable], float] = lambda observable: observable.chance,
     rise: LeakRise | None = None,
 ) -> tuple[Explanation, ...]:
-    """Compute which events explain the observables of a recording, and with which probabilities.
+    """Find the sets of events that may explain the test results of a recording, with their probabilities.
 
     Parameters
     ----------
@@ -99,14 +99,15 @@ def explain(
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Rank the terms of the volume balance by likelihood: the best keeps its log Bayes factor, others get less.
+    """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
 
-    The factor of another term is that of the best minus the difference of their log likelihoods, and at least 0.
-    The terms are alternative descriptions of the same residual. Healthy recordings show how rare the best of them is,
-    but are too few to show which term describes it best. For that only the likelihoods in the judged recording count.
+    The terms are alternative descriptions of the same residual. The best one keeps its factor. That of another term
+    is the best minus the difference of their log likelihoods, and at least 0. Healthy recordings show how rare the
+    best description is, but are too few to show which term is the best; for that only the likelihoods in the judged
+    recording count.
 
-    `log_factors`: observables with their log Bayes factors, corrected for misfit (`_correct_for_misfit`), as the
-    differences are; those of other data are returned unchanged.
+    `log_factors`: observables with their log Bayes factors. Those of other data than the balance's are returned
+    unchanged. Factors and differences are corrected for the misfit of the model (`_correct_for_misfit`).
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -124,8 +125,8 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of observables, since a model describes its data only approximately.
 
-    Each is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the misfit of a
-    model (`explanation.misfit` in `priors.toml`).
+    Each is divided by 1 + 2 m B, where B is the largest log factor of the same kind of data and m the relative misfit
+    of models (`explanation.misfit` in `priors.toml`).
     """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:
@@ -142,9 +143,10 @@ class _Posterior(NamedTuple):
 
 
 def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
-    """Compute the posterior of a set of events, each with its best possible onset.
+    """Compute the log posterior of a set of events, up to a constant, and the kinds of data that the set explains.
 
-    `gains_of`: log Bayes factors of each event by its name, for each possible onset (`_possible_gains`).
+    `gains_of`: log Bayes factors of each event by its name, for each possible onset (`_possible_gains`). The best
+    onset of each event counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -203,7 +205,7 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
 
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
-    """Compute the log Bayes factor of a change of an observable to no change.
+    """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
     `chance`: probability of the observable in a healthy recording. An increase of the leakage makes an alternative to
     it, such as an external leak, seem to increase as well. Therefore the log factor of such an observable is at most
@@ -217,10 +219,10 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
 
 
 def log_bayes_factor(chance: float) -> float:
-    """Compute the logarithm of the largest Bayes factor of a change to no change that a p-value c allows.
+    """Compute the largest log Bayes factor for a change that a p-value `chance` = c allows.
 
-    `chance`: the p-value c, i.e. the probability of such a score without a change. The result is -log(-e c log c) for
-    c < 1/e, else 0 (T. Sellke et al., 2001).
+    c is the probability of such a score without a change. The result is -log(-e c log c) for c < 1/e, else 0 (T.
+    Sellke et al., 2001).
     """
     if chance >= np.exp(-1.0):
         return 0.0

@@ -41,14 +41,17 @@ class HealthyNull:
     _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
 
     def chance(self, observable: Observable) -> float:
-        """Compute the calibrated probability of at least this score of an observable in a healthy recording."""
+        """Compute the probability that a healthy recording has at least this score of an observable.
+
+        The chance that the detector states is calibrated by healthy recordings of the machine.
+        """
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Compute the calibrated chance of a statistic from the `chance` that its detector states.
+        """Correct the `chance` that a detector states for a test by those that it stated for healthy recordings.
 
-        `key`: key of the statistic in `surprisals`.
+        `key`: key of the test in `surprisals`.
         """
         weights, inflations = self._inflation(key)
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
@@ -56,7 +59,7 @@ class HealthyNull:
     def uncalibrated_chance(self, key: str, chance: float) -> float:
         """Compute the chance that a detector must state for the calibrated chance to be `chance`.
 
-        It is the inverse of `calibrate`; `key`: key of the statistic in `surprisals`.
+        It is the inverse of `calibrate`; `key`: key of the test in `surprisals`.
         """
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
@@ -64,9 +67,10 @@ class HealthyNull:
         return float(np.exp(-find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        """Return posterior weights and values of lambda, the mean surprisal of a statistic in healthy recordings.
+        """Return weights and values of lambda, a test's unknown mean surprisal in healthy recordings.
 
-        Both have the same shape (k,). `key`: key of the statistic in `surprisals`.
+        The weights are posterior probabilities; both have the shape (k,). A surprisal is -log(chance); its mean is 1
+        if the chances are stated correctly. `key`: key of the test in `surprisals`.
         """
         if key not in self._posteriors:
             self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
@@ -74,10 +78,10 @@ class HealthyNull:
 
 
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
-    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals.
+    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(chance).
 
     Both have the shape (NODES + 1,); the first value is 1, for a detector that states its chances correctly. n
-    `surprisals` have the likelihood lambda^-n exp(-sum / lambda). Without any both results are [1].
+    `surprisals` have the likelihood lambda^-n exp(-sum / lambda). Without any surprisals both results are [1].
     """
     prior_null = DECISION.null
     if not len(surprisals):
@@ -93,7 +97,7 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 
 
 def null_key(observable: Observable) -> str:
-    """Return the key under which `HealthyNull` stores an observable.
+    """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
 
     It consists of data and name, or of the data alone for a comparison with healthy recordings, which has no onset.
     """
@@ -101,7 +105,7 @@ def null_key(observable: Observable) -> str:
 
 
 def comparison_key(data: str) -> str:
-    """Return the key under which `HealthyNull` stores comparisons with healthy recordings by one kind of data.
+    """Return the key under which `HealthyNull` stores comparisons between recordings, such as "rise: against".
 
     `data`: kind of data, as in `Observable.data`.
     """

@@ -90,9 +90,10 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 
 
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
-    """Describe in words the largest drop of the pressures' ringing that the data allow, and why a leak may hide.
+    """Describe in words the largest drop of the pressures' ringing that the data allow.
 
-    `ringing`: its precision, None if it was not measured; `provider`: name of the detector.
+    If a leak may be hidden, the reason is added. `ringing`: precision of the measured ringing, None if it was not
+    measured; `provider`: name of the detector.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -175,6 +176,6 @@ def _rarity_text(chance: float) -> str:
 
 
 def _remarks(case: Case) -> str:
-    """Return the texts of all remarks on the measured leakage; "" if there are none."""
+    """Return the texts of all remarks on the measured leakage, joined; "" if there are none."""
     leak = case.leak
     return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

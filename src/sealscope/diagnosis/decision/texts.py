@@ -11,7 +11,7 @@ from typing import Any
 
 @cache
 def _texts() -> Mapping[str, Mapping[str, str]]:
-    """Read the tables of texts from `texts.toml`: text by key, by the name of the table."""
+    """Read `texts.toml`: the tables by name, each with its texts by key."""
     return tomllib.loads((files("sealscope.diagnosis.decision") / "texts.toml").read_text("utf-8"))
 
 

@@ -9,10 +9,10 @@ from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, NO_LEAK, Verdict
 
 
 def decide_without_leak(bound: float, max_bound: float) -> Verdict:
-    """Decide on a recording in which no test found a leak.
+    """Return the verdict on a recording in which no test found a leak.
 
-    The verdict is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is at most `max_bound` in the
-    same unit, and `cannot tell` otherwise.
+    It is `no leak` if `bound`, the 95 % upper bound of an undetected leak, is at most `max_bound` in the same unit,
+    and `cannot tell` otherwise.
     """
     verdict: Verdict = NO_LEAK if math.isfinite(bound) and bound <= max_bound else CANNOT_TELL
     return verdict

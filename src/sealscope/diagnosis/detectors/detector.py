@@ -40,10 +40,10 @@ class Detector(Protocol):
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Estimate the observables of a recording that is `usable`, and test them for changes.
+        """Estimate the detector's numbers (observables) in a recording that is `usable`, and test them for changes.
 
-        `baseline` holds leak-free recordings of the same machine at any duty, without copies. If it is empty, only
-        changes within the recording are tested.
+        `baseline` holds leak-free recordings of the same machine with any load cycle, none of them twice. If it is
+        empty, only changes within the recording are tested.
         """
         ...
 

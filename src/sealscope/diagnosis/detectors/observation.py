@@ -53,7 +53,7 @@ def limit_threads() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _thread_pools(n_modules: int) -> Any:
-    """Find the loaded linear-algebra libraries.
+    """Find the thread pools of the loaded linear-algebra libraries, as a `threadpoolctl.ThreadpoolController`.
 
     The search takes milliseconds, and is repeated only when `n_modules`, the number of imported modules, has changed.
     """
@@ -65,8 +65,8 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and pressure levels, which may be mistaken for a leak.
 
-    The changes are tested within the recording and against the healthy recordings. `distrust` is the reason why the
-    pressures cannot be judged, in which case the report is empty; None if they can.
+    The changes are tested within the recording and, if `baseline` is not empty, against its healthy recordings.
+    `distrust` is the reason why the pressures cannot be judged, in which case the report is empty; None if they can.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -130,9 +130,10 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals of the signals and of the volume balance (`healthy_surprisals`).
+    """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
 
-    Without a balance, those of the pressure response are used.
+    The changes are those of the signals and of the volume balance; without a balance, those of the pressure response
+    are used in its place.
     """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
@@ -151,7 +152,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal of each observable that is tested for a change within the recording.
+    """Collect the largest surprisal -log(chance) of each observable that is tested for a change within the recording.
 
     Returns surprisals by key (`null.null_key`). The test for a step of the leak has a key of its own.
     """
@@ -166,12 +167,11 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
-    """Collect how large each tested statistic is in the healthy recordings, as surprisals -log(chance).
+    """Collect how improbable each test result is in the healthy recordings, as surprisals -log(chance).
 
-    These surprisals are the null distribution of a detector's observables. For comparisons between recordings there
-    is one distribution for each kind of data: the largest surprisal of each healthy recording when it is compared
-    with all others. With `shut`, the balance's surprisals are those under the hypothesis that the pump is cut off at
-    rest.
+    They are the null distribution of the observables of all detectors. For comparisons between recordings there is
+    one distribution for each kind of data: the largest surprisal of each healthy recording when it is compared with
+    all others. With `shut`, the balance's surprisals are those under the hypothesis that the pump is cut off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -191,7 +191,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others; yield the results as observables.
+    """Compare the ringing of each healthy recording with that of all others; yield the tests (observables) of each.
 
     Nothing is yielded for fewer than three recordings of the same chambers and sampling rate.
     """

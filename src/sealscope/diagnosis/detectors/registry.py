@@ -44,7 +44,7 @@ class PlugIn:
     make: Factory
 
     def __call__(self, rig: Rig) -> Detector:
-        """Make the detector for a rig."""
+        """Make the plug-in's detector for a rig."""
         return self.make(rig)
 
     @property

@@ -115,7 +115,10 @@ class BlockStream:
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Prepare for samples from the time `begin` [s] on, after a gap; drop samples of an incomplete block."""
+        """Continue after a gap in the samples; the next sample is at the time `begin` [s].
+
+        Samples of a block that is not complete are dropped.
+        """
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
         self._first = 0  # index since `begin` of the first stored sample
@@ -125,8 +128,9 @@ class BlockStream:
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
-        `samples`: equally long arrays by channel name, NaN where a sample is missing. `last`: no samples follow, so
-        that blocks are closed that otherwise wait for the samples after them.
+        A block is a few seconds of samples, reduced to the sums of a regression (`Blocks`). `samples`: equally long
+        arrays by channel name, NaN where a sample is missing. `last`: true if no samples follow; blocks are then
+        closed that would otherwise wait for the samples after them.
         """
         if samples:
             self._pieces.append(samples)
@@ -151,14 +155,18 @@ class BlockStream:
         return blocks
 
     def _join_pieces(self) -> dict[str, Array]:
-        """Concatenate the stored samples of each channel."""
+        """Join the stored samples of several calls of `push` to one array for each channel, by its name."""
         if len(self._pieces) == 1:  # a whole recording: no copy
             return dict(self._pieces[0])
         names = self._pieces[0] if self._pieces else ()
         return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the stream as plain values for JSON, from which `load_state` continues."""
+        """Return the state of the stream as plain values for JSON, from which `load_state` continues.
+
+        It consists of the samples that later blocks need, the offsets and signs that were estimated from the first
+        samples, and the sums over earlier blocks that weight the rows.
+        """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
             "begin": self._begin,
@@ -170,7 +178,10 @@ class BlockStream:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of a stream that `state` returned; raise InputError if it does not fit these balances."""
+        """Restore the state of a stream from the plain values that the method `state` returned.
+
+        Raise InputError if they do not fit the balances of this stream.
+        """
         samples = require_part(state, "samples", Mapping)
         self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
@@ -184,13 +195,15 @@ class BlockStream:
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Estimate for each equation whether the sign of the recorded flow is correct; sensors may be reversed.
+        """Estimate the sign of the recorded flow in each balance: 1 if it is correct, -1 if a sensor is reversed.
 
-        `rows`: rows (r, m) of each equation. The result is 1 for each left side with a correct sign, else -1.
+        `rows`: rows (r, m) of the regression of each balance.
 
-        Three symptoms of correct wiring add their log odds. Friction dissipates, so p_A - p_B correlates with the
-        flow into A; oil leaks from high to low pressure; x grows with the flow into A. Each is a z score with the
-        probability Phi(z) of a correct sign, except for a fraction of machines in which something else causes it.
+        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy,
+        so p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with
+        the flow into A. The last one counts only if it is positive, since x itself may be reversed. Each symptom has
+        a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in which something
+        else causes it.
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
@@ -205,7 +218,10 @@ class BlockStream:
         return tuple(signs)
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
-        """Compute the blocks with the indices `first` to `end` - 1 from samples; their rows are weighted together."""
+        """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
+
+        The rows of these blocks are weighted together: one robust fit to all of them determines the weights.
+        """
         length = self._strides * self._stride  # of a block [samples]
         self._estimate_stream_constants(samples, (self._n_first or end) * length)
         if self._on_samples is not None:
@@ -235,10 +251,11 @@ class BlockStream:
         return Blocks(start, last, gram, weights.reshape(-1, self._strides).sum(axis=1), flow, pressures, offsets)
 
     def _estimate_stream_constants(self, samples: Mapping[str, Array], n_samples: int) -> None:
-        """Estimate the constants of the stream: absolute minus gauge pressures, and speeds that count as resting.
+        """Estimate two constants of a recording: absolute minus gauge pressure, and the speed that counts as rest.
 
-        They are estimated once, when they are first needed. The pressures are estimated from the first `n_samples`
-        only. The speeds, below which pump or piston count as resting, are None unless the balance needs them.
+        They are estimated at the first call only. The difference of absolute and gauge pressure is estimated for each
+        sensor from its first `n_samples`. The speeds below which pump or piston count as resting are estimated only
+        if the balance needs them, and are otherwise None.
         """
         if self._absolute_offsets is None:
             self._absolute_offsets = {
@@ -314,7 +331,8 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares; 0 if the rows do not determine it.
 
-    `gram` (m, m): Gram matrix of `n_rows` rows.
+    `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: roles of its columns, such as leak and
+    left side.
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -349,7 +367,7 @@ def max_rest_rate(increments: Array, rate: float) -> float:
 def _absolute_offset(pressure: Array) -> float:
     """Compute the difference of absolute and gauge pressure [Pa] for the readings (n,) of a sensor.
 
-    It is the atmosphere, or more if readings would otherwise be below the least absolute pressure.
+    It is the atmospheric pressure, or more if a reading would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -357,9 +375,10 @@ def _absolute_offset(pressure: Array) -> float:
 
 
 def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels by name, with NaN in holes of the recording and where a pressure is clipped.
+    """Return the samples of the channels `names`, with NaN in long gaps and where a pressure is clipped.
 
-    Holes are long gaps of missing samples that were bridged (`flag_holes`).
+    The result maps the name of a channel to its samples (n,). Long gaps are those that `flag_holes` finds; in the
+    recording they are filled in.
     """
     samples = bridged_samples(recording, names)
     is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
@@ -367,10 +386,11 @@ def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples of channels by name, with NaN where a pressure is clipped.
+    """Return the samples of the channels `names`, with NaN where a pressure is clipped.
 
-    In holes, i.e. long gaps of missing samples that were bridged, the bridging values remain. If there are holes, the
-    additional entry `HOLE` is 1 there and 0 elsewhere.
+    The result maps the name of a channel to its samples (n,). In holes, i.e. long gaps of missing samples, it keeps
+    the values with which the recording fills them in. If there are holes, the additional entry `HOLE` is 1 there and
+    0 elsewhere.
     """
     samples, is_hole = {}, flag_holes(recording)
     if is_hole.any():
@@ -388,8 +408,8 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording.
 
-    The entry `START` is the decay of the drive's initial state. The pump's speed "omega" [rad/s] is added if the
-    command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing. With
+    The entry `START` is the decay exp(-t/lag) of the drive's initial state. The pump's speed "omega" [rad/s] is added
+    if the command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing. With
     `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts
     as leakage.
     """
@@ -454,7 +474,8 @@ class RecordedBlocks(NamedTuple):
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short.
 
-    There are two versions: the pump may stay connected to the cylinder while it rests, or valves may cut it off.
+    A block is a few seconds of samples, reduced to the sums of a regression. The result has two versions of the
+    blocks, since the pump may stay connected to the cylinder while it rests, or valves may cut it off.
     """
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)

@@ -96,7 +96,7 @@ class Blocks:
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Return the blocks that `pack` has reduced, with the full Gram matrices (K, E, size, size).
+        """Restore the full Gram matrices (K, E, size, size) of blocks that `pack` has reduced.
 
         Raise InputError if the stored shapes do not fit `size`.
         """
@@ -110,12 +110,15 @@ class Blocks:
 
     @property
     def time(self) -> Array:
-        """Middle of each block [s]."""
+        """Time in the middle of each block [s], shape (K,)."""
         return 0.5 * (self.start + self.end)
 
     @property
     def moving_flow(self) -> float:
-        """Mean flow while the pump delivers [m^3/s]; weighting by the flow itself excludes standstills."""
+        """Mean flow while the pump delivers [m^3/s].
+
+        It is the mean over the blocks weighted by the flow itself, to which standstills do not contribute.
+        """
         return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
 
     @property
@@ -207,7 +210,7 @@ class ColumnRoles:
         self.healthy_conductance = equation.healthy
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return the roles for a test of the term `name` instead of the leak.
+        """Return a copy of these column roles in which the term `name` is tested instead of the leak.
 
         The leak becomes an ordinary term, with a prior on its differences between recordings (`between.pump`).
         """
@@ -217,10 +220,11 @@ class ColumnRoles:
         return roles
 
     def leak_deviation(self, test: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of a coefficient in a healthy machine, in the unit of the coefficient.
+        """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in its own unit.
 
-        `test`: index of its column. The prior of a flow through an orifice gives the same mean flow over `blocks` as
-        that of a laminar leak. The result is infinite for columns that no pressure drives, or without a prior.
+        `test`: index of the coefficient's column. The prior of a flow through an orifice gives the same mean flow
+        over `blocks` as that of a laminar leak. The result is infinite for columns that no pressure drives, or
+        without a prior.
         """
         driver = self.drivers[test] if test < self.left else ""
         pressure, root = (float(np.mean(values)) for values in (blocks.mean_pressure(), blocks.mean_root()))
@@ -228,11 +232,11 @@ class ColumnRoles:
         return self.healthy_conductance * per_conductance[driver]
 
     def offset_deviation(self, test: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a column.
+        """Compute the prior standard deviation of the error of a regression column due to a pressure sensor's offset.
 
         `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for that of an
-        orifice, and 0 for columns that no pressure drives or in an equation without flow offset. The deviation of the
-        pressure is at most its mean over `blocks`, since recordings may be in counts.
+        orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The deviation of
+        the pressure is at most its mean over `blocks`, since recordings may be in counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -245,7 +249,7 @@ class Weighting:
     """Weighting of the rows of successive blocks by Huber's weights, which limit the effect of outliers.
 
     The weights follow from a fit that also uses weighted sums over earlier blocks. These sums are the state of the
-    object. `columns`: roles of the columns in each equation.
+    object. `columns`: roles of the columns (leak, motion, left side) in each equation.
     """
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
@@ -255,11 +259,11 @@ class Weighting:
 
     @property
     def has_blocks(self) -> bool:
-        """True if any block has been closed."""
+        """True if the rows of at least one block have been weighted."""
         return self._count > 0
 
     def state(self) -> dict[str, Any]:
-        """Return the number of earlier blocks and the weighted sums over them, as plain values for JSON."""
+        """Return the number of earlier blocks and the weighted sums over their rows, as plain values for JSON."""
         return {"count": self._count, "known": [plain_array(sums) for sums in self._earlier_sums]}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
@@ -324,9 +328,9 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
     """Compute the likelihood of one coefficient of a balance in each block, with all other coefficients eliminated.
 
-    `columns`: roles of the columns in each equation; the likelihoods of the equations are multiplied. `test`: index
-    of the coefficient's column, or of the left side to test a change of its scale. `replaces`: index of a column to
-    omit.
+    `columns`: roles of the columns (leak, motion, left side) in each equation; the likelihoods of the equations are
+    multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its scale.
+    `replaces`: index of a column to omit, None to omit none.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -365,7 +369,11 @@ class _NormalEquations(NamedTuple):
     left_square: float
 
     def eliminate_tested(self) -> tuple[Array, Array, float]:
-        """Return `gram`, `moment` and `left_square` after eliminating the tested coefficient, free in each block."""
+        """Eliminate the tested coefficient, which is free in each block, from the normal equations.
+
+        Returns the reduced sums: the Gram matrix (c, c) of the other columns, their products (c,) with the left side,
+        and the sum of squares of the left side.
+        """
         energy = np.maximum(self.energy, np.finfo(float).tiny)
         gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
         moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
@@ -422,11 +430,11 @@ class _NuisanceFit(NamedTuple):
 
 
 def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
-    """Fit all coefficients but the tested one (the nuisance), and the variance of a row.
+    """Fit all coefficients of a regression except the tested one, and the variance of a row.
 
-    The tested coefficient is free in each block.
-    Each nuisance column has `degrees` coefficients: a constant one and those of the polynomials of its drift.
-    `n_rows`: number of rows in all blocks.
+    `normal`: sums of the regression, from which the tested coefficient, free in each block, is eliminated. Each other
+    (nuisance) column has `degrees` coefficients: a constant one and those of the polynomials of its drift. `prior`:
+    prior standard deviations of these; `n_rows`: number of rows in all blocks.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -496,9 +504,9 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
     """Subtract a sensor offset from the pressure of the tested column, and append a column for the offset's error.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the tested column; `coefficients` (K,): coefficient
-    g of that column in each block; `offset` [Pa]. The result has the shape (K, m + 1, m + 1). The appended column -g
-    dt is the derivative of the balance with respect to the offset.
+    `gram` (K, m, m): Gram matrices of K blocks; `roles`: roles of the columns; `test`: index of the tested column;
+    `coefficients` (K,): coefficient g of that column in each block; `offset` [Pa]. The appended column -g dt is the
+    derivative of the balance with respect to the offset. It becomes the last of the m + 1 columns of the result.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -514,10 +522,11 @@ def _eliminate_nuisance(
 ) -> tuple[Array, Array]:
     """Compute the likelihood of the tested coefficient in K blocks by one equation: precision (K, K) and vector (K,).
 
-    `gram` (K, m, m): Gram matrices of the blocks; `test`: index of the tested column; `nuisance`: indices of the
-    columns to eliminate. The precision is the Schur complement (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix
-    of the tested column's sums of squares, G the Gram matrix of the nuisance columns, P their prior precision, C
-    their products with the tested column, and s^2 the variance of a row.
+    `gram` (K, m, m): Gram matrices of the blocks; `roles`: roles of the columns (leak, motion, left side); `test`:
+    index of the tested column; `nuisance`: indices of the columns to eliminate. The precision is the Schur complement
+    (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix of the tested column's sums of squares, G the Gram matrix of
+    the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the variance of a
+    row.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -545,9 +554,9 @@ def offset_cost(offset: float) -> float:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    `columns`: roles of the columns of `blocks` in each equation. The result includes the offset that is already
-    removed from `blocks`. Only changes of the leak between blocks show the offset; without them the estimate stays
-    near the removed offset.
+    `columns`: roles of the columns of `blocks` (leak, motion, left side) in each equation. The result includes the
+    offset that is already removed from `blocks`. Only changes of the leak between blocks show the offset; without
+    them the estimate stays near the removed offset.
     """
     fits = [
         _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
@@ -571,7 +580,8 @@ class LeakAndBias(NamedTuple):
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     """Compute the joint likelihood of leak coefficient and flow offset in each block, for the first equation.
 
-    `roles`: roles of its columns, among them one of the flow offset. All other coefficients are eliminated.
+    `roles`: roles of its columns (leak, motion, left side), one of which must be the flow offset. All other
+    coefficients are eliminated.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
@@ -598,10 +608,10 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
-    """Estimate a weighted mean of coefficients of the first equation, and its standard error.
+    """Estimate a weighted mean of coefficients of the first balance of a machine, and its standard error.
 
-    `weights` maps the index of a nuisance column to its weight; the weights sum to 1. Only the constant part of each
-    coefficient is averaged, not its drift.
+    `roles`: roles of its columns (leak, motion, left side). `weights` maps the index of a nuisance column to its
+    weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
@@ -615,7 +625,10 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 
 
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Compute the Gram matrix of a whole recording for each equation, divided by the variance of a row, (E, m, m)."""
+    """Compute the Gram matrix of a whole recording for each equation, divided by the variance of a row, (E, m, m).
+
+    `columns`: roles of the columns (leak, motion, left side) in each equation.
+    """
     grams = []
     for e, roles in enumerate(columns):
         fit = _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))

@@ -66,7 +66,7 @@ def compare_with_healthy(
     above: bool = False,
     prior_change: float = np.inf,
 ) -> Observable | None:
-    """Test by Student's t whether a value differs from those of healthy recordings.
+    """Test a value by Student's t for a difference from those of healthy recordings.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def compare_estimates(
     *,
     above: bool = False,
 ) -> Observable | None:
-    """Test whether an estimate differs from those of healthy recordings, where each has a known standard error.
+    """Test an estimate for a difference from those of healthy recordings, each with a known standard error.
 
     Parameters
     ----------

@@ -39,11 +39,11 @@ _TINY = np.finfo(float).tiny
 
 
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
-    """Compute the apparent conductance in each of K blocks of a leak |p_A - p_B|^e of unit coefficient.
+    """Compute the apparent conductance in each of K blocks of a leak with the flow |p_A - p_B|^e.
 
-    It is the regression coefficient of the leak's flow on p_A - p_B: 1 for laminar flow, and from the Gram matrices
-    for an orifice; between the two its logarithm is interpolated. The result maps each exponent e of `EXPONENTS` to
-    an array (K,). `columns`: roles of the columns in each equation.
+    It is the regression coefficient of this flow on p_A - p_B: 1 for laminar flow, and from the Gram matrices for an
+    orifice; between the two its logarithm is interpolated. The result maps each exponent e of `EXPONENTS` to an array
+    (K,). `columns`: roles of the columns (leak, motion, left side) in each equation.
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -53,17 +53,17 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
-    """Compute the mean flow in each of K blocks of a leak |p_A - p_B|^e of unit coefficient.
+    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e.
 
-    It is the mean of |p_A - p_B|^e, whose logarithm is interpolated between e = 1 and e = 1/2. The result maps each
-    exponent e of `EXPONENTS` to an array (K,).
+    Its logarithm is interpolated between e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of
+    `EXPONENTS` to an array (K,).
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each exponent of a leak's law, in the order of `EXPONENTS`.
+    """Return the prior probability of each law of a leak's flow, in the order of its exponents `EXPONENTS`.
 
     Laminar flow has the probability `size.laminar` of `priors.toml`; the other laws are equally probable.
     """
@@ -73,7 +73,7 @@ def law_priors() -> Array:
 
 
 def _growth_priors() -> list[tuple[float, float]]:
-    """List the possible relative growths of a leak from its onset to the end, each with its prior probability."""
+    """List possible relative growths of a leak, from its onset to the recording's end, each with its probability."""
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     return [(0.0, prior.steady), *((float(growth), (1.0 - prior.steady) / N_GROWTHS) for growth in growths)]
@@ -92,8 +92,8 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     """Estimate the mean flow of a leak that begins within a recording, from its onset to the end.
 
     The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`:
-    roles of the columns in each equation; `leak`: likelihood of the leak's coefficient in the blocks; `test`: test
-    for a step of it.
+    roles of the columns (leak, motion, left side) in each equation; `leak`: likelihood of the leak's coefficient in
+    the blocks; `test`: test for a step of it.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)

@@ -111,11 +111,11 @@ class RiseTest(Protocol):
 
     @property
     def score(self) -> float:
-        """Statistic of the test; it grows with the leakage."""
+        """Statistic of the test for increased leakage, such as a z score; it grows with the leakage."""
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy machine scores as high."""
+        """Probability that a healthy machine has at least this score."""
 
     def threshold(self, chance: float) -> float:
         """Return the score that a healthy machine exceeds with the probability `chance`."""
@@ -152,7 +152,7 @@ class LeakMeasure(Protocol):
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest factor by which the stated flow changes for other paths and laws of the leak."""
+        """Smallest and largest factor by which the flow differs from the stated one, for another path or law."""
 
     @property
     def flow_per_conductance(self) -> float:
@@ -180,18 +180,18 @@ class LeakMeasure(Protocol):
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s]: over the whole recording, and while the pump delivers."""
+        """Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers."""
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and whether a step within the recording explains it.
+        """Leakage above that of healthy recordings, with the evidence that a step within the recording caused it.
 
         None without healthy recordings.
         """
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow of this report [m^3/s] to L/min; None if the machine's size is not stated."""
+        """Factor from this detector's flows [m^3/s] to L/min; None if the machine's size is not stated."""
 
     @property
     def size_deviation(self) -> float:
@@ -209,7 +209,7 @@ class LeakMeasure(Protocol):
         """Remarks for the reader of the verdict, on sizes, sensor offsets and delays."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return `flow` relative to the pump's flow and to the piston's area; None if these are unknown."""
+        """Convert a leak's flow to a fraction of the pump's flow and a creep speed of the piston; None if unknown."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
         """Return the total leakage in the recording, and the smallest detectable leak; None if neither is known.

@@ -139,7 +139,7 @@ class StepTest:
 
     @cached_property
     def weights(self) -> Array:
-        """Probability of each onset, given that there is a step."""
+        """Probability of each tried onset, given that there is a step, shape (o,)."""
         weights = np.exp(self.likelihood - self.likelihood.max())
         return np.asarray(weights / weights.sum())
 
@@ -173,7 +173,7 @@ class StepTest:
     def threshold(self, chance: float) -> float:
         """Compute the score that a coefficient without a step exceeds with the probability `chance`.
 
-        The score is twice the logarithm of a likelihood ratio; it is searched from 0 to 10 000.
+        The score is twice the logarithm of a likelihood ratio. The result is limited to the range from 0 to 10 000.
         """
         max_score = 1e4  # upper end of the search, with a probability of practically zero
         if not self.law.chance(0.0) > chance > self.law.chance(max_score):
@@ -196,7 +196,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
         return max(max_step, 0.0)
 
     def excess_chance(fraction: float) -> float:
-        """Compute the probability of a step above `fraction` of `max_step`, minus the required probability."""
+        """Compute the probability of a step above `fraction` of `max_step`, minus that of a step above the bound."""
         return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
 
     return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
@@ -218,7 +218,7 @@ class History(NamedTuple):
         return Interval(value, value - half_width, value + half_width)
 
     def relative_to(self, before: NDArray[np.bool_]) -> History:
-        """Return the history relative to its mean over the blocks flagged in `before` (K,)."""
+        """Subtract from the coefficient's history its mean over the blocks that are flagged in `before` (K,)."""
         transform = np.eye(len(before)) - before / max(int(np.count_nonzero(before)), 1)
         return History(transform @ self.mean, transform @ self.covariance @ transform.T)
 
@@ -269,7 +269,12 @@ class NullLaw(NamedTuple):
     length: float
 
     def chance(self, score: float) -> float:
-        """Compute the probability P (see the module) that a coefficient without a step has a higher score."""
+        """Compute the probability P that a coefficient without a step has a higher score.
+
+        P is the fraction of the unit sphere in m dimensions that lies within a tube about a curve, with a radius that
+        follows from the score. The curve consists of the whitened steps at all onsets (see the module for the
+        formula).
+        """
         from scipy.special import betainc
 
         m = self.dimensions
@@ -373,7 +378,7 @@ class _StepFits(NamedTuple):
     residual_squares: Array
 
     def upside_down(self) -> _StepFits:
-        """Return the fits to -z instead of z: a step up of -z is a step down of z."""
+        """Return the fits of a step down instead of a step up, i.e. those to the readings -z."""
         return self._replace(
             moments=-self.moments, residual_squares=_residual_squares(self.total, -self.moments, self.energies)
         )
@@ -383,7 +388,8 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
 
     `z` (n,): whitened readings of the coefficient; `steps` (n, o): unit steps, whitened in the same way; `eigen`
-    (n,): eigenvalues of the walk's covariance (`_Whitened`). A step down does not reduce the residual.
+    (n,): eigenvalues of the walk's covariance (`_Whitened`). Only steps up count: a step down does not reduce the
+    residual.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -550,10 +556,10 @@ def two_sided_step_test(information: Information) -> StepTest | None:
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return time (K,), precision (K, K) and vector (K,) of the blocks and of the level's prior, the first block.
+    """Add the prior on a coefficient's level to its likelihood, as one more block before the first.
 
-    K includes the added block. No block is added without such a prior, or if there are fewer than `MIN_BLOCKS`
-    blocks.
+    Returns time (K,) [s], precision (K, K) and vector (K,) as in `Information`, where K includes the added block. No
+    block is added without such a prior, or if there are fewer than `MIN_BLOCKS` blocks.
     """
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:

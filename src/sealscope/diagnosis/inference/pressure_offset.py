@@ -39,9 +39,9 @@ N_GRID = 21
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    `columns`: roles of the columns in each equation. The offset is that of maximum a posteriori probability; it is
-    subtracted in the Gram matrices and added to `zero`. Return the blocks unchanged if the balance has no flow
-    offset, or too few blocks have information.
+    `columns`: roles of the columns (leak, motion, left side) in each equation. The offset is that of maximum a
+    posteriori probability; it is subtracted in the Gram matrices and added to `zero`. Return the blocks unchanged if
+    the balance has no flow offset, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -76,9 +76,11 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
     walks = WALKS[: int(_walk_likelihoods(leak_steps, z, WALKS).argmax()) + 1]
 
     def log_likelihood(position: float) -> float:
+        """Compute the log likelihood of an offset, given by its asinh, at the best onset, step and random walk."""
         return float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
 
     def cost(position: float) -> float:
+        """Compute minus the log posterior of an offset, given by its asinh, up to a constant."""
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
@@ -102,12 +104,13 @@ class _WhitenedSteps(NamedTuple):
 
 
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
-    """Compute whitened residuals of leak and constant flow in blocks, and their changes by unit steps of both.
+    """Whiten the residuals of leak and constant flow in blocks, and their changes by unit steps of both.
 
-    `roles`: roles of the columns of the first equation. With the precision P of leak and constant flow in K blocks,
-    (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2) converts changes of the coefficients to
-    changes of z. The leak's level and slope and the quadratic drift of the constant flow (F and B of the module) are
-    projected out. Return None if the blocks have too little information.
+    `roles`: roles of the columns (leak, motion, left side) of the first equation. With the precision P of leak and
+    constant flow in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2) converts
+    changes of the coefficients to changes of z. Slow changes are projected out: level and slope of the leak, and a
+    quadratic drift of the constant flow (F and B of the module). Return None if the blocks have too little
+    information.
     """
     count = len(blocks)
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)

@@ -30,9 +30,9 @@ from sealscope.recordings.recording import Array
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
     """Convert blocks to the balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: columns of `blocks`, among them leakage and flow offset at rest (`terms.with_rests`). For open valves
-    these two columns are dropped from the Gram matrices; for shut valves they are combined with the others
-    (`shut_at_rest_matrix`).
+    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`). For
+    open valves these two columns are dropped from the Gram matrices; for shut valves they are combined with the
+    others (`shut_at_rest_matrix`).
     """
     if shut:
         transform = shut_at_rest_matrix(roles.names)
@@ -77,7 +77,7 @@ def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if the pump or the piston rests in any block.
 
-    `roles`: columns of `blocks`, among them those at rest (`terms.with_rests`).
+    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`).
     """
     bias = roles.names.index(REST_BIAS)
     return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)  # its column is zero in motion
@@ -86,8 +86,8 @@ def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
-    `roles`: columns of `blocks`, among them those at rest (`terms.with_rests`). The odds are limited by `rest.most`
-    in `priors.toml`, and 0 if the recording says nothing about the valves.
+    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`). The
+    odds are limited by `rest.most` in `priors.toml`, and 0 if the recording says nothing about the valves.
     """
     gram = blocks.gram[:, 0]
     at_rest, bias = (roles.names.index(name) for name in RESTS)

@@ -79,6 +79,7 @@ class Mixture(NamedTuple):
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
         def excess(value: float, laws: Mixture = scaled) -> float:
+            """Compute the probability of values below `value`, minus the wanted `probability`."""
             return float(laws.weights @ ndtr((value - laws.centres) / laws.deviations)) - probability
 
         part_quantiles = scaled.centres + ndtri(probability) * scaled.deviations
@@ -183,9 +184,8 @@ class Rise(NamedTuple):
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
         """Compute the log likelihood ratio of a true rise with a log-normal prior about `rise` to no rise.
 
-        It is integrated over a grid of true rises.
-        `log_deviation`: standard deviation of the logarithm of the true rise. The grid resolves both the prior and
-        the likelihood.
+        `log_deviation`: standard deviation of the logarithm of the true rise. The likelihood is integrated over a
+        grid of true rises, which resolves both the prior and the likelihood.
         """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
@@ -218,7 +218,7 @@ class Rise(NamedTuple):
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Compute the central interval (low, high) that contains the true rise with a probability."""
+        """Compute the central interval (low, high) that contains the true rise of the leakage with a probability."""
         tail = 0.5 - 0.5 * probability
         high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
         return self.value - high, self.value - low
@@ -252,7 +252,8 @@ class RecordingSums(NamedTuple):
     ) -> RecordingSums:
         """Summarise a recording from its `blocks`: add up the Gram matrices, and average flow and pressure.
 
-        `columns`: roles of the columns in each equation; `start_s` and `oil_degC` are stored as they are.
+        `columns`: roles of the columns (leak, motion, left side) in each equation; `start_s`: date [s since 1970] and
+        `oil_degC`: oil temperature, None if unknown, are stored as they are.
         """
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (
@@ -269,8 +270,9 @@ def _conductance_of_flow(recording: RecordingSums) -> float:
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: the recording; `baseline`: the healthy ones; `columns`: roles of the columns in each equation, the same
-    for all recordings. The rise is in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa).
+    `judged`: the recording; `baseline`: the healthy ones; `columns`: roles of the columns (leak, motion, left side)
+    in each equation, the same for all recordings. The rise is in the unit of the leak's coefficient, for the laminar
+    leak m^3/(s Pa).
     """
     healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
     prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
@@ -339,8 +341,9 @@ class _Estimates(NamedTuple):
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
     """Estimate by how much the judged leak coefficient exceeds the one that the healthy recordings predict.
 
-    z = asinh(level / 2 c) of a leak coefficient `level` (`_LevelScale`) is normal about an unknown mean. Each
-    recording has an unknown scatter sigma; sessions, oil and unusual conditions add covariances (see the module).
+    `estimates`: rises of all recordings over the healthy mean. Levels are compared as z = asinh(level / 2 c), which
+    is logarithmic for large levels (`_LevelScale`) and normal about an unknown mean. Each recording has an unknown
+    scatter sigma; sessions, oil and unusual conditions add covariances (see the module).
     """
     values, rises, errors, level, level_error, min_crossover = estimates
     prior = INFERENCE.scatter
@@ -385,7 +388,9 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
 def _candidate_covariances(
     sessions: Sequence[int], oil: _Oil, relative_slope: float, *, session_deviation: float, condition_deviation: float
 ) -> tuple[Array, Array]:
-    """Build the candidate covariances of z between recordings, and the log prior of each.
+    """Build the candidate covariances of transformed leak coefficients z between recordings, with log priors.
+
+    z = asinh(a / 2 c) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
 
     Parameters
     ----------
@@ -443,7 +448,10 @@ class _LevelScale(NamedTuple):
         return np.asarray(np.arcsinh((self.level + excess) / (2.0 * self.crossover)))
 
     def slope(self, level: Any) -> Any:
-        """Compute the derivative dz/da of the transform z = asinh(a / 2 c) at a leak coefficient a = `level`."""
+        """Compute the derivative dz/da of the transform z = asinh(a / 2 c) at leak coefficients a = `level`.
+
+        `level`: a number or an array; the result has the same shape.
+        """
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
@@ -644,7 +652,7 @@ class Population:
 
 
 def number_sessions(starts: Sequence[float | None], pause: float) -> list[int]:
-    """Assign each recording to a session: a gap above `pause` [s] between two dates begins a new one.
+    """Assign each recording to a session; a gap above `pause` [s] between two dates begins a new one.
 
     `starts` (n,): dates of the recordings [s since 1970], None if unknown. Return the session number of each
     recording, from 1 on in the order of the dates; -1 if it is undated.
@@ -722,10 +730,10 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     Returns the logarithm of the ratio of the two flows, and its standard error from the recording alone. The ratio
     differs from 1 if area over displacement changed: another machine, or another scale of a sensor.
 
-    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones. The flow is the sum
-    of the coefficients of motion, weighted by the energies of their columns in the recording. The leak is fitted
-    together with the motion, which would otherwise absorb leakage in proportion to the speed. The other coefficients
-    differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: roles of
+    their columns. The flow is the sum of the coefficients of motion, weighted by the sums of squares of their columns
+    in the recording. The leak is fitted together with the motion, which would otherwise absorb leakage in proportion
+    to the speed. The other coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -758,10 +766,11 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
 
 
 def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
-    """Eliminate the coefficients that recordings do not share, such as the flow's offset, from their equations.
+    """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
 
-    `gram` (E, m, m): Gram matrices. They are those with an infinite prior deviation between recordings. The result is
-    the Schur complement of the same shape, in which their rows and columns are zero.
+    They are those without a prior on differences between recordings. `gram` (E, m, m): Gram matrices of E equations;
+    `columns`: roles of the columns (leak, motion, left side) in each equation. The result is the Schur complement of
+    the same shape, in which the rows and columns of the eliminated coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -790,8 +799,8 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
-    `baseline`. `columns`: roles of the columns in each equation. Return None if the balance has no column of an
-    orifice, or the recording has no information on one of the two leaks.
+    `baseline`. `columns`: roles of the columns (leak, motion, left side) in each equation. Return None if the balance
+    has no column of an orifice, or the recording has no information on one of the two leaks.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None

@@ -123,7 +123,7 @@ class Signals:
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """Flag of each sample: 1 if side A carries the load (p_A > p_B without the sensor offset), else 0."""
+        """Flags (n,) of the samples, 1 if side A carries the load (p_A > p_B without the sensor offset), else 0."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
@@ -137,7 +137,7 @@ class Signals:
 
     @cached_property
     def _is_outward(self) -> NDArray[np.bool_]:
-        """True if the piston moves towards B or stands still, at each sample."""
+        """Flags (n,) of the samples in which the piston moves towards B or stands still."""
         return np.asarray(self.speed >= 0.0)
 
     def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
@@ -175,7 +175,7 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
 
 
 def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Flag each run of `length` samples that begins at a flagged sample of `starts` (n,).
+    """Flag the `length` consecutive samples that begin at each flagged sample of `starts` (n,).
 
     The result has the shape (n + length - 1,).
     """
@@ -359,6 +359,7 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
         return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
 
     def weighted_expansion(s: Signals) -> Array:
+        """Compute the increments w V_A d(1/p_A) - (1 - w) V_B d(1/p_B) of the term [m^3/Pa], shape (n - 1,)."""
         weight = weight_A(s)
         return np.asarray(weight * expansion(s, "A") - (1.0 - weight) * expansion(s, "B"))
 
@@ -373,6 +374,7 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
     p = f"p_{side}"
 
     def lost_volume(s: Signals) -> Array:
+        """Compute the increments max(p, 0) dt of the term, times `weight` [Pa s], shape (n - 1,)."""
         return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
 
     return _conductance_term(f"external leak {side}", lost_volume, "external leak", (p,))
@@ -386,6 +388,7 @@ def _compensated_leak_term(side: str) -> Term:
     """
 
     def lost_volume(s: Signals) -> Array:
+        """Compute the increments of the term [Pa s], 0 while the other side has the higher pressure, (n - 1,)."""
         weight = _interval_means(s.carried_by_A) - float(side == "B")
         return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
 
@@ -433,15 +436,19 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     """
 
     def unit_flow(s: Signals) -> Array:
+        """Compute the signed root of the pressure drop over the edge [Pa^0.5], shape (n - 1,)."""
         return _signed_root(s.mean(upstream) - s.mean(downstream))
 
     def proportional_flow(s: Signals) -> Array:
+        """Compute the volume over the edge for a gain of 1, in proportion to the command, shape (n - 1,)."""
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
 
     def overlap_flow(s: Signals) -> Array:
+        """Compute the volume that an overlap of 1 takes from the flow while the edge is open, shape (n - 1,)."""
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
+        """Make a term of the edge's flow, with a coefficient in `unit`, from a function for its increments."""
         return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
 
     return (
@@ -520,16 +527,17 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a load that is held by shut valves.
+    """Return the volume balance of a load that is held by shut valves, i.e. while the command is constant.
 
-    The piston moves only as far as oil leaks from the loaded side. The channels do not separate leaks of seal, valve
-    and line. A constant command means shut valves; x grows as A fills. Return None for a circuit without
-    such valves, as a pump-controlled one, or if position, command or a pressure is missing.
+    The piston moves only as far as oil leaks from the loaded side; x must grow as A fills. The channels do not
+    separate leaks of seal, valve and line. Return None for a circuit without such valves, as a pump-controlled one,
+    or if position, command or a pressure is missing.
     """
     if not rig.circuit.holds_load or not {"x", "u", *_PRESSURES} <= channels:
         return None
 
     def displaced_volume(s: Signals) -> Array:
+        """Compute the volume that the piston displaces on the loaded side [m^3] in each interval, shape (n - 1,)."""
         area = rig.cylinder.A_A if np.nanmean(s.pressure_difference) > 0.0 else rig.cylinder.A_B
         return -area * s.step("x")
 
@@ -554,7 +562,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's balance with additional terms for leakage and flow offset while the pump or the piston rests.
+    """Return a pump's balance with two more terms: leakage and flow offset while the pump or the piston rests.
 
     They are inserted before the terms of the leak.
     """
@@ -574,6 +582,7 @@ def shut_at_rest(equation: Equation) -> Equation:
     left = equation.left
 
     def leaked_volume(s: Signals) -> Array:
+        """Compute (p_A - p_B) dt [Pa s] in intervals of motion and 0 at rest, shape (n - 1,)."""
         return (1.0 - s.at_rest(left)) * s.pressure_difference * s.dt
 
     shut = _insert_before_leaks(equation, _conductance_term(TURNING, leaked_volume, "pump leak", drift="pump"))

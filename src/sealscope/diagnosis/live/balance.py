@@ -118,10 +118,9 @@ class NotJudged(NamedTuple):
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
-        """Make a NotJudged with the reason `status`, whose counter is named after the reason.
+        """Build a NotJudged whose counter has the name of its reason `status`.
 
-        `end` is the end of the block [s], and `restarts` tells whether later blocks cannot be compared with earlier
-        ones.
+        `end` is the end of the block [s]. `restarts` is True if later blocks cannot be compared with earlier ones.
         """
         return cls(end, status, f"blocks: {status}", restarts)
 
@@ -132,10 +131,11 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 
 @kernel
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
-    """Fit a balance's coefficients to K blocks together and store them in `model`.
+    """Fit the coefficients of a volume balance to K blocks together and store them in `model`.
 
-    `grams` (K, m, m) are the blocks' Gram matrices, and `rows` (K,) the number of rows in each block. `column_order`
-    (n + 2,) holds the indices of the n nuisances, the leak and the left side in these matrices.
+    `grams` (K, m, m) are the products of the balance's columns in each block, and `rows` (K,) the number of equations
+    in each block. `column_order` (n + 2,) holds the indices of these columns: n nuisances (terms other than the
+    leak), the leak, and the left side, which is the measured volume.
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
@@ -147,10 +147,11 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
 def _estimate_leak(
     model: Coefficients, gram: Any, column_order: Any, rows: float, is_learned: bool
 ) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in one block from its Gram matrix (m, m).
+    """Estimate the leak's coefficient in one block of a volume balance.
 
-    `column_order` (n + 2,) holds the indices of the n nuisances, the leak and the left side in the matrix. Other
-    arguments and the result are those of `coefficients.estimate_leak`.
+    `gram` (m, m) are the products of the balance's columns in the block. `column_order` (n + 2,) holds the indices of
+    these columns: n nuisances (terms other than the leak), the leak, and the left side. Other arguments and the
+    result are those of `coefficients.estimate_leak`.
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, rows, is_learned)  # type: ignore[no-any-return]
@@ -168,10 +169,9 @@ class LiveBalance:
     block_seconds, has_begun = BLOCK_SECONDS, True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
-        """Start without blocks.
+        """Set up the balance for a rig and the channels `names`, with no samples yet.
 
-        `litres` tells whether the rig states the sizes that are needed for L/min; by default this is found from the
-        rig.
+        `litres` tells if the rig states the sizes that are needed for L/min; by default this is found from the rig.
         """
         self._balances = live_equations(rig, names, with_tested_terms=True)
         if not self._balances:
@@ -209,11 +209,11 @@ class LiveBalance:
         return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _has_valve(rig) else ("pump.q_b",)))
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples, and yield the result of each block that they complete.
+        """Process the next samples, and yield the result of each block of the balance that they complete.
 
-        The next block is processed only when its result is asked for. The first `LEARNED` blocks are estimated
-        together. After a gap the coefficients are kept, and samples before the gap that do not fill a block are
-        dropped.
+        A result is the conductances of a block, or the reason for none. The next block is processed only when its
+        result is asked for. The first `LEARNED` blocks are estimated together. After a gap the coefficients of the
+        balance are kept, and samples before the gap that do not fill a block are dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -229,7 +229,7 @@ class LiveBalance:
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _make_stream(self) -> BlockStream:
-        """Make the object that cuts samples at the present sampling rate into blocks and stores their samples."""
+        """Build the object that cuts samples at the present sampling rate into blocks and keeps their samples."""
 
         def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
             self._closed_samples.append((begin, samples, self._rate))
@@ -237,14 +237,14 @@ class LiveBalance:
         return BlockStream(self._balances, self._rate, BLOCK_SECONDS, on_samples=store_samples)
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
-        """Process completed blocks together with their stored samples, and yield the result of each block."""
+        """Process completed blocks of samples, and yield the conductances of each block or the reason for none."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
             self._signals.take(*samples)
             yield self._take_block(block)
 
     def _take_block(self, block: Blocks) -> BlockResult:
-        """Estimate the conductance in a block, or store the block until the coefficients can be fitted."""
+        """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted."""
         end = self._sample_times(block)[1]
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")
@@ -266,9 +266,9 @@ class LiveBalance:
         return self._estimate_first_blocks(blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the coefficients to the first blocks, and return the estimates of these blocks.
+        """Fit the coefficients of the balance to the first blocks, and return the leakage conductance in each.
 
-        Blocks at standstill are left out. The median precision of these blocks becomes the usual one.
+        Blocks at standstill are left out. The median precision of these conductances becomes the usual one.
         """
         for e, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             _fit_to_blocks(model, np.ascontiguousarray(blocks.gram[:, e]), column_order, blocks.rows)
@@ -279,9 +279,9 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time between two rows of the balance [s].
+        """Half the time between two successive equations of the balance [s].
 
-        The samples of a block reach beyond its first and last row by this much.
+        The samples of a block reach beyond its first and last equation by this much.
         """
         return 0.5 * stride_samples(self._rate) / self._rate
 
@@ -290,17 +290,18 @@ class LiveBalance:
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute how strongly the machine moves in a block, relative to earlier blocks.
+        """Compute the motion of the machine in a block, relative to earlier blocks.
 
-        The measure is the mean square of the left side of the balance (`coefficients.relative_motion`).
+        The measure is the mean square of the left side of the balance, i.e. of the measured volume
+        (`coefficients.relative_motion`).
         """
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
-        """Estimate the leak in a block from all equations of the balance together.
+        """Estimate the leak in a block from all volume balances of the machine together.
 
-        Returns the four results of `coefficients.estimate_leak`, each summed over the equations. With `is_learned`,
-        the block also updates the coefficients.
+        Returns the four numbers (w, w g, w s, w^2 V) of `coefficients.estimate_leak`, each summed over the balances.
+        With `is_learned`, the block also updates the other coefficients.
         """
         rows, equation_parts = float(block.rows[0]), zip(self._models, block.gram[0], self._column_orders, strict=True)
         results = [
@@ -309,9 +310,10 @@ class LiveBalance:
         return tuple(sum(values) for values in zip(*results, strict=True))
 
     def _estimate_block(self, block: Blocks, is_learned: bool = True) -> BlockConductance | NotJudged:
-        """Estimate the conductance in a block; return a NotJudged if a standstill tells too little of it.
+        """Estimate the leakage conductance in a block.
 
-        With `is_learned`, the block also updates the coefficients.
+        Returns a NotJudged if the machine stands still and the estimate is therefore too uncertain. With
+        `is_learned`, the block also updates the other coefficients of the balance.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
@@ -325,7 +327,7 @@ class LiveBalance:
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop all coefficients, for example after a repair.
+        """Drop all learned coefficients of the balance, for example after a repair.
 
         They are then learned anew from the blocks that begin at `since` [s] or later, including stored ones.
         """
@@ -354,7 +356,7 @@ class LiveBalance:
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON, which `load_state` restores."""
+        """Return the learned coefficients and stored blocks as plain values for JSON, which `load_state` restores."""
         return {
             **save_attributes(self, _SAVED),
             "known": [save_attributes(model, _MODEL) for model in self._models],
@@ -363,7 +365,7 @@ class LiveBalance:
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state saved by `state`, so that later results are identical to the last bit.
+        """Restore coefficients and blocks saved by `state`, so that later results are identical to the last bit.
 
         Raises InputError if the state does not fit this rig and these channels.
         """
@@ -387,7 +389,7 @@ _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__
 
 
 def _split(blocks: Blocks) -> list[Blocks]:
-    """Split several blocks into a list of single ones."""
+    """Split several blocks of samples into a list of single ones."""
     return [blocks[k : k + 1] for k in range(len(blocks))]
 
 
@@ -402,7 +404,7 @@ def size_error(rig: Rig) -> float:
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
-    """Build the volume balances that can be watched from the channels `names`.
+    """Build the volume balances of a running machine that the channels `names` allow.
 
     Balances whose flow is computed from the command are left out, and so is the pump's leakage, which cannot be told
     from the piston's. `with_tested_terms` includes terms that are zero in a healthy machine and are only tested for a

@@ -38,21 +38,25 @@ ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
 
 
 class Coefficients(NamedTuple):
-    """Nuisance coefficients of a balance, the sums they are computed from, and work arrays; n is their number.
+    """Coefficients of a volume balance other than the leak's, and the sums over blocks from which they are computed.
+
+    They are called nuisances; n is their number. The left side of the balance is the measured volume.
 
     Attributes
     ----------
-    sums : array, (n + 2, n + 2)
+    sums : ndarray, shape (n + 2, n + 2)
         Weighted products of the columns of nuisances, leak and left side.
-    values : array, (n,)
+    values : ndarray, shape (n,)
         The coefficients.
-    leak_products : array, (n,)
+    leak_products : ndarray, shape (n,)
         Products of the leak's column with the nuisances' columns.
-    numbers : array, (6,)
-        Single numbers, at the indices `ROWS` to `MISFIT`.
-    block : array, (n + 2, n + 2)
+    numbers : ndarray, shape (6,)
+        At the indices `ROWS` to `MISFIT`: number of equations in the sums, sum of squares of their left sides,
+        variance of an equation, sum of squares of the leak's column, shift of the series of estimates, and residual
+        variance of the last block over the usual one.
+    block : ndarray, shape (n + 2, n + 2)
         Work array: the products of one block.
-    matrix : array, (n, n + 3)
+    matrix : ndarray, shape (n, n + 3)
         Work array: the normal equations.
     """
 
@@ -65,16 +69,16 @@ class Coefficients(NamedTuple):
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the arrays in `Coefficients` for n nuisances."""
+    """Return the shapes of the six arrays of a `Coefficients` in their order, for n nuisances."""
     return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
 
 
 @law
 def load_block(model: Any, gram: Any, column_order: Any) -> None:
-    """Copy a block's Gram matrix (m, m) to `model.block`, ordered as nuisances, leak, left side.
+    """Copy the products of a balance's columns in one block to `model.block`, in the order of the model.
 
-    `model` is a `Coefficients`. Nuisances are the coefficients other than the leak's. `column_order` (n + 2,) holds
-    the indices of these columns in the Gram matrix.
+    `model` is a `Coefficients`, and `gram` (m, m) holds the products. `column_order` (n + 2,) holds the indices of
+    these columns: n nuisances (terms other than the leak), the leak, and the left side.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
@@ -83,10 +87,10 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
 
 @large_law
 def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
-    """Add the sums in `model.block` to those of earlier blocks, whose weight decreases.
+    """Add the products in `model.block` to the sums over earlier blocks, whose weight decreases.
 
-    `model` is a `Coefficients`, `rows` the number of rows in the block, and `weight` the weight of the block, 0 to 1.
-    Between blocks the leak may take a random step, with the variance of a block's estimate, or of any size if
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0
+    to 1. Between blocks the leak may take a random step, with the variance of a block's estimate, or of any size if
     `has_stepped`.
     """
     sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
@@ -108,9 +112,10 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
 @large_law
 def _solve(model: Any) -> None:
-    """Solve the normal equations C x = r in place, for the three right-hand sides r in `model.matrix[:, n:]`.
+    """Solve the normal equations C x = r of a balance in place, for three right-hand sides r.
 
-    C (n, n) and the first right-hand side m are computed here from the sums, with the leak's column eliminated.
+    `model` is a `Coefficients` with n coefficients, whose `matrix[:, n:]` holds the right-hand sides. C (n, n) and
+    the first of them are computed here from the sums, with the leak's column eliminated.
     """
     sums, leak = model.sums, len(model.matrix)
     n, left_side = leak, leak + 1  # indices of the leak's column and of the equation's left side
@@ -145,9 +150,9 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute the balance's coefficients other than the leak's, and the variance of a row, from the sums in `model`.
+    """Compute a balance's coefficients other than the leak's, and the variance of its equations.
 
-    `model` is a `Coefficients`, in which both results are stored.
+    `model` is a `Coefficients` with the sums from which both are computed, and in which they are stored.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
@@ -162,10 +167,10 @@ def fit_coefficients(model: Any) -> None:
 
 @large_law
 def _learn_block(model: Any, rows: float, g: float) -> float:
-    """Add `model.block` to the sums, update the usual noise, and return the weight that the block was given.
+    """Add the products in `model.block` to the sums, update the usual noise, and return the block's weight.
 
-    `model` is a `Coefficients`, `rows` the number of rows in the block, and `g` the leak's coefficient in it. The
-    weight is below 1 if the residual variance is more than `JUMP`^2 times the usual one. If g differs from the
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in it.
+    The weight is below 1 if the residual variance is more than `JUMP`^2 times the usual one. If g differs from the
     earlier estimate by more than `JUMP` standard deviations, the leak has stepped and earlier blocks do not constrain
     it any more.
     """
@@ -186,17 +191,18 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 
 @large_law
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in `model.block`; with `is_learned`, also add the block to the earlier ones.
+    """Estimate the leak's coefficient in one block; with `is_learned`, also add the block to the earlier ones.
 
-    `model` is a `Coefficients`, and `rows` the number of rows in the block. Returns (w, w g, w s, w^2 V). g is the
-    estimate and w its precision. Subtracting the shift s from g keeps the series of estimates continuous while the
-    nuisances (the coefficients other than the leak's) improve. V is the variance due to the nuisances. In the code
-    `energy` is the sum of squares of the leak's column, N_k of the module's docstring, and `usual_slope` the
-    regression of a nuisance's column on the leak's column over the last blocks.
+    `model` is a `Coefficients`, whose `block` holds the block's products, and `rows` the number of equations in it.
+    Returns (w, w g, w s, w^2 V). g is the estimate and w its precision. Subtracting the shift s from g keeps the
+    series of estimates continuous while the other coefficients improve. V is the variance of g due to the errors of
+    these coefficients.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
     solution = model.matrix[:, n:]
+    # `energy` is N_k of the module's docstring; below, `usual_slope` is the regression of a nuisance's column on the
+    # leak's column over the last blocks
     energy, usual_energy = max(block[n, n], TINY), max(numbers[ENERGY], TINY)
     for i in range(n):
         solution[i, 1] = block[i, n]
@@ -222,10 +228,10 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 
 @law
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
-    """Compute the mean square of a block's left side, divided by that of earlier blocks.
+    """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
-    `square` is the sum of squares over the block's `rows` rows, and `numbers` are those of `Coefficients`. Returns
-    inf if only this block moved, and 1 if none moved.
+    `square` is the sum of squares over the block's `rows` equations, and `numbers` are those of `Coefficients`.
+    Returns inf if only this block moved, and 1 if none moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -116,7 +116,10 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Chance of the score in a healthy machine over the test's false-alarm probability, limited to 1e-9 to 1."""
+        """Chance of the test's score in a healthy machine, divided by the allowed false-alarm probability.
+
+        The result is limited to 1e-9 to 1.
+        """
         exponent = self.estimate.log_chance - LiveRise(self.test, self.threshold).log_chance
         return math.exp(min(0.0, max(exponent, math.log(1e-9))))
 
@@ -198,10 +201,10 @@ def find_level_rise(
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
-    """Return the conductance before a leak began, and the range it may have at time `t` [s] without the leak.
+    """Return the conductance before a leak began, and the range that it would have at time `t` [s] without the leak.
 
-    The range allows for colder and warmer oil. The range widens from the onset on. After `shift` hours
-    (`priors.toml`) it spans from the coldest to the warmest oil.
+    The range allows for colder and warmer oil, and widens from the onset on. After `shift` hours (`priors.toml`) it
+    spans from the coldest to the warmest oil.
     """
     oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
@@ -267,7 +270,11 @@ class BaselineLearning:
     high: float | None = None
 
     def add(self, g: float, flow: float, duty: Duty) -> None:
-        """Add a block with its conductance `g` [m^3/(s Pa)], the `flow` of a unit conductance, and its duty."""
+        """Add a block to the sums from which the baseline is computed.
+
+        `g` is its conductance [m^3/(s Pa)], `flow` the flow of a unit conductance [L/min per m^3/(s Pa)], and `duty`
+        the logarithms of mean pressure difference and pump flow.
+        """
         self.blocks += 1
         self.total += g
         self.flow += flow
@@ -285,7 +292,7 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from the sums, which must contain at least `GROUP` blocks.
+        """Compute the baseline from the sums over blocks, which must contain at least `GROUP` blocks.
 
         `version` and `hours` are those of the new `WatchBaseline`, and `end` is the end of the last block [s]. With
         `states_lpm`, the baseline also states its level as a flow [L/min].

@@ -42,12 +42,12 @@ UNKNOWN = RiseExplanation(is_leak=False)
 
 
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
-    """Explain an increase of the leakage by the changes that were observed in the blocks around it.
+    """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
     `observables` are the quantities that were tested for a change. `data` is the kind of data that the leakage is
-    estimated from; changes in these data outside the interval `onset` [s] are ignored. `is_settled` tells whether
-    enough blocks have followed to distinguish a leak to the outside from a sensor fault. The result is `UNKNOWN` if
-    nothing explains the increase yet.
+    estimated from; changes in these data outside the interval `onset` [s] are ignored. `is_settled` is True if enough
+    blocks have followed to distinguish a leak to the outside from a sensor fault. The result is `UNKNOWN` if nothing
+    explains the increase yet.
     """
     names = ALARMING if is_settled else LEAK_EVENTS
     events = [event for event in load_events() if event.name in names]
@@ -68,6 +68,9 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
 
 
 def _coincides(observable: Observable, onset: Interval) -> bool:
-    """Test whether the 95 % interval of an observable's onset overlaps the interval `onset`; False if it has none."""
+    """Return True if the 95 % interval of an observed change's onset overlaps the interval `onset`.
+
+    False if the change has no onset.
+    """
     change = observable.onset
     return change is not None and change.low <= onset.high and change.high >= onset.low

@@ -42,7 +42,10 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:
-    """Format the sets of channels from `ways_to_watch` as words for a message."""
+    """Format sets of channels as words for a message, such as "p_A, p_B and u".
+
+    `ways` are the sets of channels from which an actuator can be watched (`ways_to_watch`).
+    """
     return ", or ".join(f"{', '.join(way[:-1])} and {way[-1]}" for way in ways)
 
 
@@ -111,7 +114,10 @@ class SampleJoiner:
         self.counters[reason] = self.counters.get(reason, 0) + number
 
     def restart(self, reason: str) -> None:
-        """Count the reason, and accept any time for the next sample, as the recorder or its clock was restarted."""
+        """Accept any time for the next sample, because the recorder or its clock was restarted.
+
+        The restart is counted under `reason`.
+        """
         self.count(reason)
         self.newest = -math.inf
 
@@ -138,7 +144,11 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels to use: the best recorded set first or when a position appears, else those in use."""
+        """Choose the channels to use from those of the samples.
+
+        These are the best set that is recorded. A set in use is kept, unless a position is recorded for the first
+        time and sets may still be replaced.
+        """
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
         return recorded if not self.names or has_new_position else self.names
@@ -171,11 +181,11 @@ class SampleJoiner:
                 indices = indices[n_samples:]
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON, which `load_state` restores."""
+        """Return channels in use, clock and counters as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore a saved `state`; raise InputError if it does not fit."""
+        """Restore channels, clock and counters saved by `state`; raise InputError if they do not fit."""
         restore_attributes(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
         if self.names not in ((), *self.ways):
             raise InputError(f"saved state's names must be {format_ways(self.ways)}, got {', '.join(self.names)}")
@@ -185,7 +195,10 @@ _SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why an actuator cannot be watched from the channels `names` of these samples; "" if it can."""
+    """Describe a reason why the samples do not suffice to watch an actuator; "" if they do.
+
+    `names` are the channels that are needed.
+    """
     for name in names:
         if name not in samples:
             return f"samples without {name}"

@@ -56,8 +56,8 @@ _MAX_SD: float = PRESSURE.response["G"][1]
 class PressureEstimator:
     """Estimate the leakage conductance block by block from the response of the pressures to the command.
 
-    It does the same as `LiveBalance` where no position is recorded, but states only changes of the conductance. `rig`
-    is the assumed machine, and `litres` tells whether it states the sizes that are needed for L/min.
+    It replaces `LiveBalance` if no position is recorded, but states only changes of the conductance. `rig` is the
+    assumed machine, and `litres` tells if it states the sizes that are needed for L/min.
 
     Attributes
     ----------
@@ -80,7 +80,10 @@ class PressureEstimator:
     states_flow = staticmethod(states_flow)
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
-        """Start without blocks; `rig` and `litres` are described at the class."""
+        """Set up the estimator for a rig, with no samples yet.
+
+        `litres` tells if the rig states the sizes that are needed for L/min; by default this is found from the rig.
+        """
         self._rig = rig
         self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
@@ -99,7 +102,8 @@ class PressureEstimator:
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block that they complete.
 
-        The next block is processed only when its result is asked for.
+        A result is the conductance of a block, or the reason for none. The next block is processed only when its
+        result is asked for.
         """
         if not run.follows:
             self._held[:], self._samples = math.nan, self._samples[:, :0]
@@ -123,8 +127,8 @@ class PressureEstimator:
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
         """Set stuck pressure readings in the first `n_block` columns of `samples` to nan.
 
-        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns False, and changes
-        nothing, if only later samples can tell whether a reading is stuck.
+        `samples` (4, n) holds times and channels, and `rate` is the sampling rate [Hz]. Returns True, or False
+        without a change if only later samples can tell that a reading is stuck.
         """
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         if min(hold.pending for hold in holds) < n_block:
@@ -135,7 +139,7 @@ class PressureEstimator:
         return True
 
     def _estimate_block(self, block: Recording) -> BlockResult:
-        """Estimate the conductance in a block, or return the reason why the block is not judged."""
+        """Estimate the leakage conductance in a block of samples, or return the reason for none."""
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _MIN_RATE:
             return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")
@@ -159,7 +163,7 @@ class PressureEstimator:
         return [BlockConductance(begin, end, g, sd, total=g, offset=_MAX_SD, pressure=pressure, pump_flow=pump_flow)]
 
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
-        """Report a block that the model does not describe, and restart the fit after several such blocks.
+        """Report a block that the model of the pressures does not describe; several such blocks restart the fit.
 
         `follower`: fit of the model; `end`: end of the block [s]; `is_settling`: True if the fit has not yet settled
         after a start or a gap; `restarts`: True if this and later blocks cannot be compared with earlier ones. The
@@ -175,7 +179,7 @@ class PressureEstimator:
         return NotJudged.with_count(end, "settling" if is_settling else "not described by the model", restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
-        """Prepare the fit for a block that follows the last one after a `gap` [s].
+        """Prepare the fit of the pressures for a block that follows the last one after a `gap` [s].
 
         After a change of the sampling rate a new fit starts from the present parameters. Returns the fit to use, and
         True if this and later blocks cannot be compared with earlier ones.
@@ -191,10 +195,10 @@ class PressureEstimator:
         return follower, has_other_rate or not is_short
 
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
-        """Fit a block and store its sums; return whether the model describes the block.
+        """Fit the model of the pressures to a block; return True if the model describes the block.
 
-        The block also updates the usual variance of the residuals. The update is faster while the model is settling
-        or does not describe the block.
+        The fit's sums over the block are stored. The block also updates the usual variance of the residuals. The
+        update is faster while the model is settling or does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
@@ -235,7 +239,7 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Forget what was learned of the machine's parameters, after a repair or an exchange.
+        """Forget the learned parameters of the machine, after a repair or an exchange.
 
         `since` has no effect; it is there for the same call as that of `LiveBalance`.
         """
@@ -243,7 +247,7 @@ class PressureEstimator:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return the state, without the rig, as plain values for JSON, which `load_state` restores."""
+        """Return fit and stored blocks, without the rig, as plain values for JSON, which `load_state` restores."""
         state = save_attributes(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}
@@ -251,9 +255,9 @@ class PressureEstimator:
         return state | {"follower": save_attributes(follower, _FOLLOWER_ATTRIBUTES) | machine}
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state saved by `state`, so that later results are identical to the last bit.
+        """Restore the fit and the blocks saved by `state`, so that later results are identical to the last bit.
 
-        Raises InputError if the state does not fit.
+        Raises InputError if they do not fit.
         """
         restore_attributes(self, _SAVED, state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
@@ -272,6 +276,6 @@ _FOLLOWER_ATTRIBUTES = ("theta", "covariance", "states", "variance", "last")
 
 
 def _recording(rows: Array, rate: float) -> Recording:
-    """Make a recording of stored samples (4, n), whose rows are time [s], p_A, p_B and u."""
+    """Build a recording from stored samples (4, n), whose rows are time [s], p_A, p_B and u."""
     t, *channels = rows
     return Recording(t, dict(zip(_READ, channels, strict=True)), {name: CHANNEL_UNITS[name] for name in _READ}, rate)

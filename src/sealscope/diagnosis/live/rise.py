@@ -27,7 +27,7 @@ class LiveRise(NamedTuple):
     test : str
         "step" for a step within the stream, "level" for a conductance above that of the healthy machine.
     score : float
-        For a step twice the logarithm of an e-value, for a level a normal quantile.
+        Score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level.
     interval : Interval
         Onset with its 95 % interval [s].
     size, deviation : float
@@ -42,7 +42,7 @@ class LiveRise(NamedTuple):
 
     @property
     def log_chance(self) -> float:
-        """Logarithm of the probability that a healthy machine reaches this score or a higher one.
+        """Logarithm of the probability that a healthy machine reaches this score of the test or a higher one.
 
         For a step it is an upper bound by Ville's inequality, -score/2.
         """
@@ -52,21 +52,21 @@ class LiveRise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Largest probability that a healthy machine scores this high."""
+        """Largest probability with which a healthy machine reaches this score of the test."""
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with a probability of at most `chance`."""
+        """Return the score of the test that a healthy machine exceeds with a probability of at most `chance`."""
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))
 
     def onset(self) -> Interval:
-        """Return the onset of the increase [s] with its 95 % interval."""
+        """Return the onset of the increase of the leakage [s] with its 95 % interval."""
         return self.interval
 
     def detectable_step(self, chance: float) -> float:
-        """Return infinity, as the smallest detectable step is not known.
+        """Return infinity, as the smallest step that the test can detect is not known.
 
         It depends on the random walk of the conductance.
         """
@@ -75,10 +75,10 @@ class LiveRise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LiveLeak:
-    """The leakage of a watched machine.
+    """The leakage of a watched machine, in the form that `decision.decide` judges.
 
-    It satisfies the protocol `observable.LeakMeasure`, which explains the fields. `test` is the increase that a test
-    has detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
+    The fields are those of the protocol `observable.LeakMeasure`, which explains them. `test` is the increase that a
+    test has detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
     """
 
     test: LiveRise
@@ -110,7 +110,7 @@ class LiveLeak:
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of the increase, and its standard deviation [m^3/s]."""
+        """Mean flow by which the leakage has increased, and its standard deviation [m^3/s]."""
         pressure = self.flow_per_conductance
         return Flow(self.test.size * pressure, self.test.deviation * pressure)
 
@@ -118,7 +118,7 @@ class LiveLeak:
 
     @property
     def rise_onset(self) -> Interval:
-        """Onset of the increase, with its 95 % interval [s]."""
+        """Onset of the increase of the leakage, with its 95 % interval [s]."""
         return self.test.interval
 
     def relative(self, flow: Flow) -> None:
@@ -132,11 +132,10 @@ class LiveLeak:
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide whether a watched machine leaks.
+    """Decide from the estimated leakage of a watched machine if it leaks.
 
-    `leak`: estimate of its leakage; if there is none yet, `lack` is the reason in one line. Other explanations of an
-    increase are not considered here. They are weighed only once, when the test raises an alarm (module
-    `explanation`).
+    `leak`: the estimate; if there is none yet, `lack` is the reason in one line. Other explanations of an increase
+    are not considered here. They are weighed only once, when the test raises an alarm (module `explanation`).
     """
     report = Observed(WATCH, lack=lack, leak=leak)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

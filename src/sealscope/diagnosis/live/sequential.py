@@ -64,12 +64,15 @@ _SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "lo
 class StepDetector:
     """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
-    The statistic is the e-detector of the module's docstring, whose symbols are used here. For each size q of the
-    random walk a Kalman filter gives `_level` and `_level_variance`. `_squares` and `_count` are T and n of the
+    In a healthy machine the coefficient follows a random walk, whose size q is unknown. For each of several sizes a
+    Kalman filter predicts the next estimate. The detector sums the evidence of a step for each size q and each
+    possible onset j. The module's docstring gives the formulas, whose symbols are used here.
+
+    `_level` and `_level_variance` are the state of each filter. `_squares` and `_count` are T and n of the
     innovations, with fading memory, `_log_weights` the log probability of q, and `_log_variances` the sum of log S.
-    `_sums` (5, q, j) has the rows `_REST` to `_LOG_PRIOR` for each walk q and onset j. `_onsets` (j, 4) holds for
-    each onset the number of innovations since, the number of its block, its time and the begin of its block [s].
-    `_unit` is the standard deviation of the first block, the unit in which estimates are stored.
+    `_sums` (5, q, j) has the rows `_REST` to `_LOG_PRIOR`. `_onsets` (j, 4) holds for each onset the number of
+    innovations since, the number of its block, its time and the begin of its block [s]. `_unit` is the standard
+    deviation of the first block, the unit in which estimates are stored.
     """
 
     def __init__(self) -> None:
@@ -79,7 +82,10 @@ class StepDetector:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all blocks so far and rises that may have begun in them; keep the learned noise and random walk."""
+        """Drop the evidence of all blocks so far, and keep the learned noise and random walk.
+
+        Rises that may have begun in these blocks are not detected any more.
+        """
         self._end = -np.inf
         self._sums, self._onsets = np.zeros((5, len(WALKS), 0)), np.zeros((0, 4))
 
@@ -89,7 +95,7 @@ class StepDetector:
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
-        """Process the estimate `g` of the coefficient in the next block.
+        """Update the evidence of a step by the estimate `g` of the coefficient in the next block.
 
         `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e = g -
         level be the innovation of the Kalman filter for a random walk, S its variance, and f the effect of a unit
@@ -121,9 +127,10 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the noise and the probabilities of the q random walks by one innovation e.
+        """Update the noise and the probabilities of the random walks after a block.
 
-        `variance` (q, 1) is S from each walk's filter, and `square` (q, 1) is e^2 / S.
+        Each of the q walks has a Kalman filter with an innovation e of variance S. `variance` (q, 1) is S, and
+        `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -138,7 +145,10 @@ class StepDetector:
         self._log_variances = self._log_variances + np.log(variance)
 
     def _add_onsets(self, begin: float, end: float) -> None:
-        """Add possible onsets in the block from `begin` to `end` [s], one for each of `PARTS`; thin out old ones."""
+        """Add possible onsets of a step in the block from `begin` to `end` [s]; thin out old ones.
+
+        There is one for each of `PARTS`, the fractions of the block in which the leak is open.
+        """
         sums = np.zeros((5, len(WALKS), len(PARTS)))
         log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
         # pi_j(q) p_q(e_j..e_k) = exp(sums[_LOG_PRIOR]) T_k^(-n/2) prod S^(-1/2), up to a factor equal for all q
@@ -152,7 +162,7 @@ class StepDetector:
             self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
-        """Compute the logarithm of the evidence (e-value M of the module's docstring) that the coefficient has risen.
+        """Compute the logarithm of the evidence that the coefficient has risen (e-value M of the module's docstring).
 
         The result is minus infinity if no rise can have begun yet, or if a quick upper bound of log M is at most
         `min_log_e`.
@@ -167,29 +177,35 @@ class StepDetector:
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
 
     def _log_likelihoods(self) -> Array:
-        """Compute how likely each random walk q is by the estimates since each onset j, if no step occurred, (q, j).
+        """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        The result is the logarithm of the walk's prior at the onset times the likelihood, up to a constant equal for
-        all q.
+        The prior of the walk at the onset is included. A constant equal for all q is left out.
         """
         n, log_T = self._onsets[:, 0], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratio log R of a step of size v under walk q with onset j, (v, q, j)."""
+        """Compute the log likelihood ratios (v, q, j) of a step of the coefficient against none.
+
+        There is one for each prior size v of the step, random walk q and onset j.
+        """
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
         explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
         return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, 0] * np.log1p(-explained)))
 
     def _log_terms(self) -> Array:
-        """Compute the logarithms of the terms whose sum is M, for each step size v, walk q and onset j, (v, q, j)."""
+        """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
+
+        There is one for each prior size v of the step, random walk q and onset j. The sum is M in the module's
+        docstring.
+        """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate when the coefficient has risen and by how much.
+        """Estimate the onset and the size of a rise of the coefficient.
 
         Both are averages over the random walks, the onsets and the prior sizes, weighted by their probabilities.
         """
@@ -216,7 +232,7 @@ class StepDetector:
         """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
 
         The bound is the quantile, at `probability`, of the rise under the condition that it is positive. It is
-        infinite until there have been enough blocks for a rise to begin in one of them.
+        infinite until there have been enough blocks in which a rise may begin.
         """
         if not len(self._onsets):
             return np.inf
@@ -230,21 +246,21 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of the innovations over the variance that the blocks state for their estimates.
+        """Variance of the estimates' prediction errors (innovations) over the variance that the estimates state.
 
-        It applies to the random walk whose variance per block is a tenth of a block's variance.
+        It applies to the random walk whose variance per block is a tenth of that of the first block's estimate.
         """
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON, which `load_state` restores."""
+        """Return the evidence of the detector as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore a state saved by `state`, so that later results are identical to the last bit.
+        """Restore the evidence saved by `state`, so that later results are identical to the last bit.
 
-        Raises InputError if the state does not fit.
+        Raises InputError if it does not fit.
         """
         restore_attributes(self, _SAVED, state)
         if self._sums.shape[2] != len(self._onsets):
@@ -252,11 +268,11 @@ class StepDetector:
 
 
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
-    """Select the onsets to keep: all of the last `RECENT` blocks, and fewer of older blocks.
+    """Flag the possible onsets of a step to keep, (j,): all of the last `RECENT` blocks, and fewer of older blocks.
 
     Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the
-    age `HORIZON`. `block` is the number of the present block and `onsets` (j, 4) are those of `StepDetector`. Returns
-    flags (j,).
+    age `HORIZON`. `block` is the number of the present block. `onsets` (j, 4) holds for each onset the number of
+    innovations since, the number of its block, its time and the begin of its block [s].
     """
     _, onset_block, onset, block_start = onsets.T
     age = block - onset_block

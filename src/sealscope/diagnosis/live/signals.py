@@ -61,7 +61,10 @@ _GROUP_SIZES = (1, 2, 4)
 
 
 class SignalWindow:
-    """Duty, noise, hum and mean pressures of the last `WINDOW` blocks of a machine, and tests for their changes."""
+    """Features of the last `WINDOW` blocks of a running machine, and tests for their changes.
+
+    The features are duty, noise, mains hum and mean pressures.
+    """
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 0))
@@ -113,8 +116,9 @@ class SignalWindow:
     def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
         """Test the mean pressures in either direction of motion for steps.
 
-        Blocks are averaged in the smallest groups in which the machine moves both ways. `rows` are stored blocks,
-        `time` (n,) their centres [s]. The result is empty if there are too few groups.
+        `rows` are the stored features of n blocks, and `time` (n,) the centres of the blocks [s]. The blocks are
+        averaged in the smallest groups in which the machine moves both ways. The result is empty if there are too few
+        groups.
         """
         # a row ends with a Gram matrix, flattened
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)
@@ -130,12 +134,12 @@ class SignalWindow:
         return ()
 
     def state(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON, which `load_state` restores."""
+        """Return the features of the last blocks as plain values for JSON, which `load_state` restores."""
         return save_attributes(self, ("_rows", "_means"))
 
     def load_state(self, state: Any) -> None:
-        """Restore a state saved by `state`, so that later results are identical to the last bit.
+        """Restore the features saved by `state`, so that later results are identical to the last bit.
 
-        Raises InputError if the state does not fit.
+        Raises InputError if they do not fit.
         """
         restore_attributes(self, ("_rows", "_means"), state)

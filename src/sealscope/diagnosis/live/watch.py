@@ -126,10 +126,10 @@ class Watch:
         self._since = math.nan  # begin of the first block that others are compared with [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
-        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
+        """Compute the false-alarm probability of a single test that is made once in `seconds`.
 
-        Each test has a fixed fraction of the stated rate of false alarms. Raises InputError if no threshold can be
-        set for this rate.
+        `test` is `STEP` or `LEVEL`; each has a fixed fraction of the stated rate of false alarms. Raises InputError
+        if no threshold can be set for this rate.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
@@ -146,15 +146,19 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig and learning time [h] of the baseline, and for each way of watching if the rig states L/min.
+        """Settings with which the baseline is learned: (rig, mapping, learning time [h]).
 
-        The order is rig, mapping from way of watching to bool, learning time.
+        The mapping tells, for each way of watching ("volumes", "pressures"), if the rig states the sizes that are
+        needed for L/min.
         """
         return self._rig, self._litres, self.learn_hours
 
     @property
     def method(self) -> str:
-        """Way of watching, "pressures" if channels without a position are in use and "volumes" otherwise."""
+        """Way of watching, "pressures" if the channels in use contain no position and "volumes" otherwise.
+
+        It is "volumes", too, until samples have arrived.
+        """
         return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
 
     @property
@@ -188,7 +192,11 @@ class Watch:
         return decide_on_stream(measure, probability)
 
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Describe the detected `leak` or, if `leak` is None, the upper bound of an undetected one."""
+        """Describe the detected `leak` in the form that the decision judges.
+
+        If `leak` is None, the result describes the upper bound of an undetected leak. `estimator` states the
+        uncertainty of flows.
+        """
         make_measure = partial(
             LiveLeak,
             flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
@@ -254,9 +262,10 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the numbering of an earlier watch, which had other settings.
+        """Continue the numbering of an earlier watch of the same machine, which had other settings.
 
-        `blocks` is the number of its blocks, and `baseline_version` the version of its baseline.
+        `blocks` is the number of blocks of that watch, and `baseline_version` the version of its baseline. The next
+        baseline has the version that follows.
         """
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
@@ -277,15 +286,15 @@ class Watch:
         self._forget()
 
     def _forget(self) -> None:
-        """Restart the tests, and drop all blocks that later ones would be compared with."""
+        """Restart the tests for a leak, and drop all blocks with which later ones would be compared."""
         self._detector.forget()
         self._compared, self._grouped = self._compared[:0], 0
 
     def judge(self, result: BlockResult) -> BlockEstimate:
-        """Test a result of the estimator for a leak, and return the estimate of its last block.
+        """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        If there is no conductance, the returned estimate states the reason. `blocks` counts results: the blocks of
-        the first fit arrive together as one.
+        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of
+        the first fit arrive together in one result, and count as one block; the estimate is that of the last of them.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -300,7 +309,10 @@ class Watch:
         return estimate
 
     def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
-        """Test a block against all earlier ones, learn from it, and estimate its leak."""
+        """Test a block against all earlier ones and estimate its leak.
+
+        The block is added to the baseline while that is learned.
+        """
         row = np.array([block], _BLOCK)
         is_finite = all(abs(number) < _MAX_NUMBER for number in block)
         if not (is_finite and self._detector.is_representable(block.g, block.sd)):
@@ -330,9 +342,10 @@ class Watch:
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
-        """Add a block to the tests; restart them after a pause and at a change between known and other duties.
+        """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        `row` is the block as an array with one row of `_BLOCK`.
+        A change of duty is one from known duties, those of the baseline, to others or back. `row` is the block as an
+        array with one row of `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -359,7 +372,7 @@ class Watch:
         """Test for a step of the conductance after a block, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a higher score replaces its onset and size. Returns True if a step was
-        found but is not, or not yet, explained by a leak.
+        found that a leak does not, or not yet, explain.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -379,10 +392,10 @@ class Watch:
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
-        """Explain an increase of the conductance by the blocks around it, or as a leak if these are no longer stored.
+        """Find the cause of an increase of the conductance in the blocks around it.
 
-        If the explanation is the start of the machine, or surely another event, the tests restart and the event is
-        counted.
+        The cause is a leak if these blocks are no longer stored. If it is the start of the machine, or surely another
+        event, the tests restart and the event is counted.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))
         if n_since < _EXPLANATION.shows:
@@ -444,11 +457,12 @@ class Watch:
         before: float | None = None,
         cause: Cause | None = None,
     ) -> None:
-        """Set the leak alarm, `self.leak`, from a significant increase of the conductance at the end of a block.
+        """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance.
 
-        `threshold` is that of the test, and `reason` the text of the alarm. `before` is the conductance before the
-        onset, by default the mean of the blocks before it. `cause` is by default that of the estimator. If there is
-        an alarm already, its time and its conductance before the onset are kept.
+        The increase was found at the end of `block`. `threshold` is that of the test, and `reason` the text of the
+        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is
+        by default that of the estimator. If there is an alarm already, its time and its conductance before the onset
+        are kept.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -520,7 +534,10 @@ class Watch:
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the watch as plain values for JSON; ``"version"`` is that of the format."""
+        """Return the state of the watch as plain values for JSON, which `from_state` restores.
+
+        ``"version"`` is that of the format.
+        """
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,

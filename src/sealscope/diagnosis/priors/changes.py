@@ -8,13 +8,13 @@ class SignalPriors(PriorTable):
     """Features of the signals, such as noise and hum, and how much they change in a healthy machine.
 
     - `blocks`: most blocks that a recording is divided into.
-    - `order`: number of differences by which noise is told from motion and ringing.
+    - `order`: number of successive differences of a signal, which leave its noise and remove motion and ringing.
     - `mains` [Hz]: frequencies of the electric grids.
-    - `highest`: highest frequency over the sampling rate at which a hum is looked for.
+    - `highest`: highest frequency at which hum is looked for, over the sampling rate.
     - `neighbours` [bins]: distances of the spectral lines that a line of hum is compared with.
     - `shortest` [s]: shortest block.
-    - `busy`: smallest time in motion, over that of the busiest block, with which a block counts as in motion.
-    - `wander`: change of the logarithm of a feature within a recording.
+    - `busy`: a block counts as in motion if it moves for at least this fraction of the time of the busiest block.
+    - `wander`: change of the logarithm of a feature within a recording, a standard deviation.
     """
 
     blocks: int
@@ -28,10 +28,10 @@ class SignalPriors(PriorTable):
 
 
 class PressureLevelPriors(PriorTable):
-    """Mean pressures in either direction of motion.
+    """Blocks in which the mean pressures during forward and backward motion are compared.
 
-    - `blocks`: numbers of blocks that are tried, the largest first.
-    - `least`: smallest fraction of a block's time for which it moves in either direction.
+    - `blocks`: numbers of blocks that a recording may be divided into, tried from the largest on.
+    - `least`: smallest fraction of a block's time that the machine must move in each direction.
     - `slowest`: lowest speed that counts as motion, over the highest one.
     """
 
@@ -41,13 +41,13 @@ class PressureLevelPriors(PriorTable):
 
 
 class HealthyLevelPriors(PriorTable):
-    """Friction and drift of a pressure, compared with healthy recordings.
+    """Friction of a recording and drift of its pressures, in the comparison with healthy recordings.
 
     - `slowest`: lowest speed that counts as motion, over the highest one.
     - `friction`: standard error of the logarithm of a recording's friction.
     - `scatter`: standard deviation of this logarithm between days.
-    - `recordings`: number of recordings that the prior on the scatter counts for.
-    - `drift` [Pa]: standard deviation of a transducer's zero within a recording.
+    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `drift` [Pa]: standard deviation of the drift of a pressure sensor's zero within a recording.
     """
 
     slowest: float
@@ -58,15 +58,15 @@ class HealthyLevelPriors(PriorTable):
 
 
 class OctavePriors(PriorTable):
-    """Spectra of both pressures in octaves, compared with healthy recordings.
+    """Ratio of the spectra of p_A and p_B in octaves, in the comparison with healthy recordings.
 
     - `lowest`, `highest` [Hz]: limits of the frequencies that are compared.
-    - `share`: highest frequency over the sampling rate.
-    - `busy`: quantile of the windows' powers that counts.
-    - `seconds` [s]: length of a window.
-    - `error`: standard error of the ratio of a recording.
-    - `scatter`: standard deviation of the ratio between days.
-    - `recordings`: number of recordings that the prior on the scatter counts for.
+    - `share`: highest frequency that is compared, over the sampling rate.
+    - `busy`: quantile of the windows' powers that represents the recording, high because the machine may often rest.
+    - `seconds` [s]: length of a window, of which a spectrum is computed.
+    - `error`: standard error of the logarithm of the ratio in one recording.
+    - `scatter`: standard deviation of this logarithm between days.
+    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
     """
 
     lowest: float
@@ -80,9 +80,12 @@ class OctavePriors(PriorTable):
 
 
 class FilteredPriors(PriorTable):
-    """Change of the spectrum's tilt that a filter or a clogged line of a transducer causes.
+    """Tilt of the spectrum of one pressure that a filter or a clogged line of its sensor causes.
 
-    - `size`: median size.
+    The tilt is the change of the log ratio of p_A to p_B from low to high frequencies. Its size has a log-normal
+    prior.
+
+    - `size`: median size of the tilt.
     - `spread`: standard deviation of the logarithm of the size.
     """
 
@@ -91,13 +94,13 @@ class FilteredPriors(PriorTable):
 
 
 class ChargePriors(PriorTable):
-    """Drifts of the low values of the pressures.
+    """Drift of the charge pressure, seen in the lowest pressures of the chambers.
 
     - `share`: smallest fraction of the samples in which a chamber fed at the charge pressure is low.
-    - `near` [Pa]: range of the low values above the lowest one.
+    - `near` [Pa]: a pressure is low up to this difference from the lowest one.
     - `seconds` [s]: averaging time.
     - `scatter` [Pa/s]: standard deviation of the drift between days.
-    - `recordings`: number of recordings that the prior on the scatter counts for.
+    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
     """
 
     share: float
@@ -108,7 +111,7 @@ class ChargePriors(PriorTable):
 
 
 class ChangePriors(PriorTable):
-    """The tables of `inference/changes/priors.toml`."""
+    """All tables of `inference/changes/priors.toml`, the assumptions on signals that a leak does not change."""
 
     features: SignalPriors
     levels: PressureLevelPriors

@@ -6,8 +6,8 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class SmallestLeakPriors(PriorTable):
     """Definition of the smallest detectable leak of a machine.
 
-    - `power`: probability with which the next recording shows it.
-    - `repeats`: factors on the number of healthy recordings that are tried to halve it.
+    - `power`: probability with which the next recording shows this leak.
+    - `repeats`: factors by which more healthy recordings are assumed, to find how many would halve this leak.
     """
 
     power: float
@@ -15,7 +15,7 @@ class SmallestLeakPriors(PriorTable):
 
 
 class CommissionedPriors(PriorTable):
-    """The table of `commissioned/priors.toml`."""
+    """The only table of `commissioned/priors.toml`, which defines the smallest detectable leak of a machine."""
 
     smallest: SmallestLeakPriors
 

@@ -4,12 +4,14 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class NullPriors(PriorTable):
-    """Prior on the error of the false-alarm probabilities that a detector's own law gives.
+    """Prior on the error of the chances that a detector states for the scores of healthy recordings.
 
-    - `fails`: fraction of machines on which the law does not hold for a statistic.
-    - `inflation`: exponential scale of the logarithm of the factor by which such a law underestimates a surprisal's
-      mean.
-    - `largest`: largest such factor.
+    A surprisal is -log(chance), with a mean of 1 if the chances are right. If they are not, its mean is larger by a
+    factor.
+
+    - `fails`: fraction of machines on which the chances of a statistic are wrong.
+    - `inflation`: exponential scale of the logarithm of the factor.
+    - `largest`: largest factor.
     """
 
     fails: float
@@ -20,22 +22,21 @@ class NullPriors(PriorTable):
 class QuestionPriors(PriorTable):
     """Division of the false-alarm probability of a diagnosis among its tests.
 
-    - `within`: fraction for a change within the recording if there are healthy recordings; without them, fraction for
-      the
-      leakage against the limit in the rig's file.
+    - `within`: fraction of the test for a change within the recording. Without healthy recordings, it is the fraction
+      of the test of the leakage against the limit in the rig's file.
     """
 
     within: float
 
 
 class ExplanationPriors(PriorTable):
-    """Probabilities from which an explanation is named or a leak stated.
+    """Probabilities from which a leak is stated, excluded, or replaced by another explanation.
 
-    - `heading`: factor by which another event that is named for a healthy recording may be rarer than a false leak.
+    - `heading`: allowed probability of naming another event for a healthy recording, over that of a false leak.
     - `leak`: probability from which a change is called a leak.
     - `named`: probability from which a cause other than a leak is named.
     - `sure`: a leak is excluded if its probability is below 1 - `sure`.
-    - `misfit`: smallest relative error with which a term describes the data.
+    - `misfit`: smallest relative error with which a term of the model is assumed to describe the data.
     """
 
     heading: float
@@ -46,9 +47,9 @@ class ExplanationPriors(PriorTable):
 
 
 class WorthPriors(PriorTable):
-    """Limits beyond which "no leak" is not stated.
+    """Limits beyond which the verdict "no leak" would say too little and is not stated.
 
-    - `share`: largest upper bound of a leak, over the pump's flow.
+    - `share`: largest upper bound of an undetected leak, over the pump's mean flow.
     - `unjudged`: largest fraction of a recording after its last judged sample.
     """
 
@@ -57,7 +58,7 @@ class WorthPriors(PriorTable):
 
 
 class DecisionPriors(PriorTable):
-    """The tables of `decision/priors.toml`."""
+    """All tables of `decision/priors.toml`, the probabilities on which a decision rests."""
 
     null: NullPriors
     questions: QuestionPriors

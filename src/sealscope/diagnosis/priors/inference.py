@@ -4,7 +4,9 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class DriftPriors(PriorTable):
-    """Relative change of each kind of coefficient in a minute, a standard deviation [1/min].
+    """Drift of each kind of coefficient in a volume balance.
+
+    Each field is the standard deviation of the relative change in a minute [1/min].
 
     - `motion`: coefficients of the motion, such as displacement over area.
     - `compliance`: compressed oil.
@@ -13,7 +15,7 @@ class DriftPriors(PriorTable):
     - `leak`: leakage past the piston.
     - `pump`: leakage of the pump.
     - `outside`: leakage to the outside.
-    - `edge`: gain of a servo valve's edge.
+    - `edge`: gain of a servo valve's control edge.
     """
 
     motion: float
@@ -27,9 +29,9 @@ class DriftPriors(PriorTable):
 
 
 class DifferencePriors(DriftPriors):
-    """Relative difference of each kind of coefficient between recordings of one machine, a standard deviation.
+    """Relative difference of each kind of coefficient between recordings of one machine.
 
-    Fields as in `DriftPriors`, but without a unit, and in addition:
+    Each field is a standard deviation. The fields are those of `DriftPriors`, but without a unit, and in addition:
 
     - `speed`: flow that the pump loses in proportion to its speed.
     """
@@ -38,7 +40,7 @@ class DifferencePriors(DriftPriors):
 
 
 class LevelPriors(PriorTable):
-    """Size of a constant flow in a balance, a standard deviation.
+    """Standard deviations of constant flows in a volume balance, whose mean is zero.
 
     - `outside` [m^3/s]: constant leakage to the outside.
     - `gas` [m^3/s]: flow from an accumulator whose gas changes its temperature.
@@ -52,8 +54,8 @@ class BlockPriors(PriorTable):
     """Division of a recording into blocks.
 
     - `longest`, `shortest` [s]: limits of a block's length.
-    - `blocks`: number of blocks below which blocks are shorter than the longest.
-    - `coarse`: largest number of blocks for changes other than those of the leak.
+    - `blocks`: number of blocks of a recording, unless their length would be outside these limits.
+    - `coarse`: largest number of blocks in tests for changes other than leaks.
     """
 
     longest: float
@@ -63,18 +65,20 @@ class BlockPriors(PriorTable):
 
 
 class ScatterPriors(PriorTable):
-    """Scatter of the leakage between recordings of one machine; leakages are divided by the pump's mean flow.
+    """Scatter of the leakage between recordings of one machine.
 
-    - `between`: factor to which the standard deviations of `DifferencePriors`, together, are uncertain.
+    Leakages are divided by the pump's mean flow.
+
+    - `between`: factor by which all standard deviations of `DifferencePriors` together may be wrong.
     - `freedom`: degrees of freedom of the prior on the scatter of the motion's coefficients.
-    - `estimate`: standard deviation of the scatter that a recording's own rows predict.
+    - `estimate`: smallest scatter, over the standard error that a recording states for its leakage.
     - `finest`: smallest scatter of the leakage.
     - `leak`: standard deviation of the leakage between recordings.
     - `largest`: largest scatter of the leakage.
     - `relative`: largest scatter of the leakage's logarithm.
     - `unlike`: fraction of days whose unrecorded oil temperature is unlike that of all others.
-    - `session`: standard deviation of the leakage between sessions.
-    - `tail`: probability that a healthy recording is unlike all others.
+    - `session`: standard deviation of the leakage between sessions with oil of one viscosity.
+    - `tail`: probability that the healthy recordings do not predict a healthy recording, on either side.
     """
 
     between: float
@@ -94,8 +98,8 @@ class ConditionPriors(PriorTable):
 
     - `ratio`: logarithm of load or speed over those of the healthy days, a standard deviation.
     - `oil` [K]: change of the oil temperature within a day.
-    - `motion`: exponent with which displaced over pumped volume depends on load and speed, a standard deviation.
-    - `leak`: exponent with which a conductance depends on load and speed, a standard deviation.
+    - `motion`: exponent of load and speed in the ratio of displaced to pumped volume, a standard deviation.
+    - `leak`: exponent of load and speed in a leak's conductance, a standard deviation.
     """
 
     ratio: float
@@ -110,9 +114,8 @@ class OilPriors(PriorTable):
     - `warmest`: largest conductance, with the warmest oil, over the smallest.
     - `per_kelvin`, `per_kelvin_deviation` [1/K]: relative increase of a leak per kelvin, and its standard deviation.
     - `shift` [h]: time in which the oil warms by the largest difference.
-    - `per_drop`, `per_drop_deviation`: exponent with which a leak falls with the viscous pressure drop of the motion,
-      and
-      its standard deviation.
+    - `per_drop`, `per_drop_deviation`: the leak is inversely proportional to this power of the viscous pressure drop
+      of the motion; the exponent and its standard deviation.
     - `drop_tells`: probability that a change of this pressure drop is due to the oil and not to the duty.
     """
 
@@ -129,7 +132,7 @@ class SizePriors(PriorTable):
     """Uncertainty of a machine's sizes, as relative standard deviations, and the law of its leak.
 
     - `displacement`: displacement of the pump.
-    - `law`: mean flow of a leak whose law is between that of a laminar leak and that of an orifice.
+    - `law`: mean flow of a leak of unknown law, which may be laminar, an orifice or between the two.
     - `laminar`: prior probability of a laminar leak.
     - `readings`: number of independent readings of the leak's law in a recording.
     - `meter`: scale of a flow meter.
@@ -145,11 +148,11 @@ class SizePriors(PriorTable):
 
 
 class RepeatPriors(PriorTable):
-    """Flow that the same motion needs on another day, as relative standard deviations.
+    """Differences of the flow that the same motion needs on another day, as relative standard deviations.
 
     - `error`: error within a recording.
     - `scatter`: scatter between days.
-    - `recordings`: number of recordings that the prior on the scatter counts for.
+    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
     """
 
     error: float
@@ -169,10 +172,11 @@ class GrowthPriors(PriorTable):
 
 
 class StepSize(PriorTable):
-    """Size of a change, with a log-normal prior.
+    """Size of a change other than a leak past the piston, with a log-normal prior.
 
-    - `size`: median, of an external leak [m^3/s], of free air [Pa], of a drift [Pa/s], of a scale relative.
-    - `spread`: standard deviation of the logarithm.
+    - `size`: median size. It is in [m^3/s] for an external leak, [Pa] for free air, [Pa/s] for a drift, and relative
+      for a scale.
+    - `spread`: standard deviation of the logarithm of the size.
     """
 
     size: float
@@ -180,11 +184,11 @@ class StepSize(PriorTable):
 
 
 class SensePriors(PriorTable):
-    """Probabilities of other causes of what looks like a wrong sign of the flow into side A.
+    """Probabilities that a sign of the recorded flow looks wrong for another reason than wrong wiring.
 
-    - `work`: that the load gives back more work than it takes.
-    - `leak`: that zeros, compliance and losses of the pump look like a negative leak.
-    - `sides`: that the sides A and B are exchanged in the log.
+    - `work`: the load gives back more work than it takes.
+    - `leak`: zeros, compliance and losses of the pump look like a negative leak.
+    - `sides`: the sides A and B are exchanged in the log.
     """
 
     work: float
@@ -193,22 +197,23 @@ class SensePriors(PriorTable):
 
 
 class HeldOilPriors(PriorTable):
-    """Oil that is enclosed in a cylinder side while valves shut it.
+    """Oil that is enclosed in the sides of a cylinder while shut valves hold it; such a time is a hold.
 
     - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and its relative standard deviation.
     - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and its relative standard deviation.
     - `unlike`: largest ratio of the areas of both sides.
-    - `right`: probability that the holds are right if they disagree with the whole recording.
-    - `agrees`: standard deviation of the logarithm of a conductance between holds and whole recording.
-    - `rare`: chance below which the holds tell something of a leak's size.
+    - `right`: probability that the holds are right about a leak's size if they disagree with the whole recording.
+    - `agrees`: standard deviation of the logarithm of the ratio of the conductances from holds and whole recording.
+    - `rare`: chance in a healthy machine below which a rise of the leakage in the holds is used to size the leak.
     - `settles` [s]: time in which valves shut.
     - `shortest` [s]: shortest hold.
     - `equalises` [s]: time in which a leak equalises the pressures of a hold.
-    - `loaded`: log odds from which a pressure difference is surely a load.
+    - `loaded`: log odds from which a pressure difference is surely due to a load, and not to an offset of the
+      sensors.
     - `independent`: number of independent readings of one side in a hold.
-    - `misfit`: fraction of the compressed volume that the terms do not describe.
+    - `misfit`: fraction of the compressed volume that this model of the oil does not describe.
     - `gain`: relative difference between the gains of two pressure sensors.
-    - `charge`: variation of the charge pressure over the smallest pressure of either side.
+    - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
     - `air`: volume fraction of free air in the oil.
     """
 
@@ -232,20 +237,20 @@ class HeldOilPriors(PriorTable):
 
 
 class PressurePriors(PriorTable):
-    """Range in which the terms of free air hold.
+    """Smallest pressure at which free air is modelled.
 
-    - `least` [Pa]: smallest absolute pressure.
+    - `least` [Pa]: this absolute pressure, below which oil boils.
     """
 
     least: float
 
 
 class ZeroPriors(PriorTable):
-    """Offset of a pressure sensor.
+    """Offset of a pressure sensor's zero.
 
-    - `pressure` [Pa]: standard deviation between two sensors.
-    - `far` [Pa]: standard deviation of a sensor that is far off.
-    - `odds`: probability of a sensor that is far off.
+    - `pressure` [Pa]: standard deviation of the offset between two usual sensors.
+    - `far` [Pa]: standard deviation of the offset of a faulty sensor.
+    - `odds`: probability that a sensor is faulty.
     """
 
     pressure: float
@@ -254,10 +259,12 @@ class ZeroPriors(PriorTable):
 
 
 class HealthyPriors(PriorTable):
-    """Leakage conductance of a healthy machine, as standard deviations.
+    """Leakage conductance of a healthy machine.
 
-    - `outside` [m^3/(s Pa)]: to the outside.
-    - `piston` [m^3/(s Pa)]: past the piston.
+    Each field is a standard deviation.
+
+    - `outside` [m^3/(s Pa)]: leakage to the outside.
+    - `piston` [m^3/(s Pa)]: leakage past the piston.
     """
 
     outside: float
@@ -265,14 +272,15 @@ class HealthyPriors(PriorTable):
 
 
 class HeldPriors(PriorTable):
-    """A piston whose position a control loop holds or returns.
+    """A piston without a recorded position, which a control loop holds or returns.
 
-    - `half` [s]: half the width of a test function while the piston is held.
+    - `half` [s]: half the width of a test function, the smooth weight of samples in one equation, while the piston is
+      held.
     - `settles` [s]: time in which pressures settle after a motion.
     - `slow`: largest speed of a held piston over its highest speed.
     - `averaged` [s]: time over which the speed is averaged.
     - `share`: smallest leakage of a pump over its mean flow.
-    - `elsewhere`: fraction of a test function in which noise may change the sign of p_A - p_B.
+    - `elsewhere`: fraction of a test function's weight in which noise may change the sign of p_A - p_B.
     - `creep` [m/s]: largest speed of a load that shut valves hold.
     """
 
@@ -286,17 +294,19 @@ class HeldPriors(PriorTable):
 
 
 class RestPriors(PriorTable):
-    """A pump at rest; flows are divided by the mean flow in motion.
+    """A pump at rest, from which valves may cut off the cylinder.
+
+    Flows are divided by the mean flow in motion.
 
     - `averaged` [s]: time over which the flow is averaged.
     - `least` [s]: shortest rest.
-    - `share`: largest mean flow at rest.
+    - `share`: largest averaged flow at rest.
     - `holding`: mean flow of a pump that holds a load.
     - `moves`: smallest mean flow in a block of motion.
-    - `shut`: leakage of a healthy piston over that of pump and piston, a standard deviation.
-    - `open`: difference of the leakage of a pump at rest and in motion, a standard deviation.
-    - `most`: largest log odds, from one healthy recording, that valves cut the pump off.
-    - `alone`: the same for a judged recording.
+    - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
+    - `open`: relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation.
+    - `most`: limit of the log odds, from a healthy recording, that valves cut the pump off.
+    - `alone`: the same limit for a judged recording.
     - `locked`: mean log odds of healthy recordings from which valves surely hold the pressures.
     """
 
@@ -313,7 +323,7 @@ class RestPriors(PriorTable):
 
 
 class InferencePriors(PriorTable):
-    """The tables of `inference/priors.toml`."""
+    """All tables of `inference/priors.toml`, the assumptions on the terms of a volume balance."""
 
     drift: DriftPriors
     level: LevelPriors

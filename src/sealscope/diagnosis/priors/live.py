@@ -6,7 +6,8 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class SampleClock(PriorTable):
     """Clock of the samples of a running machine.
 
-    - `follows`: smallest and largest step between successive samples, over the sampling interval.
+    - `follows`: smallest and largest time between successive samples, over the sampling interval. Nearer samples are
+      copies, farther ones have a gap between them.
     - `rate`: relative error of a stated sampling rate.
     """
 
@@ -19,9 +20,10 @@ class LiveBlocks(PriorTable):
 
     - `seconds` [s]: length of a block.
     - `learned` [blocks]: number of blocks before the first estimate.
-    - `tells`: smallest precision of a block at standstill, over that of a usual block, with which it counts.
+    - `tells`: smallest precision of a leak's estimate in a block at standstill, over that of a usual block, with
+      which the block is used.
     - `standstill`: mean square of the motion, over the usual one, below which a machine stands still.
-    - `wakes` [blocks]: number of blocks with far more motion than ever before from which the machine is learned anew.
+    - `wakes` [blocks]: the machine is learned anew after this number of blocks with far more motion than ever before.
     """
 
     seconds: float
@@ -32,10 +34,11 @@ class LiveBlocks(PriorTable):
 
 
 class CoefficientMemory(PriorTable):
-    """Memory of the estimated coefficients.
+    """Memory of the estimated coefficients of a volume balance.
 
-    - `memory` [blocks]: time after which a block counts for 1/e.
-    - `returns` [blocks]: time in which the series of estimates returns to the level that the coefficients give.
+    - `memory` [blocks]: age at which a block has the weight 1/e.
+    - `returns` [blocks]: time constant with which the series of leakage estimates returns to the level given by the
+      present coefficients.
     - `jump`: standard deviations beyond which a residual is a glitch or a step.
     """
 
@@ -45,17 +48,18 @@ class CoefficientMemory(PriorTable):
 
 
 class StepPriors(PriorTable):
-    """A step of the leak within the stream of blocks.
+    """A step of the leak within the stream of blocks, and the random walk of a healthy machine's leakage.
 
-    - `walks`: variances of a healthy machine's random walk in a block, over that of a block's estimate, each equally
-      likely.
-    - `sizes`: variances of the step, over that of a block's estimate, each equally likely.
+    Variances are divided by that of a block's estimate.
+
+    - `walks`: variances of the random walk in one block, each equally likely.
+    - `sizes`: variances of the step, each equally likely.
     - `parts`: fractions of the first block in which the leak is open, each equally likely.
     - `changes`: probability per block that the random walk changes its size.
-    - `memory`: factor per block on the weight of earlier blocks for noise and random walk.
-    - `recent` [blocks]: time for which all onsets are kept.
+    - `memory`: factor per block by which earlier blocks lose weight in the estimates of noise and random walk.
+    - `recent` [blocks]: age up to which all possible onsets are kept; of older ones only some are.
     - `horizon` [blocks]: largest age of an onset.
-    - `stated` [blocks]: number of blocks that the stated variance of an estimate counts for.
+    - `stated` [blocks]: the stated variance of an estimate weighs as much as this number of blocks.
     """
 
     walks: tuple[float, ...]
@@ -74,9 +78,9 @@ class WatchPriors(PriorTable):
     - `pause` [s]: longest pause across which blocks are compared.
     - `margin`: logarithm by which pressure and flow may lie outside the range of the baseline.
     - `damped`: logarithm by which a leak may lower the pressure difference.
-    - `inside`: smallest fraction of a leak, seen by the pressures, that is inside the actuator.
-    - `group` [blocks]: number of blocks in a mean that is compared with the baseline.
-    - `recent` [blocks]: number of blocks in the mean that is stated as the present leak.
+    - `inside`: smallest fraction of a leak, as estimated from the pressures, that flows past the piston.
+    - `group` [blocks]: number of blocks whose mean is compared with the baseline.
+    - `recent` [blocks]: number of blocks whose mean is stated as the present leak.
     - `step`: fraction of the false alarms for the test for a step.
     - `level`: fraction of the false alarms for the test against the baseline.
     """
@@ -92,12 +96,12 @@ class WatchPriors(PriorTable):
 
 
 class RiseExplanationPriors(PriorTable):
-    """Explanation of an increase of the leakage by the blocks around it.
+    """Search for the cause of an increase of the leakage in the blocks around it.
 
     - `window` [blocks]: number of blocks that are stored.
-    - `shows` [blocks]: number of blocks since the onset before an explanation is looked for.
-    - `rare`: largest chance with which a change shows in the blocks.
-    - `start` [blocks]: time after a pause within which an increase is due to the start.
+    - `shows` [blocks]: number of blocks since the onset before a cause is looked for.
+    - `rare`: a change shows in the blocks if its chance in a healthy machine is at most this one.
+    - `start` [blocks]: time after a pause within which an increase is due to the start of the machine.
     - `settles` [blocks]: number of blocks since the onset after which the explanation is final.
     """
 
@@ -109,14 +113,14 @@ class RiseExplanationPriors(PriorTable):
 
 
 class LiveResponse(PriorTable):
-    """Fit of the pressure response to a running machine.
+    """Fit of a model of the pressure response to a running machine.
 
     - `seconds` [s]: length of a block.
     - `begins` [s]: length of the first fit.
-    - `settling`, `resuming` [blocks]: time until the simulated states have settled, at first and after a gap.
-    - `described`: standard deviations of a block's chi square beyond which the model does not describe it.
-    - `lost` [blocks]: number of successive blocks that are not described after which the fit is started anew.
-    - `usual` [blocks]: time over which the usual variance is averaged.
+    - `settling`, `resuming` [blocks]: time until the simulated states have settled, after the start and after a gap.
+    - `described`: the model describes a block if its chi square is below this number of standard deviations.
+    - `lost` [blocks]: number of successive blocks without such a description after which the fit starts anew.
+    - `usual` [blocks]: time over which the usual variance of the residuals is averaged.
     """
 
     seconds: float
@@ -129,7 +133,7 @@ class LiveResponse(PriorTable):
 
 
 class LivePriors(PriorTable):
-    """The tables of `live/priors.toml`."""
+    """All tables of `live/priors.toml`, the assumptions on a running machine."""
 
     samples: SampleClock
     block: LiveBlocks

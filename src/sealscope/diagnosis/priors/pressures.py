@@ -16,7 +16,7 @@ class ResponseBlocks(PriorTable):
 
     - `most`: largest number of blocks.
     - `shortest` [s]: shortest block.
-    - `wander` [s]: time for which the change of a parameter is stated.
+    - `wander` [s]: time for which other priors state the change of a parameter.
     - `slowest` [Hz]: lowest sampling rate.
     """
 
@@ -55,7 +55,7 @@ class ConductancePriors(PriorTable):
 
     - `wander` [m^3/(s Pa)]: its change in 90 s, a standard deviation.
     - `level` [m^3/(s Pa)]: its standard deviation between recordings of one machine.
-    - `orifice`: mean flow of an orifice over that of the laminar leak that fits the response best.
+    - `orifice`: mean flow through an orifice, over that of the laminar leak with the same effect on the pressures.
     """
 
     wander: float
@@ -64,9 +64,10 @@ class ConductancePriors(PriorTable):
 
 
 class FrictionLaw(PriorTable):
-    """A law of friction; the unit of lengths per force is [m/N].
+    """Parameters of a law of friction for the contact of piston and seal.
 
-    - `give` [m/N]: compliance of the contact before it slides: centre, standard deviation and change in 90 s.
+    - `give` [m/N]: displacement per force before the contact slides. The three numbers are centre, standard deviation
+      and change in 90 s.
     - `creep` [m/s]: largest speed of creep; None to use the value of the rig.
     """
 
@@ -75,16 +76,16 @@ class FrictionLaw(PriorTable):
 
 
 class FollowPriors(PriorTable):
-    """Fits along a recording.
+    """Fits of the pressure response along a recording.
 
     - `window` [s]: length of the first fit.
-    - `beginning` [s]: length of the beginning, which is run once before the fit.
+    - `beginning` [s]: length of the beginning, which is fitted once before the actual fit to find its initial values.
     - `block` [s]: length of a block of the beginning.
     - `settling` [s]: time in which the drive starts.
     - `centring` [s]: time constant of the mean position, from which the load's spring force is counted.
     - `slow` [periods]: width of the Gaussian filter that removes the ringing.
-    - `unexplained`: standard deviations of a block's chi square above which jumps of parameters are tried.
-    - `explained`: largest fraction of the variance of p_A - p_B that valid parameters leave unexplained.
+    - `unexplained`: jumps of parameters are tried if a block's chi square exceeds this number of standard deviations.
+    - `explained`: largest fraction of the variance of p_A - p_B that a valid fit leaves unexplained.
     """
 
     window: float
@@ -98,9 +99,9 @@ class FollowPriors(PriorTable):
 
 
 class PressureResponsePriors(PriorTable):
-    """The tables of `inference/pressures/priors.toml`.
+    """All tables of `inference/pressures/priors.toml`, for machines that are judged by pressures and command.
 
-    Three of them are mappings by the name of a parameter. `response` gives centre, standard deviation and change in
+    Three of them are mappings from the name of a parameter. `response` gives centre, standard deviation and change in
     90 s. `start` gives the middle of the values from which fits start, and the factor from it to the largest one.
     `jump` gives the same for values after a jump.
     """

@@ -6,12 +6,11 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class WalkPriors(PriorTable):
     """Random walk of the logarithm of the RMS over time.
 
-    - `machine`, `noise`, `duty` [1 in 90 s]: half-Cauchy scales of the standard deviation that it gains in `time`,
-      due to
-      the machine, to noise and to a duty that does not repeat.
+    - `machine`, `noise`, `duty` [1 in 90 s]: half-Cauchy scales of the standard deviation of its change in `time`.
+      They are the parts due to the machine, to noise and to a duty that does not repeat.
     - `tried`: number of rates of the walk between recordings that are tried.
     - `time` [s]: time for which the scales are stated.
-    - `least`: smallest fraction of a detail's energy that is due to the machine.
+    - `least`: smallest fraction of a wavelet detail's energy that is due to the machine.
     """
 
     machine: float
@@ -23,12 +22,14 @@ class WalkPriors(PriorTable):
 
 
 class DutyExponents(PriorTable):
-    """Exponents of a power law for a detail's RMS over the duty, as prior standard deviations.
+    """Exponents of power laws for the RMS of a wavelet detail over the duty.
 
-    - `command`: of the command's RMS.
-    - `rate`: of the RMS of the command's rate of change.
-    - `load`: of the RMS of the pressure difference.
-    - `direction`: of the mean pressure difference over its RMS.
+    Each field is a prior standard deviation of the exponent of one quantity.
+
+    - `command`: RMS of the command.
+    - `rate`: RMS of the command's rate of change.
+    - `load`: RMS of the pressure difference.
+    - `direction`: mean pressure difference over its RMS.
     """
 
     command: float
@@ -89,7 +90,7 @@ class RingingRates(PriorTable):
 
 
 class RmsChangePriors(PriorTable):
-    """The tables of `rms_change/priors.toml`."""
+    """All tables of `rms_change/priors.toml`, the assumptions on the RMS of the pressures' wavelet details."""
 
     walk: WalkPriors
     duty: DutyExponents

@@ -4,10 +4,10 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class LevelDeviation(PriorTable):
-    """Scatter of the level between recordings of one machine.
+    """Scatter of the leakage level between recordings of one machine.
 
     - `volume_balance`: standard deviation over the usual level, for the volume balance.
-    - `ringing`: standard deviation of the ringing's logarithm.
+    - `ringing`: standard deviation of the logarithm of the pressures' ringing.
     - `nodes`: number of standard deviations that are tried.
     - `freedom`: degrees of freedom of the prior.
     - `lasts`: fractions of the variance that are correlated over time, each equally likely.
@@ -23,10 +23,10 @@ class LevelDeviation(PriorTable):
 
 
 class LevelError(PriorTable):
-    """Errors of the level of a single recording.
+    """Errors of the leakage level of a single recording.
 
-    - `ringing`: standard error of the ringing's logarithm.
-    - `scale`: relative difference of the scale above which recordings cannot be compared.
+    - `ringing`: standard error of the logarithm of the pressures' ringing.
+    - `scale`: largest relative difference of the ratio of displacement to area between recordings that are compared.
     """
 
     ringing: float
@@ -34,10 +34,10 @@ class LevelError(PriorTable):
 
 
 class ChangeScales(PriorTable):
-    """Scales of the half-normal priors on a change.
+    """Scales of the half-normal priors on a change of the leakage level.
 
     - `steps` [deviations between recordings]: sizes of a step.
-    - `intervals` [intervals between recordings]: time in which a growth reaches one deviation.
+    - `intervals` [intervals between recordings]: time in which a growth reaches one standard deviation.
     - `wait` [d]: longest wait between recordings that counts as running time.
     """
 
@@ -47,7 +47,7 @@ class ChangeScales(PriorTable):
 
 
 class HistoryPriors(PriorTable):
-    """Limits of a fitted history.
+    """Limits of a machine's history that is fitted to its recordings.
 
     - `outlier` [deviations between recordings]: distance beyond which a single recording is an outlier.
     - `furthest` [d]: longest time that is predicted.
@@ -58,7 +58,7 @@ class HistoryPriors(PriorTable):
 
 
 class TrendPriors(PriorTable):
-    """The tables of `trend/priors.toml`."""
+    """All tables of `trend/priors.toml`, the assumptions on the leakage of a machine from recording to recording."""
 
     between: LevelDeviation
     reading: LevelError

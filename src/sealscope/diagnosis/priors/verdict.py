@@ -15,8 +15,8 @@ class RepairPriors(PriorTable):
 class FalseAlarmPriors(PriorTable):
     """Probability of the verdict "leak" on a leak-free recording.
 
-    - `probability`: default.
-    - `rarest`, `largest`: limits of what a caller may ask for.
+    - `probability`: default value.
+    - `rarest`, `largest`: limits of the values that a caller may choose.
     """
 
     probability: float
@@ -25,7 +25,7 @@ class FalseAlarmPriors(PriorTable):
 
 
 class VerdictPriors(PriorTable):
-    """The tables of `verdict/priors.toml`."""
+    """All tables of `verdict/priors.toml`, which are the default repair limit and the false-alarm probabilities."""
 
     repair: RepairPriors
     false_alarm: FalseAlarmPriors

@@ -67,12 +67,12 @@ class RmsBlocks:
 
     @property
     def share(self) -> float:
-        """Fraction of all blocks that have no missing samples."""
+        """Fraction of the recording's blocks that are used; in the others too many samples are missing."""
         return len(self.log_rms) / max(len(self.log_rms) + self.n_left_out, 1)
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns of `log_rms`, such as "d3 of p_A"."""
+        """Names of the columns of `log_rms`, such as "d3 of p_A" for the third wavelet detail of p_A."""
         return column_names(self.chambers)
 
     @property
@@ -92,7 +92,7 @@ class RmsBlocks:
 
 
 def column_names(chambers: Sequence[str]) -> list[str]:
-    """Return the names of the columns of `RmsBlocks.log_rms`, such as "d3 of p_A"."""
+    """Return the names of the columns of `RmsBlocks.log_rms`, such as "d3 of p_A" for a wavelet detail of p_A."""
     return [f"{quantity} of {chamber}" for chamber in chambers for quantity in QUANTITIES]
 
 
@@ -103,9 +103,10 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 
 
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
-    """Compute log RMS (5 per judged chamber,) and duty (4,) of a whole recording, as described for `RmsBlocks`.
+    """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    Samples at the ends, where the wavelet transform depends on padding, are left out.
+    Both are described for `RmsBlocks`. Samples at the ends, where the wavelet transform depends on padding, are left
+    out.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -114,9 +115,10 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 
 
 def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
-    """Compute log RMS (n, 5 per chamber) and duty (n, 4) of the blocks between consecutive sample `bounds` (n + 1,).
+    """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
-    `transformed` holds the wavelet details of each chamber.
+    Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
+    the numbers of the samples at which blocks begin and end.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -134,10 +136,11 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
-    """Cut a recording into blocks and compute their log RMS and duty.
+    """Cut a recording into blocks and compute the log RMS of wavelet details and features of the duty of each.
 
-    The recording must be uniformly sampled and without missing samples. Samples at the ends, where the wavelet
-    transform depends on padding, are left out.
+    The recording must be uniformly sampled and its gaps filled in. Blocks of which too many samples were missing are
+    left out, and so are samples at the ends, where the wavelet transform depends on padding. From the results the
+    mean differences between the phases of a duty cycle are removed.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -186,8 +189,9 @@ def _find_frozen(
 ) -> str | None:
     """Describe the first block in which a pressure reading is stuck; None if there is none.
 
-    A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. `is_complete` (n,) marks
-    the blocks without missing samples, and `times` (n + 1,) are the bounds of the blocks [s].
+    A reading is stuck if one of its wavelet details d1 to d4 is only rounding error or not finite. `log_rms`: log RMS
+    of the details in n blocks; `is_complete` (n,): flags of the blocks without missing samples; `times` (n + 1,):
+    bounds of the blocks [s].
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

@@ -47,7 +47,7 @@ class RmsChange:
         """Create the detector; `rig` is ignored, as the method assumes nothing of the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the recording is long enough and its chamber pressures move, else the reason why not."""
+        """Return None if the recording is long enough and its chamber pressures vary, else the reason why not."""
         if missing := describe_missing_chambers(recording):
             return missing
         if len(recording) < min_samples():
@@ -68,7 +68,7 @@ class RmsChange:
         }
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the RMS of the details for changes.
+        """Test the RMS of the pressures' wavelet details for changes.
 
         The recording is compared with those of `baseline` or, without one, tested for a change within it. If the
         sampling rate is too low or the recording too short, the report is empty and states the reason.
@@ -89,10 +89,11 @@ class RmsChange:
 
 
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
-    """Test every detail of every chamber for a step of its RMS within one recording.
+    """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
     All quantities are assumed to change at one onset, which is found from the sum of their log likelihoods. `rate` is
-    the sampling rate [Hz], and `unused` are recorded columns that belong to no channel.
+    the sampling rate [Hz], and `unused` are recorded columns that belong to no channel. If a quantity has too little
+    information, the report is empty and states the reason.
     """
     changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -125,9 +126,10 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 
 
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
-    """Test the RMS of a recording's details for changes against leak-free recordings of the same chambers and rate.
+    """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    If there is none, the report is empty and states the reason.
+    These must have the same chamber pressures and sampling rate. If there is none, the report is empty and states the
+    reason.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, and must be of the same ones
@@ -151,7 +153,7 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
 def compare_summaries(
     judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]
 ) -> tuple[tuple[Observable, ...], float]:
-    """Test every detail of every chamber for a rise or fall of its RMS against leak-free recordings.
+    """Test the RMS of every chamber pressure's wavelet details for a rise or fall against leak-free recordings.
 
     `judged` and `summaries` are results of `RmsChange.learn`. Returns one observable for each detail, and the
     smallest 95 % upper bound of an undetected change over all judged quantities (change of log RMS).
@@ -172,14 +174,14 @@ def compare_summaries(
 
 
 def _is_judged(column: str) -> bool:
-    """Test whether the detail in a column name, such as "d3 of p_A", is one of those that are judged (`JUDGED`)."""
+    """Return True if the wavelet detail in a column name, such as "d3 of p_A", is a judged one (`JUDGED`)."""
     return column.split(maxsplit=1)[0] in JUDGED
 
 
 def _make_observable(
     column: str, size: float, score: float, chance: float, chambers: Sequence[str], onset: Interval | None = None
 ) -> Observable:
-    """Make the observable for the change of one column, such as "d3 of p_A".
+    """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
     `size` is the change of the log RMS, and `chance` the p-value of a single test. It is multiplied by the number of
     tests: a rise and a fall of each judged quantity in each chamber.

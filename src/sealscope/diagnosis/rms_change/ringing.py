@@ -25,11 +25,13 @@ from sealscope.signals.details import QUANTITIES
 
 
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
-    """Compute the change of the log RMS without noise, and the fraction of the energy that is not noise.
+    """Compute the change of the log RMS of wavelet details without noise, and the noise-free fraction of energy.
 
-    `log_rms` (n, 5 per chamber) are the values of n blocks or recordings. `healthy` (k, 5 per chamber) are those from
-    which the machine's mean energy S_j in each detail is estimated, as the energy that exceeds that of d1. The energy
-    E_1 of d1 in the same row is the noise. Returns y and w of the module's equations, both in the shape of `log_rms`.
+    The changes are y = log RMS - log sqrt(S_j + E_1), the fractions w = S_j / (S_j + E_1). `log_rms` (n, 5 per
+    chamber) are the values of n blocks or recordings. `healthy` (k, 5 per chamber) are those from which the machine's
+    mean energy S_j in each detail is estimated, as the energy that exceeds that of d1. The energy E_1 of d1 in the
+    same row is the noise. Both results have the shape of `log_rms`; for d1 itself y is the log RMS, and w is 1. The
+    product d3d4 changes as d3 and d4 together, with w = 1.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -47,10 +49,11 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 
 
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Compute the likelihood of the machine's change of amplitude, g of the module, in each block of a recording.
+    """Compute the likelihood of the relative change g of the ringing's amplitude in each block of a recording.
 
-    The effect of the duty is eliminated. Returns one `Information` (a normal likelihood over the blocks) for each
-    column of `blocks.log_rms`, and the mean weight w of each column.
+    Noise is subtracted (`subtract_noise`), and the effect of the duty eliminated. Returns one `Information` (a normal
+    likelihood over the blocks) for each column of `blocks.log_rms`, and the mean of each column's fraction of energy
+    that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance
@@ -75,11 +78,12 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def estimate_rises(
     log_rms: Array, duty: Array, healthy: Array, healthy_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Estimate the change g of each quantity relative to n leak-free recordings, corrected for the duty.
+    """Estimate the change g of the ringing's amplitude relative to n leak-free recordings, corrected for the duty.
 
     `log_rms` (5 per chamber,) and `duty` (4,) are those of the judged recording, `healthy` (n, 5 per chamber) and
     `healthy_duty` (n, 4) those of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free
-    recordings and of the judged one [s], None if unknown. Returns the changes and their weights w, (5 per chamber,).
+    recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet quantity, and the
+    fractions of their energy that are not noise, (5 per chamber,).
 
     The healthy values are modelled by a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over
     time. The rate of this process is unknown. Its variance is that between sessions, which are separated by a pause.

@@ -61,8 +61,8 @@ class LeakReading:
         Method by which the level was estimated. None if no level can be stated; `problem` then tells why.
     level, error : float
         Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)]. For the basis "ringing"
-        minus the mean log RMS of the details. Unless `states_flow`, it is relative to the assumed machine. nan
-        without a basis.
+        it is minus the mean log RMS of the pressures' wavelet details. Unless `states_flow`, it is relative to the
+        assumed machine. nan without a basis.
     states_flow : bool
         True if the level can be stated in L/min.
     area : float or None
@@ -141,10 +141,11 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the leakage by the best method that a recording without defects allows.
+    """Estimate the leakage by the best method that the channels of a recording allow.
 
-    The methods are the volume balance, the pressure response and the ringing, in this order. Returns the fields of
-    `LeakReading` that depend on the method, or only its `problem` if no method is possible.
+    The methods are the volume balance, the pressure response and the damping of the pressures' ringing, in this
+    order. The recording `part` must have no defects. Returns a mapping with the fields of `LeakReading` that depend
+    on the method, or only with its `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     no_balance, no_response = unusable_reason(balance, part), unusable_reason(response, part)
@@ -173,7 +174,7 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
 
 
 def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Return the fields of `LeakReading` for a conductance from the volume balance."""
+    """Collect the fields of `LeakReading` that follow from the solution of a volume balance, by their names."""
     size, total = solution.size, solution.conductance
     return {
         "basis": "volume balance",
@@ -190,9 +191,10 @@ def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[s
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the standard deviation of the level between recordings of one machine.
+    """Make the prior on the standard deviation of a leakage level between recordings of one machine.
 
-    `usual` is the typical level. The volume balance has a prior in proportion to it.
+    `basis` is the method by which the levels were estimated, and `usual` the typical level. For the volume balance,
+    the standard deviation is proportional to it.
     """
     between = TREND.between
     if basis == "pressure response":
@@ -230,19 +232,19 @@ class TrendPoint(LeakReading):
     high: float | None = None
 
     def time_of_day(self, day: float) -> float:
-        """Convert a time of the trend, in days since the first recording, to seconds since 1970."""
+        """Convert a time of the trend, in days since its first recording, to seconds since 1970."""
         return self.start + (day - self.day) * DAY
 
 
 def build_timeline(
     readings: Sequence[LeakReading], every: float | None = None
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
-    """Sort readings by time and group those that can be compared with each other.
+    """Sort leakage readings by time and group those that can be compared with each other.
 
-    Only readings of the most frequent basis are used; the readings of a group have nearly equal scales of position or
-    angle. `every` is the time between readings [s] if they are to be dated in the order of their names. Returns the
-    readings with their groups, and for each group a text on its difference from the first one. Raises InputError if
-    the time of a reading is unknown.
+    Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
+    displacement to area, i.e. the same sensors. `every` is the time between readings [s], with which they are dated
+    in the order of their file names; None if their times are known. Returns (readings with their groups, texts). Each
+    text tells how one group differs from the first. Raises InputError if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -264,9 +266,10 @@ def build_timeline(
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time; if `every` [s] is given, date them at equal intervals in the order of their names.
+    """Sort leakage readings by time.
 
-    Raises InputError if the time of a reading is unknown.
+    If `every` [s] is given, they are dated at equal intervals in the order of their file names. Raises InputError if
+    the time of a reading is unknown.
     """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
@@ -281,9 +284,10 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
-    """Return for each reading the reason why it is left out, "" for those that are used.
+    """List the reason why each reading is left out of a trend, "" for those that are used.
 
-    A reading is left out if it has no level, is a copy of another recording, or has another basis than most readings.
+    A reading is left out if it has no leakage level, is a copy of another one, or was estimated by another method
+    than most readings.
     """
     file_of_digest: dict[str, str] = {}
     notes = []
@@ -301,9 +305,10 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 
 
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """List the findings on a trend: errors of the clock, readings left out, and groups that cannot be compared.
+    """List the findings on a trend: errors of the clock, recordings left out, and groups that cannot be compared.
 
-    Readings that are left out for reasons that differ only in numbers share one finding.
+    `points` are the recordings in the order of time, and `differences` a text for each group on its difference from
+    the first. Recordings left out for reasons that differ only in numbers share one finding.
     """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
@@ -322,17 +327,20 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
 
 
 def _join_files(readings: Iterable[LeakReading]) -> str:
-    """Join the file names of readings in a text, at most three of them."""
+    """Join the file names of readings to a text for messages, which contains at most three names."""
     return join_names((reading.file for reading in readings), 3)
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative change from the scale `other` to `scale`; 0 if one of them is unknown."""
+    """Compute `scale` / `other` - 1; 0 if one of them is unknown.
+
+    Both are a machine's measured ratio of displacement to area, from two readings.
+    """
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
-    """Find signs that a clock was set back; at most one finding.
+    """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
     The signs are recordings that overlap, and times that fall while the numbers in the file names rise. Recordings
     dated without a time of day have the same start and do not count as overlapping.

@@ -251,7 +251,10 @@ class Trend:
         return str(time_ms)[:19]  # without the fraction of a second
 
     def _format_days(self, days: Interval | None) -> dict[str, str | float | None] | None:
-        """Format value and ends of an interval of days like `_format_day`; None for None."""
+        """Format the value and the limits of an interval of days as ISO dates, or as numbers if no dates are known.
+
+        The result is None if `days` is None.
+        """
         return days and {name: self._format_day(day) for name, day in days._asdict().items()}
 
 
@@ -340,7 +343,10 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Add levels, periods between repairs and the decision to a trend of at least one comparable recording."""
+    """Complete a trend by its levels, the periods between repairs and the decision.
+
+    The trend must have at least one recording that can be compared.
+    """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
     averages, rows = levels.average_neighbours(), trend.rows
@@ -361,7 +367,10 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Return the points with values in the trend's unit, and the findings with one on outliers if there are any."""
+    """Add the leakage in the trend's unit to the points of a trend, and a finding if there are outliers.
+
+    `levels` are the converted levels of the compared points. Returns (points, findings).
+    """
     points, findings, outliers = [*trend.points], [*trend.findings], np.flatnonzero(outlier_excess(levels)[1])
     remark = "apart from the recordings before and after: it counts as if it were near"
     for k, row in enumerate(trend.rows):
@@ -376,25 +385,25 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count how many of the first recordings, known to be healthy, are among the compared ones; at least 1."""
+    """Count the compared recordings that were known to be healthy; at least 1."""
     digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
 
 
 class _ConvertedLevels(NamedTuple):
-    """Levels in the trend's unit, and the factor that converts the level of a reading to that unit."""
+    """Leakage levels in the trend's unit, and the factor by which a reading's level was multiplied."""
 
     levels: Levels
     trend_units_per_level: float
 
 
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
-    """Convert the compared levels to the trend's unit and to the oil temperature of the first recording.
+    """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are
-    conductances [m^3/(s Pa)] or, for the ringing, logarithms, whose difference from the healthy mean is converted to
-    %.
+    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. The temperature is
+    that of the first recording. Levels are conductances [m^3/(s Pa)] or, for the ringing, logarithms; the difference
+    of a logarithm from the healthy mean is converted to %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
@@ -419,7 +428,10 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Convert the repair limit to an increase of the level in the trend's unit; None if it cannot be converted."""
+    """Convert the repair limit to an increase of the leakage in the trend's unit; None if it cannot be converted.
+
+    `trend_units_per_level` is the factor from the level of a reading to that unit.
+    """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:
         return trend.repair.value / LITRE_PER_MINUTE

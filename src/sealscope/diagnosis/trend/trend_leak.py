@@ -31,10 +31,10 @@ MIN_RECORDINGS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrendLeak:
-    """Increase of the leakage from recording to recording, in the form of the protocol `LeakMeasure`.
+    """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
 
-    That protocol explains the fields; flows are in the unit of the levels. There is no test for a step within a
-    recording, and no history other than the trend itself.
+    The fields are those of the protocol `LeakMeasure`, which explains them. Flows are in the unit of the trend. There
+    is no test for a step within a recording, and no history other than the trend itself.
     """
 
     provider: str
@@ -61,9 +61,9 @@ class TrendLeak:
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """The whole increase of the leakage, as no step within a recording explains a part of it.
+        """The whole increase of the leakage; None if nothing increased.
 
-        The result is None if nothing increased.
+        No step within a recording explains a part of it.
         """
         return None if self.rise is None else LeakRise(self.rise)
 
@@ -71,7 +71,10 @@ class TrendLeak:
         """Return None, as a trend states no leak relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston [L/min]; None if the levels are relative."""
+        """Return the present flow past pump and piston [L/min] with its interval; None if no L/min are stated.
+
+        `detectable_flow` is not used.
+        """
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
@@ -104,7 +107,10 @@ def decide_trend(
     years : float
         Mean time between false alarms [machine-years].
 
-    Returns ------- Evidence The verdict; "cannot tell" for fewer than three recordings.
+    Returns
+    -------
+    Evidence
+        The verdict; "cannot tell" for fewer than three recordings.
     """
     wear = episode.wear
     # interval over the mean time to a false alarm of this score
@@ -126,9 +132,9 @@ def _measure_leak(
 ) -> TrendLeak:
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
-    `chance` is the probability of such an increase in a healthy machine; the other arguments are those of
-    `decide_trend`. As the leak may be laminar or an orifice, its flow is taken as proportional to the pressure to one
-    of the powers `EXPONENTS`.
+    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy
+    machine. The other arguments are those of `decide_trend`. The leak may be laminar or an orifice, so its flow is
+    proportional to the pressure to one of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -154,7 +160,7 @@ def _measure_leak(
 
 
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
-    """Describe the increase by a normal distribution that is negative with the probability `chance`.
+    """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
 
     The result is None if the chance is 0.5 or more, or if the upper bound of the increase is not positive.
     """
@@ -168,19 +174,19 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Make the total leakage [L/min] from the present level `total` with its interval.
+    """Compute the present leakage [L/min], with an interval that includes the error of the machine's size.
 
-    The interval is widened by the relative error `size_deviation` of the machine's size. `pressure` is the pressure
-    difference at which the flow is stated [Pa].
+    `total` is the leakage with the interval of its estimate, `size_deviation` the relative standard error of the
+    size, and `pressure` the pressure difference at which the flow is stated [Pa].
     """
     below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
     return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
 
 
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
-    """Report the decrease of the ringing as an observation of a detector; it gives no upper bound of a leak.
+    """Report the decrease of the pressures' ringing since the last repair, in the form of a detector's observations.
 
-    `chance` is the probability of such a decrease in a healthy machine.
+    `chance` is the probability of such a decrease in a healthy machine. The ringing gives no upper bound of a leak.
     """
     size = -wear.leak.value / 100.0  # change of the logarithm, from %
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
@@ -191,9 +197,10 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split the recordings of the last one's group into those before the onset of the change and those since.
+    """Split recordings into those before the onset of the leak and those since; return both lists.
 
-    Without an onset, the last recording alone is the second part.
+    Only recordings that can be compared with the last one are included. Without an onset, the last recording alone is
+    in the second list.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -202,10 +209,10 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
 
 
 def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
-    """Test the other terms of the volume balance for a change at the onset, which could explain the increase.
+    """Test the other terms of the volume balance for a change at the onset of the leak.
 
-    The recordings since the onset are compared with those before, if the same single balance describes both;
-    otherwise the result is empty.
+    Such a change could explain the increase instead of a leak. The recordings since the onset are compared with those
+    before. The result is empty unless a single balance with the same terms describes both.
     """
     names = [roles.names for roles in points[-1].terms]
     sums_before, sums_since = (
@@ -220,7 +227,11 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 
 
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
-    """Compare the ringing of the last recording with those before the onset that have the same channels and rate."""
+    """Test the pressures' ringing of the last recording for a change since the onset of the leak.
+
+    It is compared with the recordings before the onset that have the same channels and sampling rate. The result
+    contains no observations if there are none.
+    """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":
         return Observed(RMS_CHANGE)

@@ -56,9 +56,10 @@ _MAX_FREEDOM = 20
 
 
 class ScatterPrior(NamedTuple):
-    """Prior on the standard deviation of the level between recordings: scaled inverse chi-square.
+    """Prior on the standard deviation of the leakage level between recordings.
 
-    `scale` is the typical standard deviation, and `freedom` the degrees of freedom.
+    It is a scaled inverse chi-square distribution. `scale` is the typical standard deviation, and `freedom` the
+    degrees of freedom.
     """
 
     scale: float
@@ -71,15 +72,15 @@ class Levels:
 
     Attributes
     ----------
-    t : array, (n,)
+    t : ndarray, shape (n,)
         Times [days].
-    value : array, (n,)
+    value : ndarray, shape (n,)
         The levels.
-    error : array, (n,)
+    error : ndarray, shape (n,)
         Standard error that each recording states for its level.
-    group : array, (n,)
+    group : ndarray, shape (n,)
         Number of the group of comparable recordings, which have a common mean.
-    covariate : array, (n,)
+    covariate : ndarray, shape (n,)
         An explanatory variable, the warming of the oil [K].
     prior : ScatterPrior
         Prior on the standard deviation between recordings.
@@ -99,7 +100,7 @@ class Levels:
         return self.t.size
 
     def select(self, rows: slice) -> Levels:
-        """Return the levels of a slice of the recordings."""
+        """Return the leakage levels of a slice of the recordings, with the same prior."""
         t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
         return replace(self, t=t, value=value, error=error, group=self.group[rows], covariate=covariate)
 
@@ -113,9 +114,9 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        It combines a prior and the data. The prior variance includes the mean square of the stated errors; that of
-        the data follows from the median change between neighbours in a group. The two are averaged, with the prior's
-        degrees of freedom and the number of such changes as weights.
+        It is the root of a weighted mean of two variances. The first is that of the prior plus the mean square of the
+        stated errors; its weight is the prior's degrees of freedom. The second follows from the median change between
+        neighbours in a group; its weight is the number of these changes.
         """
         prior = self.prior
         # the step of two neighbours has twice the variance of one
@@ -126,7 +127,10 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average neighbours of the same group, so that about `max_count` levels remain, to limit computing time."""
+        """Average the levels of successive recordings in a group, so that about `max_count` levels remain.
+
+        This limits the computing time.
+        """
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
@@ -141,12 +145,12 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute how far each level lies outside the scatter of the levels before it, which is ignored as an outlier.
+    """Compute the part of each leakage level that is ignored as an outlier.
 
     This excess is the signed distance of a level from the median of the up to three levels before it, less `outlier`
     standard deviations (`priors.toml`). It is 0 if the level before lies as far out on the same side. Returns two
-    variants, each (n,). The first treats each level as the latest one. The second also uses the level after it: the
-    excess is 0 if that lies as far out on the same side, and for the last level.
+    variants, each (n,). The first treats each level as the latest one. The second is also 0 for the last level, and
+    for a level whose successor lies as far out on the same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -165,22 +169,22 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
 
 
 class _Changes(NamedTuple):
-    """Hypotheses of a change of the level: c changes over n recordings, with m different profiles over time.
+    """Hypotheses of a change of the leakage level: c changes over n recordings, with m different profiles over time.
 
     Attributes
     ----------
-    profiles : array, (n, m)
-        Effect of a unit change on each recording, g of the module.
-    profile_index : array, (c,)
-        Column of `profiles` that each change has.
-    scale : array, (c,)
-        Prior scale of the size of each change, in units of tau.
-    begin : array, (c,)
+    profiles : ndarray, shape (n, m)
+        Effect of a change of unit size on each recording, g in the module's docstring.
+    profile_index : ndarray, shape (c,)
+        Column of `profiles` that belongs to each change.
+    scale : ndarray, shape (c,)
+        Prior scale of the size of each change, in units of the scatter tau.
+    begin : ndarray, shape (c,)
         Index of the first recording after each change.
-    grows : array, (c,)
+    grows : ndarray, shape (c,)
         True for a growth, False for a step.
-    log_weight : array, (c,)
-        Logarithm of w_j of the module, which is divided among the kinds and scales of change with the same begin.
+    log_weight : ndarray, shape (c,)
+        Logarithm of the weight w_j in the module's docstring. The changes with the same `begin` share this weight.
     """
 
     profiles: Array
@@ -192,10 +196,10 @@ class _Changes(NamedTuple):
 
     @classmethod
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
-        """Make all changes that may begin after the first `n_healthy` recordings: steps, and growths per month.
+        """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        The scale of a step is a multiple of the scatter tau. That of a growth is tau over a number of usual intervals
-        between recordings. With `steps_only` there are no growths.
+        The prior scale of a step is a multiple of the scatter tau. A growth is a rise per month; its prior scale is
+        tau over a number of usual intervals between recordings. With `steps_only` there are no growths.
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))
@@ -215,7 +219,11 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Make a single growth with the given profile (n,) and `scale`, which begins with the first recording."""
+        """Build the single hypothesis of a growth that begins with the first recording.
+
+        `profile` (n,) is the effect of a growth of unit size on each recording, and `scale` the prior scale of its
+        size.
+        """
         first = np.zeros(1, dtype=np.int64)
         return cls(
             profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
@@ -223,19 +231,21 @@ class _Changes(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """Likelihoods at one point (tau, r) of the grid, for n recordings and m profiles of a change.
+    """Likelihoods at one point of the grid of tau and r, for n recordings and m profiles of a change over time.
+
+    tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
 
     Attributes
     ----------
     tau : float
         Standard deviation between recordings.
-    log_null : array, (n,)
+    log_null : ndarray, shape (n,)
         Logarithm of prior times likelihood without a change, after each recording.
-    a, b : array, (n, m)
-        Terms of the likelihood ratio, as in the module.
+    a, b : ndarray, shape (n, m)
+        Terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta, after each recording.
     mean, variance : float
-        Mean level of the last group without a change, and its variance.
-    mean_slope : array, (m,)
+        Mean level of the last group of comparable recordings without a change, and its variance.
+    mean_slope : ndarray, shape (m,)
         Decrease of this mean per unit of a change.
     """
 
@@ -249,13 +259,15 @@ class _Node(NamedTuple):
 
 
 def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
-    """Compute the likelihoods at all points (tau, r) of the grid for changes with the given `profiles` (n, m).
+    """Compute the likelihoods of leakage levels with and without a change, at all points of a grid of tau and r.
 
-    With `may_grow`, the level may have grown evenly since the first recording even without a change. The levels have
-    the covariance shared + tau^2 (r C + (1 - r) I) + error^2, where C is the correlation over the time between
-    recordings and r the fraction of the scatter that is correlated. Vectors are whitened by its Cholesky factor L: z
-    is the levels, u the unit level of the last group, and G the profiles. Up to each recording a = sum G^2 and b =
-    sum G z.
+    tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
+    `profiles` (n, m) are the effects of m changes of unit size on each recording. With `may_grow`, the level may have
+    grown evenly since the first recording even without a change.
+
+    The levels have the covariance shared + tau^2 (r C + (1 - r) I) + error^2, where C is the correlation over the
+    time between recordings. Vectors are whitened by its Cholesky factor L: z is the levels, u the unit level of the
+    last group, and G the profiles. Up to each recording a = sum G^2 and b = sum G z.
     """
     from scipy.linalg import solve_triangular
 
@@ -294,10 +306,10 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 
 
 def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
-    """Compute the log of the mean likelihood ratio of a change whose size has a half-normal prior.
+    """Compute the log of the mean likelihood ratio of a change whose size delta has a half-normal prior.
 
-    The mean of exp(b delta - a delta^2/2) over a half-normal delta of scale k is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2)
-    Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
+    `scale` is the scale k of the prior; `a` and `b` are terms of the ratio exp(b delta - a delta^2/2). Its mean over
+    delta is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
     """
     from scipy.special import log_ndtr
 
@@ -307,28 +319,28 @@ def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
 
 
 class ChangeScores(NamedTuple):
-    """Result of the sequential test after each of n recordings.
+    """Result of the sequential test for a change of the leakage level, after each of n recordings.
 
-    `log_R` (n,) is the logarithm of the statistic R, and `begin` (n,) the index of the first recording after the most
-    probable change.
+    `log_R` (n,) is the logarithm of the test statistic R, and `begin` (n,) the index of the first recording after the
+    most probable change.
     """
 
     log_R: Array
     begin: IntArray
 
     def find_alarm(self, days: float) -> int | None:
-        """Find the first recording with R above `days`, the mean time to a false alarm [days].
+        """Find the index of the first recording with a test statistic R above `days`; None if there is none.
 
-        The result is None if there is none.
+        `days` is the mean time to a false alarm [days], which is the threshold of R.
         """
         alarms = np.flatnonzero(self.log_R > math.log(days))
         return int(alarms[0]) if alarms.size else None
 
 
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
-    """Compute the statistic R of the sequential test for a rise of the level, either a step or a growth.
+    """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
-    With `falls` the test is for a downward step instead. The first `n_healthy` recordings are assumed unchanged. With
+    The first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
     `may_grow`, an even growth since the first recording does not count as a change.
     """
     if falls:
@@ -348,9 +360,10 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
 
 
 def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
-    """Draw one number from each of d normal distributions, which are cut off below 0 if `positive`.
+    """Draw one number from each of d normal distributions.
 
-    Uses the inverse distribution function.
+    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` they are cut off below 0. Uses
+    the inverse distribution function.
     """
     from scipy.special import ndtr, ndtri
 
@@ -360,10 +373,10 @@ def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positiv
 
 
 class _Draws(NamedTuple):
-    """Draws (d,) from the posterior distribution of a change.
+    """Random draws (d,) from the posterior distribution of a change of the leakage level.
 
-    `tau` is the standard deviation between recordings, `change` the index of the change among the hypotheses,
-    `amplitude` its size, and `mean_before` the mean level before it.
+    `tau` is the standard deviation between recordings, `change` the index of the drawn hypothesis in `_Changes`,
+    `amplitude` the size of the change, and `mean_before` the mean level before it.
     """
 
     tau: Array
@@ -373,9 +386,10 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw from the posterior distribution of the hypotheses `changes` given the levels; the seed is fixed.
+        """Draw from the posterior distribution of hypothetical changes, given the leakage levels; the seed is fixed.
 
-        With `signed`, the size of a change has a flat prior and either sign, instead of a half-normal prior.
+        `changes` are the hypotheses. The size of a change has a half-normal prior or, with `signed`, a flat prior on
+        either sign.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
@@ -395,7 +409,10 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rise (d,) of the last recording's level for each draw from the hypotheses `changes`."""
+        """Compute the rise (d,) of the last recording's leakage level in each draw.
+
+        `changes` are the hypotheses from which the draws were made.
+        """
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
@@ -441,18 +458,18 @@ class Wear(NamedTuple):
 
 
 def _interval_of_draws(draws: Array) -> Interval:
-    """Compute the median and the 95 % interval of draws (d,), some of which may be infinite."""
+    """Compute the median and the 95 % interval of random draws (d,), some of which may be infinite."""
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], method="lower")
     return Interval(float(median), float(low), float(high))
 
 
 def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int | None) -> Wear:
-    """Estimate level, growth and time to the repair limit after the last recording.
+    """Estimate leakage level, growth and time to the repair limit after the last recording.
 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
     `change_begin` is the index of the first recording after the change that the test has found. If it is None, an
-    even growth or decrease over all recordings is estimated, with a wide prior. No growth per month is estimated from
-    recordings that span less than a day.
+    even growth or decrease over all recordings is estimated, with a wide prior. The growth per month is NaN if the
+    recordings span less than a day.
     """
     is_changed, is_long = change_begin is not None, levels.t[-1] - levels.t[0] >= 1.0
     # without a change the growth may begin with the first recording
@@ -501,7 +518,10 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean of recordings without a change, the range of 95 % of them, and their standard deviation."""
+    """Estimate the level and the scatter of recordings without a change.
+
+    Returns (mean level with the range of 95 % of such recordings, standard deviation between recordings).
+    """
     draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
     error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))
     noise = np.random.default_rng(21).standard_normal(draws.tau.size)
@@ -510,11 +530,12 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 
 
 class Episode(NamedTuple):
-    """A period between two repairs, rows `begin` to `end` (exclusive) of the compared recordings.
+    """A period between two repairs of a machine, and the result of the test for a leak in it.
 
-    `alarm` is the row at which the test raised an alarm, or None. `log_days` is the logarithm of the largest mean
-    time to a false alarm [days] for which the test would raise one. `wear` is the state after the last row. `fell` is
-    True if the period began with a repair, i.e. a fall of the level.
+    The period has the rows `begin` to `end` - 1 of the compared recordings. `alarm` is the row at which the test
+    raised an alarm, or None. `log_days` is the logarithm of the largest mean time to a false alarm [days] at which
+    the test would raise one. `wear` is the state after the last row. `fell` is True if the period began with a
+    repair, i.e. a fall of the level.
     """
 
     begin: int
@@ -528,9 +549,9 @@ class Episode(NamedTuple):
 def find_episodes(
     levels: Levels, *, years: float, n_healthy: int = 1, allowed_rise: float | None = None
 ) -> list[Episode]:
-    """Divide a series of recordings at repairs, and test and estimate the wear in each period between them.
+    """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
-    `years` is the mean time between false alarms, at least. The first `n_healthy` recordings are known to be healthy.
+    `years` is the smallest mean time between false alarms. The first `n_healthy` recordings are known to be healthy.
     `allowed_rise` is the rise of the level at which a repair is due, or None. A repair is a fall of the level that
     the same test detects. After it the level is estimated anew, and the scatter before it becomes the prior.
     """
@@ -554,8 +575,9 @@ def find_episodes(
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
     """Find the index of the first recording after the first repair; the number of recordings if there was none.
 
-    `rise` is the result of the test for a rise, and `days` the mean time to a false alarm [days]. If that test has
-    raised an alarm, a fall is looked for only after the rise.
+    `rise` is the result of the test for a rise of the leakage level, and `days` the mean time to a false alarm
+    [days]. The first `n_healthy` recordings are known to be healthy. If the test has raised an alarm, a fall is
+    looked for only after the rise.
     """
     fall, worn_from = score_changes(levels, n_healthy, falls=True), 0
     alarm, repair = rise.find_alarm(days), fall.find_alarm(days)

@@ -151,7 +151,7 @@ class Diagnosis(Evidence):
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
-        """Measured ratio of displacement to piston area, over the assumed ratio, with its 95 % interval.
+        """Measured over assumed ratio of displacement to piston area, and the two ends of its 95 % interval.
 
         It is None if no detector has measured the ratio.
         """
@@ -172,7 +172,7 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """Name of the condition in `states.toml` that corresponds to the verdict."""
+        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change"."""
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -368,7 +368,7 @@ class Diagnosis(Evidence):
 
 
 def _is_usual(test: Evidence) -> bool:
-    """Test whether at least 1 in 20 healthy recordings scores as high; True if this chance is not stated."""
+    """Return True if at least 1 in 20 healthy recordings scores as high in the test, or if this is not stated."""
     return test.chance is None or test.chance >= 0.05
 
 

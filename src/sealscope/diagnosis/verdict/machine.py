@@ -59,7 +59,7 @@ class AssumedMachine:
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the machine as plain values for JSON."""
+        """Return the assumed sizes of the machine, and their sources, as plain values for JSON."""
         return {
             "name": self.rig,
             "stated_by": self.stated_by,
@@ -100,13 +100,13 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Test whether a whole rig was stated; False for the default rig, even with stated areas or displacement."""
+    """Return True if a whole rig was stated; False for the default rig, even with stated areas or displacement."""
     # nobody states the mass alone: it is assumed for want of a rig, or it is the rig's
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Test whether the pump flow is measured by a flow meter in m^3/s, given the units of the channels.
+    """Return True if a flow meter measures the pump's flow in m^3/s, given the `units` of the channels by name.
 
     The result is False if the flow is computed from the pump's angle or speed.
     """
@@ -116,8 +116,8 @@ def measures_flow(units: Mapping[str, str]) -> bool:
 def healthy_leakage(rig: Rig) -> float:
     """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] that the rig gives; 0 if it is not known.
 
-    The parameter is `pump.G_healthy`. A value that a rig file assumes for its own pump is used. The value of the
-    default rig is not used for another pump of which only the displacement is stated.
+    The parameter is `pump.G_healthy`. A value that a rig's file assumes for its own pump is used. The value of the
+    default rig is not used for another pump, of which only the displacement is stated.
     """
     is_same_place = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_same_place
@@ -130,7 +130,7 @@ def unstated_rig() -> Rig:
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Test whether a recording's provenance names a packaged rig of the same areas and displacement as `rig`."""
+    """Return True if a recording's provenance names a packaged rig of the same areas and displacement as `rig`."""
     experiment = provenance.get("experiment")
     if not isinstance(experiment, Mapping):
         return False

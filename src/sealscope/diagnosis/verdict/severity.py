@@ -71,7 +71,10 @@ class RepairLimit:
         return None if area is None else self.value * area / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain values for JSON; of flow and creep speed, the one that is not stated is None."""
+        """Return the limit as plain values for JSON.
+
+        It is either a flow or a creep speed; the other of the two is None.
+        """
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,

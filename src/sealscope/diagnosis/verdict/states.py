@@ -54,13 +54,13 @@ class MachineState:
     action: str
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the state as plain values for JSON."""
+        """Return the fields of the state by name, as plain values for JSON."""
         return {**vars(self)}
 
 
 @cache
 def _tables() -> Mapping[str, Mapping[str, Any]]:
-    """Read the tables of `states.toml`; they are cached."""
+    """Read the tables of `states.toml`, by their names; the result is cached."""
     return tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))
 
 

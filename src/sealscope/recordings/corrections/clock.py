@@ -28,7 +28,7 @@ def resample_evenly(recording: Recording) -> Recording:
 
     An even recording is returned unchanged. Rows without a time are dropped, and so are rows that are not later than
     all rows before. If the clock steps back or leaps because the file contains several recordings, only the longest
-    is used.
+    recording is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -65,7 +65,7 @@ def _ordered_rows(t: Array) -> NDArray[np.intp]:
 def _longest_dense_stretch(t: Array, rate: float) -> slice:
     """Find the longest stretch of rows in which at most the fraction `MAX_GAP_FRACTION` of the samples is lost.
 
-    `t` (n,): increasing times [s]; `rate` [Hz]: samples that are due per second.
+    `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
     # samples beyond the fewest allowed since the first row: a stretch is dense enough if it does not decrease
     first_time = t[:1].sum()  # 0 if there is none
@@ -105,8 +105,8 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
 def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
     """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,).
 
-    The result is NaN before the first and after the last sample. Unless `is_slow`, it is also NaN within intervals
-    longer than `MAX_INTERVAL` times the median interval.
+    The result (m,) is NaN before the first and after the last sample. Unless the channel `is_slow`, such as a
+    temperature, it is also NaN within intervals longer than `MAX_INTERVAL` times the median interval.
     """
     if t.size < 2:
         return np.full(even_times.size, np.nan)

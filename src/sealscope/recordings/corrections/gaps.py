@@ -75,9 +75,10 @@ def remove_impossible(recording: Recording) -> Recording:
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
-    A gap is filled by a spline if it is short, else from another cycle of the duty or by a straight line. In the rows
-    of a gap missing values of all channels are filled; recorded values stay. Returns the same recording if there is
-    nothing to fill. The clock must be even (`clock.resample_evenly`).
+    A gap is a run of rows in which a needed channel has no value. It is filled by a spline if it is short, else from
+    another cycle of the duty or by a straight line. In its rows the missing values of all channels are filled;
+    recorded values stay. Returns the same recording if there is nothing to fill. The clock must be even
+    (`clock.resample_evenly`).
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -110,8 +111,8 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
     """Interpolate short gaps linearly in the channels that are not `needed`, except at the ends.
 
-    A gap is short up to `SPLINE` samples in a pressure, and up to the prior `motion` [s] in other channels, as a
-    moving mass moves evenly over that time: a slow sensor leaves such gaps between its samples. Returns the same
+    A gap is short up to `SPLINE` samples in a pressure, and up to the prior `motion` [s] in other channels, because a
+    moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the same
     recording if these channels have no missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
@@ -130,9 +131,10 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks of samples in which more than the fraction `MAX_BRIDGED_FRACTION` is bridged.
+    """Flag the blocks of samples of which too many were missing and have been filled.
 
-    `bounds` (n + 1,): sample indices at which the blocks begin and end. Returns the flags (n,).
+    `bounds` (n + 1,): sample indices at which the blocks begin and end. A block is flagged if more than the fraction
+    `MAX_BRIDGED_FRACTION` of its samples is filled (`Recording.bridged`). Returns the flags (n,).
     """
     bounds = np.asarray(bounds)
     if recording.bridged is None:
@@ -142,7 +144,10 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 
 
 def flag_holes(recording: Recording) -> Flags:
-    """Flag the rows (n,) in long bridged gaps, longer than the prior `hole` [s] and `MAX_INTERVAL` sampling steps."""
+    """Flag the rows (n,) of long gaps, whose missing values have been filled (`Recording.bridged`).
+
+    A gap is long if it is longer than the prior `hole` [s] and longer than `MAX_INTERVAL` sampling steps.
+    """
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
         max_gap = max(_GAPS.hole, MAX_INTERVAL / recording.rate)
@@ -158,11 +163,11 @@ def _finite_mean(values: Array) -> float:
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Fill a gap in all channels, in place, from the nearest similar cycle of the duty; return True if there is one.
+    """Fill a gap in all channels, in place, from a nearby cycle of the duty; return True if there is a similar one.
 
     The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`.
-    The nearest two cycles on either side of the gap are tried. A cycle is similar if its `_cycle_mismatch` is at most
-    `_MAX_MISMATCH`.
+    The nearest two cycles on either side of the gap are tried. A cycle is similar if its `_cycle_mismatch` in the
+    `needed` channels is at most `_MAX_MISMATCH`.
     """
     half_cycle = round(0.5 * period)
     min_cycles = math.ceil((stop - first + half_cycle) / period)
@@ -180,11 +185,11 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute how much the duty around a gap differs from the duty `shift` samples away.
+    """Compute the relative difference of the duty around a gap from the duty `shift` samples away.
 
-    Both stretches extend up to `half_cycle` samples beyond the gap, `first` to `stop`, on either side. The mismatch
-    is the rms difference of the two, without their means, divided by the standard deviation of the shifted one. It is
-    infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
+    The gap has the samples `first` to `stop` - 1. Both stretches extend up to `half_cycle` samples beyond it on
+    either side. The mismatch is the rms difference of the two, without their means, divided by the standard deviation
+    of the shifted one. It is infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as it exists here and there
@@ -204,7 +209,7 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill the missing values from index `first` to `stop`, in place, by the values `shift` samples away.
+    """Fill the missing values from index `first` to `stop` - 1, in place, by the values `shift` samples away.
 
     A linear offset is added, with which both ends meet the values around the gap.
     """

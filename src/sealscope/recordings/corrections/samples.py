@@ -35,9 +35,11 @@ from sealscope.recordings.recording import Recording
 class CorrectedSamples(NamedTuple):
     """A recording after the correction of its samples.
 
-    `recording`: on an even clock, from the first to the last row with all chamber pressures and the command;
-    `findings`: the corrections made; `stuck`: names of chamber pressures that are stuck for too long to be used;
-    `used_fraction`: fraction of the original samples within the time span of `recording`.
+    - `recording`: the samples on an even clock, from the first to the last row with all chamber pressures and the
+      command.
+    - `findings`: the corrections made.
+    - `stuck`: names of chamber pressures that repeat one value for too long to be used.
+    - `used_fraction`: fraction of the original samples within the time span of `recording`.
     """
 
     recording: Recording
@@ -49,8 +51,8 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, and report each correction as a finding.
 
-    In this order: impossible values, dropouts, rows and pressures that are stuck, spikes, repeated samples, an uneven
-    clock, speeds without a sign, gaps.
+    The defects are treated in this order: impossible values, dropouts, rows and pressures that repeat one value for a
+    long time, spikes, repeated samples, an uneven clock, speeds without a sign, gaps.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
@@ -96,9 +98,10 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def remove_holes(recording: Recording) -> Recording:
-    """Set long bridged gaps (`flag_holes`) to NaN, for detectors that cannot give them a lower weight.
+    """Set long gaps to NaN again that have been filled, for detectors that cannot give them a lower weight.
 
-    The result has no `bridged` flags. Returns the same recording if there are no long gaps.
+    The gaps are those of `flag_holes`. The result has no `bridged` flags. Returns the same recording if there are no
+    long gaps.
     """
     rows = flag_holes(recording)
     if not rows.any():
@@ -107,5 +110,8 @@ def remove_holes(recording: Recording) -> Recording:
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to an even clock (`resample_evenly`); the list of findings is empty."""
+    """Resample a recording to an even clock (`resample_evenly`), in the form of the other corrections.
+
+    Also returns a list of findings, which is empty.
+    """
     return resample_evenly(recording), []

@@ -28,9 +28,10 @@ _N_CHANGES = 2**15
 
 
 def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Set spikes, samples that leap and return at once, to NaN in all channels but slow ones and the command.
+    """Set spikes to NaN, i.e. single samples that leap and return at once, and report them as findings.
 
-    Returns the recording, and a finding for each channel with spikes.
+    Slow channels and the command are left as they are. Returns the recording, and a finding for each channel with
+    spikes.
     """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, values in recording.channels.items():

@@ -32,11 +32,11 @@ _MAX_REPEAT = 3
 
 
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Interpolate samples that repeat the previous one between the fresh ones; return the recording and the findings.
+    """Replace samples that repeat the previous one by linear interpolation between new readings.
 
     Two kinds are found: a channel that repeats each sample for a fixed time (`estimate_holding_period`), and single
     rows in which all channels repeat the row before (`_flag_repeated_rows`). Slow channels and the command stay as
-    they are.
+    they are. Returns the recording and the findings.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
@@ -61,10 +61,10 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 
 
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
-    """Flag the rows (n,) in which the chamber pressure `name` is stuck while the machine moves.
+    """Flag the rows (n,) in which the chamber pressure `name` repeats one value while the machine moves.
 
     Motion is seen in the position, else in the pump's angle, else in the other chamber pressure, which may change
-    while valves hold the cylinder. If none of them is recorded, all stuck runs are flagged. Runs at the smallest or
+    while valves hold the cylinder. If none of them is recorded, all such rows are flagged. Rows at the smallest or
     largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
@@ -82,8 +82,9 @@ def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
 def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats its last row for a long time.
 
-    In such rows all channels are constant or missing, and both chamber pressures are held (`motion.find_holds`). No
-    channel jumps where they begin, and at least one does where they end. A machine at rest would continue smoothly.
+    In such rows all channels are constant or missing, and both chamber pressures keep one value for longer than their
+    noise allows (`motion.find_holds`). No channel jumps where they begin, and at least one does where they end. A
+    machine at rest would continue smoothly.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
@@ -109,14 +110,15 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 
 
 def _is_constant_or_missing(values: Array) -> bool:
-    """Test whether all values (n,) are equal, or all are NaN."""
+    """Return True if all values (n,) are equal, or if all are NaN."""
     return bool(np.isnan(values).all() or np.ptp(values) == 0.0)
 
 
 def _jumps_at(values: Array, row: int) -> bool:
-    """Test whether a channel (n,) changes across the index `row` by more than it usually does.
+    """Return True if a channel (n,) changes across the index `row` by more than it usually does.
 
-    The usual change is a high quantile (the prior `leap`) of all changes of the channel over as many samples.
+    The change is taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (the prior `leap`) of
+    all changes of the channel over as many samples.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -124,9 +126,9 @@ def _jumps_at(values: Array, row: int) -> bool:
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Test whether a channel moves in the given rows by more than a small fraction of its range (the prior `moves`).
+    """Return True if a channel changes in the given rows by more than a small fraction of its range.
 
-    `rows` (k,): indices of the rows.
+    `rows` (k,): indices of the rows. The fraction is the prior `moves`.
     """
     all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     min_fraction: float = _PRIORS.moves
@@ -134,10 +136,10 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Find the k runs of equal successive values in a channel (n,).
+    """Find the k runs in which a channel (n,) repeats one value.
 
-    Returns the index of the first value of each run, and flags (k,) of the runs that both begin and end with a jump.
-    A jump is a change by more than `_MIN_JUMP` times the channel's resolution (`estimate_quantum`).
+    Returns the index of the first value of each run (k,), and flags (k,) of the runs that both begin and end with a
+    jump. A jump is a change by more than `_MIN_JUMP` times the channel's resolution (`estimate_quantum`).
     """
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     jumps = np.abs(np.diff(values)[starts[1:] - 1]) > _MIN_JUMP * estimate_quantum(values)
@@ -145,10 +147,11 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 
 
 def estimate_holding_period(t: Array, values: Array) -> float | None:
-    """Estimate the time [s] for which a channel (n,) repeats each of its samples.
+    """Estimate the time [s] for which a channel (n,) repeats each reading; None if it does not.
 
-    `t` (n,): times [s]. Most runs of equal values between jumps must last equally long; their mean duration is the
-    result. None if that is not the case, if there are too few runs, or if the time is too short to matter.
+    A sensor that is slower than the logger causes this. `t` (n,): times [s]. Most runs of equal values between jumps
+    must last equally long; their mean duration is the result. None, too, if there are too few runs, or if the time is
+    too short to matter.
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -169,7 +172,7 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
 
-    `t` (n,): times [s].
+    `t` (n,): times [s]; `values` (n,): samples of the channel, NaN where missing.
     """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
@@ -185,8 +188,8 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger repeats the previous row in all channels that move.
 
-    Up to `_MAX_REPEAT` such rows follow each other, and a channel jumps before and after them. No row is flagged if
-    there are not many more of them than would occur by chance.
+    Fewer than `_MAX_REPEAT` such rows follow each other, and a channel jumps before and after them. No row is flagged
+    if there are not many more of them than would occur by chance.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

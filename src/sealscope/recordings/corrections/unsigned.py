@@ -46,7 +46,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
 
 
 def _has_one_sign(values: Array) -> bool:
-    """Test whether a channel (n,) stays on one side of zero, to within its noise."""
+    """Return True if a channel (n,) stays on one side of zero, to within its noise."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return False
@@ -55,7 +55,7 @@ def _has_one_sign(values: Array) -> bool:
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
-    """Find the signs (n,) of the flow into chamber A; also return the source of the signs, in words.
+    """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
     `magnitude` (n,): absolute speed or flow. Returns (None, "") if neither position nor command determines the signs,
     or if the motion is in one direction only.
@@ -74,8 +74,8 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 def _piston_speed(x: Array, rate: float) -> Array:
     """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] sampled at `rate` [Hz].
 
-    It is the central difference of the positions before and after, each at a distance of the prior `half` [s].
-    Missing positions are interpolated linearly.
+    It is the central difference of the positions half a window before and after a sample; half a window is the prior
+    `half` [s]. Missing positions are interpolated linearly.
     """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
@@ -86,7 +86,7 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
 
 def _moves_both_ways(values: Array) -> bool:
-    """Test whether a signal (n,) has enough motion in both directions.
+    """Return True if a signal (n,) has enough motion in both directions.
 
     Its positive and its negative values are summed. The smaller sum must exceed the larger one times the prior
     `least`.
@@ -98,7 +98,7 @@ def _moves_both_ways(values: Array) -> bool:
 def _correlation(first: Array, second: Array) -> float:
     """Compute the correlation of two channels (n,) over the rows known in both.
 
-    0 if fewer than three rows are known, or if either channel is constant in them.
+    The result is 0 if fewer than three rows are known, or if either channel is constant in them.
     """
     known = np.isfinite(first) & np.isfinite(second)
     if np.count_nonzero(known) < 3 or not (np.ptp(first[known]) > 0.0 and np.ptp(second[known]) > 0.0):
@@ -110,8 +110,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     """Estimate the signs (n,) of the flow into chamber A from the piston speed and the chamber pressures.
 
     The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s] and a coefficient a
-    for each direction. Fits of the model alternate with searches for the signs, from the signs of the speed on, until
-    no sign changes, at most `_MAX_ITERATIONS` times.
+    for each direction. The first signs are those of the speed. Fits of the model then alternate with searches for the
+    signs until no sign changes, at most `_MAX_ITERATIONS` times.
     """
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
@@ -147,7 +147,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 def _noise_variance(speed: Array, rate: float) -> float:
     """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    Speeds are compared that are computed from different positions; the median makes the estimate robust to motion.
+    It follows from differences of speeds that are computed from different positions; the median makes the estimate
+    robust to motion.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -166,8 +167,9 @@ def _average_nearby(values: Array, rate: float) -> Array:
 def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     """Find the most likely sequence of signs (n,), +1 or -1, by the Viterbi algorithm.
 
-    `log_odds` (n,): log odds of a positive sign in each sample; `cost_of_change` (n - 1,): log odds against a change
-    of sign after each sample. The log odds accumulate from sample to sample, limited to the cost of a change.
+    `log_odds` (n,): log odds of a positive sign, from each sample alone; `cost_of_change` (n - 1,): log odds against
+    a change of sign after each sample. The log odds accumulate from sample to sample, limited to the cost of a
+    change.
     """
     path_odds, odds = np.empty(log_odds.size), 0.0
     for k, (evidence, cost) in enumerate(zip(log_odds.tolist(), [0.0, *cost_of_change.tolist()], strict=True)):

@@ -48,7 +48,7 @@ _MAX_UNITS = 64
 
 
 def is_missing(cell: str) -> bool:
-    """Test whether a cell stands for a missing sample: it is empty, or a mark such as `NaN` or `--`."""
+    """Return True if a cell of a log stands for a missing sample: it is empty, or a mark such as `NaN` or `--`."""
     return cell.strip().lower() in MISSING
 
 
@@ -69,11 +69,11 @@ def is_value(cell: str, decimal: str) -> bool:
 
 
 def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str]) -> tuple[Array, list[int]]:
-    """Parse cells to an array of doubles (n,), and also return the indices of the cells that contain words.
+    """Parse the cells of a column to an array of doubles (n,), and find the cells that contain words.
 
     A word is neither a number nor a mark of a missing sample; both words and missing samples become NaN. `decimal`:
-    decimal separator; `where`: function that describes the place of the cell with a given index, for messages. Raises
-    InputError for an infinite number.
+    decimal separator; `where`: function that describes the place of the cell with a given index, for messages.
+    Returns the numbers and the indices of the words. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is no decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -91,7 +91,7 @@ def parse_numbers(cells: Sequence[str], decimal: str, where: Callable[[int], str
 
 
 def _parse_number(cell: str, pointed: str, decimal: str) -> float:
-    """Parse a cell to a double, NaN for a word.
+    """Parse a cell to a double; NaN if it is not a number.
 
     `pointed`: the cell with "." in place of the decimal separator `decimal`.
     """
@@ -142,9 +142,9 @@ def _trailing_unit(cell: str) -> str | None:
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the columns in which over half of the cells are numbers with a known unit: column -> most frequent unit.
+    """Find the units that are written after the numbers in the columns of a log: column -> most frequent unit.
 
-    `rows`: cells of each line of a log.
+    `rows`: cells of each line of a log. A column is included if over half of its cells are numbers with a known unit.
     """
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
@@ -161,16 +161,16 @@ def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
 
 
 def remove_units(line: str, units: Iterable[str]) -> str:
-    """Remove `units` from the cells of a line of a log, where they follow a number at the end of a cell."""
+    """Remove `units` from a line of a log, where they follow a number at the end of a cell."""
     pattern = "|".join(re.escape(unit) for unit in sorted(set(units), key=len, reverse=True))
     return re.sub(rf"(?<=[\d.])[ \u00a0\u202f]{{0,2}}(?:{pattern})(?=[ ]{{0,8}}\"?[ ]{{0,8}}(?:[;,|\t]|$))", "", line)
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units found in the cells of columns to the labels of these columns, unless they state a unit.
+    """Add the units that were found in the cells of columns to the headings of these columns.
 
-    `units`: column -> unit in its cells; `place`: name of the file in messages. Raises InputError if a label states
-    another unit.
+    `labels`: the headings; those that state a unit stay as they are. `units`: column -> unit in its cells; `place`:
+    name of the file in messages. Raises InputError if a heading states another unit.
     """
     result = []
     for column, label in enumerate(labels):
@@ -185,7 +185,7 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 
 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, where: Callable[[int], str]) -> list[str]:
-    """Remove `unit` from the ends of a column's cells.
+    """Remove the unit after the number from each cell of a column.
 
     Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
     it does not end in `unit`; `where`: function from the index of a cell to its place, for messages. Raises

@@ -42,9 +42,9 @@ REST = "*"
 
 @dataclass(frozen=True)
 class Request:
-    """Request for reading a file; invalid values raise InputError.
+    """Choices of a user for reading a file; invalid values raise InputError.
 
-    `map`: choice of the columns; `rate`: sampling rate [Hz] in place of a time column, or None; `file`: name of the
+    `map`: column of each channel; `rate`: sampling rate [Hz] in place of a time column, or None; `file`: name of the
     file for the provenance.
     """
 
@@ -69,12 +69,16 @@ class Request:
 class ColumnMap:
     """The columns of a table that are read, and their meaning; columns are numbered from 0.
 
-    `labels`: headings of all columns; `rate`: sampling rate [Hz] from the caller or the file, or None; `time`: the
-    time column, or None; `time_label`: name and unit used for it; `channels`: channel -> formula of columns; `parts`:
-    part of the time, such as "hour" -> its column, if several columns form the time. `date`: column of the date if
-    the time column may be a time of day, or the time column itself if it is called a date. `names`: channel -> its
-    name in the file, if that differs; `unused`: names of columns with measured pressures, positions, speeds and flows
-    that are in no channel; `notes`: lines for the history.
+    - `labels`: headings of all columns.
+    - `rate`: sampling rate [Hz] from the caller or the file, or None.
+    - `time`: the time column, or None; `time_label`: name and unit used for it.
+    - `channels`: channel -> formula of columns.
+    - `parts`: part of the time, such as "hour" -> its column, if several columns form the time.
+    - `date`: column of the date if the time column may be a time of day, or the time column itself if it is called a
+      date.
+    - `names`: channel -> its name in the file, if that differs.
+    - `unused`: names of columns with measured pressures, positions, speeds and flows that are in no channel.
+    - `notes`: lines for the history of the recording.
     """
 
     labels: Sequence[Label]
@@ -90,14 +94,14 @@ class ColumnMap:
 
     @property
     def channel_of(self) -> dict[int, str]:
-        """Mapping from each column to the channel that uses it, the last one if there are several."""
+        """Mapping from each column that a channel uses to this channel, the last one if there are several."""
         return {column: name for name, formula in self.channels.items() for column in formula.factors}
 
     @property
     def columns(self) -> dict[int, str]:
-        """Mapping from each column to read to its kind, "numbers", or "time" for the time column, which is last.
+        """Mapping from each column to read to its kind, "numbers" or "time".
 
-        A time column that is also part of a channel is read as numbers.
+        The time column is the last. It is read as numbers if it is also part of a channel.
         """
         read = {*self.channel_of, *self.parts.values()} - {self.time}
         columns = dict.fromkeys(sorted(read), "numbers")
@@ -125,7 +129,7 @@ def _check_channel(channel: str) -> None:
 
 
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
-    """Raise InputError for an invalid map, and for a sampling rate that is not positive.
+    """Raise InputError for an invalid map from channels to columns, and for a sampling rate that is not positive.
 
     A map is invalid if it has an unknown channel, or a word other than "auto" in place of columns.
     """
@@ -140,7 +144,7 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def uses_names(channel_map: ChannelMap) -> bool:
-    """Test whether a map lets channels be chosen by the names of the columns, i.e. contains "auto"."""
+    """Return True if a map from channels to columns contains "auto", and so lets names of columns decide."""
     return isinstance(channel_map, str) or REST in channel_map
 
 
@@ -152,7 +156,10 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map, channel -> column, with which a recording was read, from its provenance."""
+    """Reconstruct the map, channel -> column, with which a recording was read, from its provenance.
+
+    Empty if the provenance names no columns.
+    """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
     proposed = proposed_map([Label.parse(heading) for heading in columns.values()])
@@ -160,9 +167,9 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def _find_unit(label: Label, channel: str) -> str | None:
-    """Find the unit of a column in its heading, or at the end of its name if the channel can have that unit.
+    """Find the unit of a column in its heading, or at the end of its name; None if there is none.
 
-    None if there is none.
+    A unit at the end of the name must be one that the channel can have.
     """
     ending = split_unit(label.name)[1] if label.unit is None else None
     is_possible = ending is not None and same_dimension(ending, "s" if channel == "t" else CHANNEL_UNITS[channel])
@@ -170,7 +177,7 @@ def _find_unit(label: Label, channel: str) -> str | None:
 
 
 def _format_columns(labels: Sequence[Label]) -> str:
-    """Format the names of the columns for messages."""
+    """Format the headings of all columns as a list for messages."""
     return join_names(label.whole for label in labels)
 
 
@@ -201,9 +208,10 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
 
 
 def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> Formula[int]:
-    """Parse the entry of a map for a channel, the name of a column or a formula, to a formula of column numbers.
+    """Parse the column that a user's map gives for a channel to a formula of column numbers.
 
-    A unit in the entry takes precedence over one in the heading, and that over one at the end of the column's name.
+    `column_text`: the name of a column, or a formula of several. A unit in it takes precedence over one in the
+    heading, and that over one at the end of the column's name.
     """
     description = f"{column_text}, mapped to {channel},"
     name_before_blank, _, unit_after_blank = column_text.rpartition(" ")
@@ -251,7 +259,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add the channels and the time of a user's map to `choice`; `columns`: channel -> column or formula."""
+    """Add the channels and the time that a user's map names to `choice`; `columns`: channel -> column or formula."""
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole
@@ -269,7 +277,10 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Add the channels whose names columns have to `choice`, and the time, unless a map has set them already."""
+    """Add the channels and the time that are found by the names of columns to `choice`.
+
+    Those that a map has already set stay.
+    """
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
@@ -289,10 +300,10 @@ def _apply_names(choice: ColumnMap) -> None:
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
-    """Find the only column with a channel's name within its own, as in `Rig.Cyl.p_A [bar]` or `p_A_bar`.
+    """Find the only column whose name contains a channel's name, such as `Rig.Cyl.p_A [bar]` or `p_A_bar`.
 
-    The name is part of a path or stands before a unit, and the unit must suit the channel. None if there is no such
-    column or several.
+    The channel's name is part of a path or stands before a unit, and the unit must suit the channel. None if there is
+    no such column or several.
     """
     matches = [
         i
@@ -324,11 +335,11 @@ def _find_time(labels: Sequence[Label]) -> int | None:
 
 
 def _choose_time_columns(choice: ColumnMap) -> None:
-    """Choose the time of a table from several columns, or from columns whose names do not mean the time.
+    """Choose the time of a table if it is in several columns, or in columns whose names do not mean the time.
 
-    Columns of hours, minutes and seconds form the time, alone or with a date. If there is no time column and the file
-    states no rate, a date is the time, or the only column in a unit of time. Columns with parts of a second are added
-    to the time.
+    The result is stored in `choice`. Columns of hours, minutes and seconds form the time, alone or with a date. If
+    there is no time column and the file states no rate, a date is the time, or the only column in a unit of time.
+    Columns with parts of a second are added to the time.
     """
     labels, used = choice.labels, choice.channel_of
     parts = find_time_parts(labels, used)

@@ -29,7 +29,10 @@ _STREAMS, _REFERENCES = "#sigstream#", "#refs#"
 
 
 def is_matlab_4(head: bytes) -> bool:
-    """Test whether `head` begins a MATLAB 4 file, with five integers and a name that ends in a zero byte."""
+    """Return True if `head`, the first bytes of a file, begins a MATLAB 4 file.
+
+    Such a file begins with five integers and a name that ends in a zero byte.
+    """
     for machine, order in enumerate("<>" if len(head) > 20 else ""):  # little and big endian
         kind, rows, columns, imaginary, length = struct.unpack(f"{order}5i", head[:20])
         if (
@@ -47,7 +50,7 @@ def is_matlab_4(head: bytes) -> bool:
 
 
 def read_matlab(path: Path, request: Request) -> RecordingFields:
-    """Read the requested series of a MATLAB file to the fields of a recording; raise MissingExtra without mat-io."""
+    """Read the requested columns of a MATLAB file to the fields of a recording; raise MissingExtra without mat-io."""
     import h5py
 
     size = path.stat().st_size
@@ -87,7 +90,7 @@ def _check_links(file: Any) -> None:
 
 
 def _read_streams(file: Any) -> Iterator[Series]:
-    """Yield the series of doubles among the signal streams of an open HDF5 file.
+    """Yield the signals of an open HDF5 file that stores them as streams of doubles.
 
     In the file `CompressedTime` contains first time, step and number of samples, and `DataR2` the number of the
     stream.
@@ -116,5 +119,5 @@ def _decode_utf16(characters: Any) -> str:
 
 
 def _read_doubles(data: Any, count: int) -> Array:
-    """Read the first `count` doubles from a data set of bytes."""
+    """Read the first `count` doubles (count,) from a data set of bytes."""
     return np.frombuffer(data[: count * np.dtype(np.float64).itemsize].tobytes(), dtype=np.float64, count=count)

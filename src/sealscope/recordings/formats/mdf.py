@@ -35,7 +35,10 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
             master = file.masters_db.get(number)
 
             def read_seconds(number: int = number) -> Any:
-                """Read the times (n,) [s] of a group, and the time stamp of 0 s, None if the file has no date."""
+                """Read the times (n,) [s] of a group of channels, and the time stamp of 0 s.
+
+                The stamp is None if the file has no date.
+                """
                 return np.asarray(file.get_master(number), dtype=np.float64), start
 
             clock = None if master is None else Clock(number, read_seconds)
@@ -50,7 +53,7 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _open_file(MDF: Any, path: Path) -> Any:
-    """Open an MDF file with asammdf's class `MDF`.
+    """Open an MDF file with `MDF`, the class of asammdf.
 
     If that fails, the object is marked as closed, because its destructor would print an error.
     """
@@ -65,7 +68,7 @@ def _open_file(MDF: Any, path: Path) -> Any:
 
 
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
-    """Read the samples (n,) of a channel by the numbers of its group and of the channel in it.
+    """Read the samples (n,) of a channel, given the number of its group in the file and its index in the group.
 
     A conversion may give a few texts among the numbers, such as `SNA`; these become NaN.
     """

@@ -37,7 +37,7 @@ _CHANNEL_ORDER = {name: place for place, name in enumerate(LONG_NAMES)}
 
 
 def read_netcdf(path: Path, request: Request) -> RecordingFields:
-    """Read the requested data sets of a NetCDF-4 or HDF5 file to the fields of a recording.
+    """Read the requested series of samples in a NetCDF-4 or HDF5 file to the fields of a recording.
 
     A series is a one-dimensional data set, or a field of a data set of records.
     """
@@ -75,13 +75,16 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
-    """Read the field `field` of a data set of records as doubles (n,); `name`: the data set in messages."""
+    """Read one field of a data set of records as doubles (n,).
+
+    `name`: the data set in messages; `field`: name of the field.
+    """
     check_internal(name, data)
     return np.asarray(data[field], dtype=np.float64)
 
 
 def _is_series(item: Any) -> bool:
-    """Test whether an item of a file is a one-dimensional data set; a NetCDF dimension without values is none."""
+    """Return True if an item of a file is a one-dimensional data set, but no NetCDF dimension without values."""
     import h5py
 
     if not isinstance(item, h5py.Dataset) or item.ndim != 1:
@@ -98,7 +101,10 @@ def check_internal(name: str, data: Any) -> None:
 
 
 def _decode_text(value: Any) -> str | None:
-    """Decode an attribute or cell with a single text: a str, UTF-8 bytes, or an array of one; None for others."""
+    """Decode an attribute or cell that contains a single text; None for others.
+
+    The text is a str, UTF-8 bytes, or an array of one of them.
+    """
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, bytes):
@@ -112,7 +118,7 @@ def _first_number(value: Any) -> float:
 
 
 def _parse_label(name: str, data: Any) -> Label:
-    """Make the label of the data set `name` from its name and its attribute of units."""
+    """Make the heading of the data set `name` from its name and its attribute of units."""
     unit = next(
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
@@ -145,7 +151,7 @@ def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
 
 
 def _read_texts(data: Any, name: str, file_size: int) -> list[str]:
-    """Read a data set of texts, in chunks that bound the memory.
+    """Read a data set of texts in chunks, to bound the memory.
 
     Many cells may refer to one text, which may be as long as the file, `file_size` [bytes]. `name`: the data set in
     messages.
@@ -195,9 +201,10 @@ def make_attributes(description: Mapping[str, Any]) -> dict[str, Any]:
 def write_netcdf(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write a NetCDF-4 file without loss of precision; arguments as from `Recording.series`.
+    """Write the samples of a recording as a NetCDF-4 file without loss of precision.
 
-    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
+    `values`, `units`, `description`: as from `Recording.series`. The file is made in memory first, because libhdf5
+    aborts the process if the disk is full.
     """
     import h5netcdf
 

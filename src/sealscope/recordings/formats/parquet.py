@@ -41,7 +41,7 @@ def read_parquet(path: Path, request: Request) -> RecordingFields:
         schema, rows = file.schema_arrow, file.metadata.num_rows
 
     def read_column(number: int) -> Any:
-        """Read a column by its number."""
+        """Read a column of the table by its number."""
         name = schema.field(number).name
         texts = [name] if _is_text(schema.field(number)) else []
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # stores repeated texts once
@@ -60,7 +60,7 @@ def _read_remarks(schema: Any) -> dict[str, str]:
 
 
 def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) -> list[Series]:
-    """List the columns of a table as series.
+    """List the columns of a table as series, whose samples are read when they are needed.
 
     `schema`: pyarrow's schema of the table; `read_column`: function that reads a column by its number; `n_rows`:
     number of rows.
@@ -78,7 +78,7 @@ def _list_series(schema: Any, read_column: Callable[[int], Any], n_rows: int) ->
 
 
 def _is_text(field: Any) -> bool:
-    """Test whether a column, a field of pyarrow's schema, has a text type."""
+    """Return True if a column of a table has a text type; `field`: the column in pyarrow's schema."""
     return str(field.type) in ("string", "large_string")
 
 
@@ -110,9 +110,10 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
 def write_parquet(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write a Parquet file with columns `t [s]`, `p_A [Pa]`, ... of doubles; arguments as from `Recording.series`.
+    """Write the samples of a recording as a Parquet file with columns `t [s]`, `p_A [Pa]`, ... of doubles.
 
-    The description becomes metadata of the table. Raises MissingExtra without pyarrow.
+    `values`, `units`, `description`: as from `Recording.series`. The description becomes metadata of the table.
+    Raises MissingExtra without pyarrow.
     """
     pyarrow = import_library("pyarrow", "Parquet", "pyarrow")
     columns = {f"{name} [{units[name]}]": pyarrow.array(series, from_pandas=False) for name, series in values.items()}

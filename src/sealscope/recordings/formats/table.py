@@ -67,7 +67,7 @@ Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
 
 @dataclass(frozen=True)
 class Clock:
-    """Sampling times that one or more series have in common.
+    """Sampling times that one or more series of samples have in common.
 
     `key`: equal for series that are sampled together; `read`: function that returns the times (n,) [s] and the time
     stamp of 0 s, None if that is not known.
@@ -78,17 +78,20 @@ class Clock:
 
     @classmethod
     def of_times(cls, key: Hashable, t: Array, start: np.datetime64 | None = None) -> Clock:
-        """Make a clock from its times `t` (n,) [s] after the time stamp `start`; `key`: as for the class."""
+        """Make a clock from known times `t` (n,) [s], which count from the time stamp `start`.
+
+        Series with the same `key` are sampled together. `start` is None if it is not known.
+        """
         return cls(key, lambda: (t, start))
 
 
 @dataclass(frozen=True)
 class Series:
-    """A named series of samples in a file, which are read when they are needed.
+    """A named column of samples in a file, which are read when they are needed.
 
-    `group`: name of the group that it is in, or empty; `label`: its name and unit; `count`: number of samples;
-    `values`: function that reads the samples (n,) as doubles, texts or datetime64; `clock`: sampling times, None if
-    the file does not state them.
+    `group`: name of the group that it is in, or ""; `label`: its name and unit; `count`: number of samples; `values`:
+    function that reads the samples (n,) as doubles, texts or datetime64; `clock`: sampling times, None if the file
+    does not state them.
     """
 
     group: str
@@ -99,14 +102,14 @@ class Series:
 
     @property
     def path(self) -> str:
-        """Name of the series after the name of its group, as a map may contain it: `group/name`."""
+        """Name of the series with that of its group, `group/name`, as a user's map may give it."""
         return f"{self.group}/{self.label.whole}" if self.group else self.label.whole
 
 
 def uniform_clock(
     key: Hashable, count: int, step: float, first: float = 0.0, start: np.datetime64 | None = None
 ) -> Clock:
-    """Make the clock of `count` samples every `step` [s], the first at `first` [s] after `start`.
+    """Build the clock of `count` samples every `step` [s], the first at `first` [s] after the time stamp `start`.
 
     Series share the clock if `key` and all other arguments are equal.
     """
@@ -142,10 +145,13 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    `request`: choice of the series; `kind`: format of the file in words; `remarks`: entries in the file's header;
-    `rate` [Hz]: sampling rate stated by the file, for series without a clock; `description`: rate, provenance and
-    history in a file that Sealscope has written; `prepare`: function that reads all used columns together; `size`:
-    size of a file that may be compressed [bytes], for `check_size`.
+    - `request`: choice of the series.
+    - `kind`: format of the file in words.
+    - `remarks`: entries in the file's header.
+    - `rate` [Hz]: sampling rate stated by the file, for series without a clock.
+    - `description`: rate, provenance and history in a file that Sealscope has written.
+    - `prepare`: function that reads all used columns together, before their values are needed.
+    - `size`: size of a file that may be compressed [bytes], for `check_size`.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
@@ -191,9 +197,11 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns of a table that were read to the fields of a recording.
 
-    `choice`: meaning of the columns; `columns`: column -> values (n,), doubles or, for the time, datetime64; `kind`,
-    `remarks`, `description`: as for `build_fields`; `notes`: lines for the history; `state`: state of the time column
-    after the previous part of a text log, which is updated.
+    - `choice`: meaning of the columns.
+    - `columns`: column -> values (n,), doubles or, for the time, datetime64.
+    - `kind`, `remarks`, `description`: as for `build_fields`.
+    - `notes`: lines for the history.
+    - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
     """
     label, start, remarks = choice.time_label, dict[str, Any](), remarks or {}
     count = len(next(iter(columns.values())))
@@ -239,9 +247,10 @@ def convert_columns(
 def _convert_channels(
     choice: ColumnMap, columns: Mapping[int, NDArray[Any]]
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
-    """Convert the chosen channels to SI units or counts; return (values, units, units in the log where they differ).
+    """Convert the chosen channels of a table to SI units or counts.
 
-    Each is a mapping from the names of channels.
+    Returns (values (n,), units, units in the log where they differ), each a mapping from the names of channels.
+    `columns`: column -> values (n,).
     """
     channels, units, log_units = {}, {}, {}
     for name, formula in choice.channels.items():
@@ -256,10 +265,10 @@ def _convert_channels(
 
 
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
-    """Combine the columns that form the time, and add a line to `notes`.
+    """Combine the columns that form the time, such as date and hours, and add a line on it to `notes`.
 
     `label`: name and unit of the time. Returns the time column alone if the other columns are no parts of its time.
-    Raises InputError if it is a column of hours.
+    Raises InputError if that is a column of hours.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -277,7 +286,7 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
 
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:
-    """Test whether any date stamp in `time` (n,) has a time of day other than midnight.
+    """Return True if any date stamp in `time` (n,) has a time of day other than midnight.
 
     False if the values are no stamps.
     """
@@ -286,10 +295,10 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give series without a clock the times of the time series in their group, and remove the time series.
+    """Give each series without a clock the times of the time series in its group.
 
-    If the file has only one time series, it stays, as a column. A series with a name such as `data` or `value` that
-    is alone in its group gets the name of the group.
+    Returns the series without these time series. If the file has only one of them, it stays, as a column. A series
+    with a name such as `data` or `value` that is alone in its group gets the name of the group.
     """
     time_series: dict[str, Series] = {}
     for member in series:
@@ -312,7 +321,7 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 
 
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
-    """Read the times (n,) [s] of a time series, and the time stamp of 0 s.
+    """Read the times (n,) [s] of a series that contains times, and the time stamp of 0 s.
 
     Date stamps count from the first of them, which is returned, or None for a series in a group. For other times the
     returned stamp is `start`. Raises InputError if no row has a time.
@@ -336,10 +345,10 @@ def timedelta_seconds(times: Any) -> Array:
 
 
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
-    """Give each series a unique name; return the series, and lines for the history.
+    """Give each series of a file a unique name; return the series, and lines for the history.
 
-    If several groups have series of one name, that in the group with most channels, or else with most samples, keeps
-    it. The others are called by their paths. A file without groups is returned unchanged.
+    If several groups have series of one name, the group with most channels, or else with most samples, keeps it. The
+    others are called by their paths, `group/name`. A file without groups is returned unchanged.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -366,9 +375,10 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles, or as datetime64 if `as_time` and they are date stamps.
+    """Read the samples (n,) of a series as doubles.
 
-    A few words in a column of texts become NaN; raises InputError for more, and for other types.
+    With `as_time`, date stamps are read as datetime64. A few words in a column of texts become NaN; raises InputError
+    for more, and for other types.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -390,7 +400,7 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the used columns to the clock of the chamber pressures.
+    """Resample the columns to read to one clock, that of the chamber pressures.
 
     Without these, the clock is that of the pressures at the pump, or of the longest series. `used`: column -> series.
     Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no series has a
@@ -486,10 +496,11 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 
 @dataclass(frozen=True)
 class _LongTable:
-    """A long table, in which each row is one sample of a named channel.
+    """A table in which each row is one sample of a named channel.
 
     `choice`, `request`: meaning of the columns; `columns`: column -> cells (n,); `value`, `time`: the columns of the
-    samples and their times. The rows of each name are read as a recording with the single channel `u` in counts.
+    samples and their times. The rows of each name are read as a recording with a single channel in counts, which is
+    called `u`.
     """
 
     choice: ColumnMap
@@ -499,18 +510,20 @@ class _LongTable:
     time: int
 
     def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
-        """Make the series of one channel from its rows, which are read when they are needed.
+        """Make the series of one channel of the table, whose samples are read when they are needed.
 
-        `number`: number of the channel, the key of its clock; `rows` (k,): indices of its rows.
+        `number`: number of the channel, the key of its clock; `label`: name and unit of the channel; `rows` (k,):
+        indices of its rows in the table.
         """
         read_rows = cache(partial(self._read_rows, label, rows))
         clock = Clock(number, lambda: self._read_clock(read_rows(), rows))
         return Series("", label, rows.size, lambda: read_rows().channels["u"], clock)
 
     def _read_rows(self, label: Label, rows: NDArray[np.intp]) -> RecordingFields:
-        """Convert those of the rows that have a time to a recording; raise InputError if too many samples are words.
+        """Convert the rows of one channel that have a time to the fields of a recording.
 
-        `rows` (k,): indices of the rows of one channel.
+        `rows` (k,): indices of the channel's rows in the table; `label`: its name, for messages. Raises InputError if
+        too many samples are words.
         """
         times = self.columns[self.time][rows]
         timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
@@ -522,9 +535,9 @@ class _LongTable:
         return convert_columns(self.choice, columns, "", self.request)
 
     def _read_clock(self, fields: RecordingFields, rows: NDArray[np.intp]) -> tuple[Array, np.datetime64 | None]:
-        """Return the times (n,) [s] of one channel's recording, and the time stamp of 0 s, None if it is not known.
+        """Return the times (n,) [s] of one channel, and the time stamp of 0 s, None if it is not known.
 
-        `fields`: the recording; `rows` (k,): indices of its rows in the table.
+        `fields`: the recording of the channel; `rows` (k,): indices of its rows in the table.
         """
         start, times = fields.provenance, self.columns[self.time][rows]
         if "start_epoch_s" in start:
@@ -538,10 +551,10 @@ class _LongTable:
 def _pivot_long_table(
     series: Sequence[Series], column_by_kind: Mapping[str, int], prepare: Prepare | None
 ) -> tuple[list[Series], list[str]]:
-    """Make a series for each name in a long table; also return lines for the history.
+    """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`. Samples that the file calls
-    invalid become NaN.
+    `series`: columns of the table; `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`.
+    Samples that the file calls invalid become NaN. Also returns lines for the history.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -599,7 +612,10 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError if `count` texts of up to `width` bytes are too many or too long for the column `name`."""
+    """Raise InputError if a column has too many texts, or too long ones.
+
+    `count`: number of texts; `width`: length of the longest one [bytes]; `name`: the column in messages.
+    """
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "

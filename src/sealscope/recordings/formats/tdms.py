@@ -46,7 +46,7 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
 
 
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
-    """Make the clock of a channel of `count` samples from its waveform properties; None if they state no interval."""
+    """Build the clock of a channel of `count` samples from its waveform properties; None without an interval."""
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:
         return None

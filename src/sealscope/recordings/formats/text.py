@@ -97,7 +97,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
     All parts have equally many rows, as many as `every` lasts at the sampling rate of the first block; the last may
     have fewer. A log is a single part if it has a time column for each channel, if it begins with the last sample, or
-    if it is a long table.
+    if each row is one sample of a named channel (a long table).
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -117,7 +117,11 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     log = _Log(path, layout, choice.columns, choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert the rows of some blocks to the fields of a recording; `more_notes`: lines for its history."""
+        """Convert the rows of some blocks to the fields of a recording.
+
+        `state`: state of the time column after the previous part, which is updated; `more_notes`: lines for the
+        history.
+        """
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
@@ -140,9 +144,10 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log with several time columns, each of them before its channels, or a long table.
+    """Read a log that has a time column for each channel, or one in which each row is a sample of a named channel.
 
-    `time_columns`: numbers of the time columns, empty for a long table.
+    `time_columns`: numbers of the time columns, each of them before its channels; empty for a log of the second kind
+    (a long table).
     """
     cells_by_column: dict[int, NDArray[Any]] = {}
     columns = [column for column in range(len(layout.labels)) if column not in time_columns]
@@ -153,7 +158,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
         """Read the requested columns and their times, and return lines for the history.
 
-        `kinds`: index in `columns` -> kind; `date`: column of the date, or None.
+        `kinds`: index in `columns` -> kind of its values, such as "numbers"; `date`: column of the date, or None.
         """
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
@@ -164,7 +169,10 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         return [*layout.notes, *notes, *log.describe_text_lines(), *notes_on_times]
 
     def make_series(column: int, clock: Clock | None = None) -> Series:
-        """Make the series of a column that `prepare` reads later; its length is not known before, and set to 0."""
+        """Make the series of a column that `prepare` reads later.
+
+        Its length is not known before, and set to 0.
+        """
         return Series("", layout.labels[column], 0, partial(cells_by_column.__getitem__, column), clock)
 
     start = scope_start(layout.remarks)
@@ -174,7 +182,10 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
 
 
 def _find_channel_times(labels: Sequence[Label]) -> list[int]:
-    """Find the time columns of a log in which each time column precedes its channels; empty for other logs."""
+    """Find the time columns of a log in which each channel, or group of channels, follows a time column of its own.
+
+    Empty for other logs.
+    """
     # the time columns differ only in a number at the end of their names
     names = [_NUMBER_SUFFIX.sub("", label.name.casefold()) for label in labels]
     if names.count(names[0]) < 2 or not is_time(labels[0]):
@@ -186,7 +197,7 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup blocks of rows into lists with `size` rows each; the last list may have fewer rows."""
+    """Regroup blocks of rows of a log into lists with `size` rows each; the last list may have fewer rows."""
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -217,7 +228,7 @@ def read_layout(path: Path) -> Layout:
 
 @dataclass
 class _Block:
-    """Consecutive rows of a log.
+    """Consecutive rows of a text log.
 
     `columns`: column -> values (n,); `word_rows`: column -> indices of the rows with a word in place of a number;
     `first_words`: column -> the first of these words with its place, for messages.
@@ -231,7 +242,7 @@ class _Block:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return a block with the rows of a slice."""
+        """Return a block with the rows of a slice of this block."""
         first, stop, _ = rows.indices(len(self))
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
@@ -242,16 +253,20 @@ class _Block:
 class _Log:
     """Reader of the rows of a text log, block by block.
 
-    Of its attributes `kinds` is a mapping from the columns to read to their kinds, and `date` the column of the date
-    or None, as for `table.Prepare`. `min_cells`: number of cells that a row needs; `n_rows`, `n_repeated`,
-    `n_text_lines`: numbers of rows, repeated heading lines and lines of text that were read until now; `has_stamps`,
-    `has_date`: whether the time column contains stamps, and whether a date column completes them, not known before
-    its first cell; `n_words`: number of words by column; `last_width`: number of cells in the last row;
-    `null_values`: texts that pyarrow reads as missing.
+    - `kinds`: column to read -> kind of its values; `date`: column of the date, or None, both as for `table.Prepare`.
+    - `min_cells`: number of cells that a row needs.
+    - `n_rows`, `n_repeated`, `n_text_lines`: numbers of rows, repeated heading lines and lines of text read until
+      now.
+    - `has_stamps`: True if the time column contains date stamps, None before its first cell is read.
+    - `has_date`: True if a date column completes these stamps.
+    - `day_first`: True if the day precedes the month in dates, None before the first date that leaves this open.
+    - `n_words`: number of words by column.
+    - `last_width`: number of cells in the last row.
+    - `uses_arrow`: True if pyarrow may read blocks; `null_values`: texts that it reads as missing.
     """
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
-        """Set up the reader without reading rows, and decide whether pyarrow can read this layout."""
+        """Prepare to read a log, without reading rows, and decide if pyarrow can read its layout."""
         self.path, self.layout, self.kinds, self.date, self.place = path, layout, kinds, date, str(path)
         self.min_cells = max(kinds) + 1
         self.n_rows = self.n_repeated = self.n_text_lines = 0
@@ -269,14 +284,14 @@ class _Log:
         self.null_values, self.last_width = ["", "NaN"], 0
 
     def iter_blocks(self) -> Iterator[_Block]:
-        """Yield the rows in blocks, in order.
+        """Yield the rows of the log in blocks, in order.
 
         A block is read by pyarrow if that is possible, else row by row.
         """
         is_first = True
 
         def n_bytes() -> int:
-            """Compute the number of bytes to read next."""
+            """Compute the number of bytes of the file to read next."""
             return _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1)
 
         with self.path.open("rb") as file:
@@ -293,7 +308,7 @@ class _Log:
                     yield block
 
     def _split_rows(self, first_line: int, block: bytes, is_cut: bool) -> tuple[list[list[str]], Sequence[int]]:
-        """Split a block of bytes into rows of cells; also return the line number of each row.
+        """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
         `first_line`: number of the block's first line; `is_cut`: the file ends within its last line.
         """
@@ -312,12 +327,12 @@ class _Log:
         return self._remove_text_rows(rows, line_numbers)
 
     def _count_rows(self, n_rows: int) -> None:
-        """Count `n_rows` more rows; raise InputError if the columns then have too many values."""
+        """Add `n_rows` to the number of rows read; raise InputError if the columns then have too many values."""
         self.n_rows += n_rows
         check_size(self.n_rows, len(self.kinds))
 
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
-        """Read the rows of a block by pyarrow; None unless all of them are plain numbers that it can read.
+        """Read the rows of a block of bytes by pyarrow; None unless all of them are plain numbers that it can read.
 
         `first_line`: number of the block's first line; `end`: number of bytes up to the end of its last complete
         line.
@@ -361,7 +376,7 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the indices of the lines with samples, from index `first` on.
+        """List the indices of the lines that contain samples, from index `first` on.
 
         Comments, blank lines and repeated headings are left out.
         """
@@ -375,10 +390,10 @@ class _Log:
         return rows
 
     def _split_lines(self, lines: list[str], line_numbers: Sequence[int], is_cut: bool) -> list[list[str]]:
-        """Split lines into cells.
+        """Split lines of the log into cells.
 
-        A quotation mark must be closed on its line, unless it is the last line and `is_cut`; raises InputError
-        otherwise.
+        `line_numbers`: number of each line in the file, for messages. Raises InputError for a quotation mark that is
+        not closed on its line. In the last line it may be open if `is_cut`, i.e. if the file ends within this line.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -430,7 +445,7 @@ class _Log:
     def _parse_rows(self, rows: Sequence[Sequence[str]], lines: Sequence[int], is_cut: bool) -> _Block:
         """Parse rows of cells to a block of values.
 
-        `lines`: number of the line of each row; `is_cut`: the last row is incomplete.
+        `lines`: number of each row's line in the file; `is_cut`: the last row is incomplete.
         """
         block = _Block()
         for column, kind in self.kinds.items():
@@ -456,9 +471,9 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Test whether the time column contains stamps, as its first cell in the log shows.
+        """Return True if the time column contains date stamps, as its first cell in the log shows.
 
-        `cells`: cells of the time column in `rows`. Also finds out whether a date column completes these stamps
+        `cells`: cells of the time column in `rows`. Also finds out if a date column completes these stamps
         (`has_date`).
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
@@ -486,10 +501,10 @@ class _Log:
         return f"(line {lines[index]}, column {self.layout.labels[column].whole}, {self.place})"
 
     def _parse_dates(self, cells: list[str], where: Callable[[int], str]) -> tuple[NDArray[np.datetime64], list[int]]:
-        """Parse cells to datetime64 (n,), NaT for missing ones and words; also return the indices of the words.
+        """Parse cells to time stamps (n,), datetime64, NaT for missing ones and words.
 
-        `where`: function from the index of a cell to its place. Raises InputError for a cell with digits that is no
-        stamp.
+        Also returns the indices of the words. `where`: function from the index of a cell to its place. Raises
+        InputError for a cell with digits that is no stamp.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
@@ -510,9 +525,9 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad]!r} {where(bad)}") from None
 
     def _is_day_first(self) -> bool:
-        """Decide whether the day precedes the month in the dates of the log, such as 05/06/2024.
+        """Decide if the day precedes the month in the dates of the log, such as 05/06/2024.
 
-        The log is read up to the first date that tells.
+        The log is read up to the first date that decides this.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
@@ -530,7 +545,7 @@ class _Log:
         return order
 
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-        """Join blocks to whole columns, column -> values (n,); also return lines for the history.
+        """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
 
         The columns are removed from the blocks to save memory. Raises InputError if too many cells are words.
         """
@@ -568,9 +583,9 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe the lines of text and the repeated headings that were left out, for the history.
+        """Describe for the history the lines of text and the repeated headings that were left out of the log.
 
-        Raises InputError if there are too many lines of text.
+        The list is empty if there are none. Raises InputError if there are too many lines of text.
         """
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
@@ -583,11 +598,11 @@ class _Log:
 def _iter_line_blocks(
     file: BinaryIO, encoding: str, place: str, n_bytes: Callable[[], int]
 ) -> Iterator[tuple[int, bytes, int, bool]]:
-    """Yield a file in blocks: (number of the first line, bytes, end, is_cut).
+    """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
 
     The bytes before `end` are complete lines; those after it come again in the next block. `is_cut`: the file ends
-    within the block's last line. `place`: path of the file for messages; `n_bytes`: function that returns how many
-    bytes to read next.
+    within the block's last line. `place`: path of the file for messages; `n_bytes`: function that returns the number
+    of bytes to read next.
     """
     character_bytes = 2 if encoding.startswith("utf-16") else 1
     newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
@@ -638,7 +653,8 @@ def write_text(
 ) -> None:
     """Write a text log: `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss.
 
-    Arguments as from `Recording.series`. Raises InputError for an infinite sample.
+    `values`, `units`, `description`: as from `Recording.series`; `delimiter`: separator of cells. Raises InputError
+    for an infinite sample.
     """
     for name, series in values.items():
         if np.isinf(series).any():

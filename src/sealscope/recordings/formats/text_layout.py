@@ -53,12 +53,16 @@ _DELIMITER_NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " "
 class Layout:
     """The layout of a text log.
 
-    `delimiter`: separator of cells, where a blank stands for any white space; `decimal`: decimal separator; `labels`:
-    headings of the columns; `first_row`: index of the first line of samples; `description`: JSON written by
-    Sealscope, or None; `notes`: lines for the history; `remarks`: entries above the heading, name -> text;
-    `lines_above`: lines above the first row, which some loggers repeat among the samples; `rate`: sampling rate
-    stated in them [Hz], or None; `cell_units`: column -> unit after each of its numbers; `prefixed`: numbers end in
-    SI prefixes.
+    - `encoding`: encoding of the text.
+    - `delimiter`: separator of cells, where a blank stands for any white space.
+    - `decimal`: decimal separator; `prefixed`: True if numbers end in SI prefixes.
+    - `labels`: headings of the columns; `cell_units`: column -> unit after each of its numbers.
+    - `first_row`: index of the first line of samples.
+    - `description`: JSON written by Sealscope, or None.
+    - `notes`: lines for the history.
+    - `remarks`: entries above the heading, name -> text.
+    - `lines_above`: lines above the first row, which some loggers repeat among the samples.
+    - `rate`: sampling rate stated in these lines [Hz], or None.
     """
 
     encoding: str
@@ -76,7 +80,7 @@ class Layout:
 
     @property
     def kind(self) -> str:
-        """The format, in words."""
+        """The layout in words, such as "text, comma separated, utf-8"."""
         comma = ", decimal comma" if self.decimal == "," else ""
         return f"text, {_DELIMITER_NAMES[self.delimiter]} separated{comma}, {self.encoding}"
 
@@ -135,9 +139,9 @@ def _used_width(row: Sequence[str]) -> int:
 
 
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
-    """Detect the dialect of a log, (delimiter, decimal separator, number of cells in a row), from some of its lines.
+    """Detect delimiter, decimal separator and number of cells in a row from some lines of a log.
 
-    In this dialect the largest fraction of the cells are numbers or time stamps.
+    Returns the three in this order. With them, the largest fraction of the cells are numbers or time stamps.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -160,7 +164,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 
 
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
-    """Split a heading line into the names of columns.
+    """Split the heading line of a log into the names of columns.
 
     If the delimiter is a blank, a unit in brackets stays with its name. Names may then contain single blanks, if
     wider spaces separate exactly `width` names.
@@ -173,9 +177,9 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
-    """Parse a row of units: the unit of each cell, None for an empty one.
+    """Parse a row of units below or above the names of columns: the unit of each cell, None for an empty one.
 
-    At least 60 % of its cells must be known units; None for any other row.
+    At least 60 % of the cells must be known units; the result is None for any other row.
     """
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
@@ -186,16 +190,17 @@ def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
 def _parse_heading(
     lines: Sequence[str], first_row: int, delimiter: str, width: int, decimal: str
 ) -> tuple[list[Label], int]:
-    """Parse the heading above the line `first_row` of samples; return (labels, number of heading lines).
+    """Parse the heading of a log, which ends above the first line of samples.
 
-    `width`: number of cells in a row of samples.
+    `lines`: lines of the log; `first_row`: index of the first line of samples; `width`: number of cells in a row of
+    samples; `delimiter`, `decimal`: separators of cells and of decimals. Returns (labels of the columns, number of
+    heading lines); no labels if there is no heading.
     """
 
     def split_names(line: str) -> list[str] | None:
         """Split a heading line into the names of columns.
 
-        Return None if the number of names does not fit the number of columns, or if the line has values instead of
-        names.
+        None if the number of names does not fit the number of columns, or if the line has values instead of names.
         """
         cells = _split_heading(line, delimiter, width)
         if cells and not cells[-1]:  # drop empty cells beyond the width
@@ -231,9 +236,10 @@ def _parse_heading(
 
 
 def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] | None:
-    """Parse heading rows that begin with keys such as `Name` and `Unit`; return (labels, number of rows).
+    """Parse heading rows that begin with keys such as `Name` and `Unit`.
 
-    `rows`: cells of the rows, from the lowest up. None if there are no such keys.
+    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows), or None if there
+    are no such keys.
     """
     keys = [row[0].strip().rstrip(":").casefold() for row in rows]
     heading = next((i for i, key in enumerate(keys) if key in WORDS["row"]["name"] and _used_width(rows[i]) > 1), None)
@@ -248,9 +254,9 @@ def _parse_keyed_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int] 
 
 
 def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int]:
-    """Parse heading rows of names, and possibly of units, groups and rulers; return (labels, number of rows).
+    """Parse heading rows of names, and possibly of units, groups and rulers such as `----`.
 
-    `rows`: cells of the rows, from the lowest up.
+    `rows`: cells of the rows, from the lowest up. Returns (labels of the columns, number of rows).
     """
     n_skipped = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
     row, *rows_above = rows[n_skipped:]
@@ -282,9 +288,9 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
 
 
 def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
-    """Parse the row of units of Graphtec loggers, `NO.,Time,ms,V,...`: the unit of each cell or None.
+    """Parse the row of units that Graphtec loggers write, `NO.,Time,ms,V,...`: the unit of each cell or None.
 
-    None for any other row.
+    The result is None for any other row.
     """
     cells = [cell.strip() for cell in row]
     if [cell.casefold() for cell in cells[:3]] != ["no.", "time", "ms"]:
@@ -293,14 +299,14 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Test whether a row is a ruler such as `----`, or repeats one text that is no unit in all cells."""
+    """Return True if a row separates others: a ruler such as `----`, or one text, which is no unit, in all cells."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)
 
 
 def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) -> Layout:
-    """Detect the layout of a log from its beginning `head` in the given encoding.
+    """Detect the layout of a text log from its beginning `head` in the given encoding.
 
     `place`: the file in messages; `is_complete`: `head` is the whole log. Raises InputError for a text without rows
     of numbers.
@@ -355,9 +361,9 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
 
 
 def _no_rows_error(line: str, delimiter: str | None) -> InputError:
-    """Make the InputError for a text without rows of numbers.
+    """Build the InputError for a text without rows of numbers.
 
-    `line`: its first line; `delimiter`: the delimiter, or None if it is not known.
+    `line`: its first line; `delimiter`: separator of cells, or None if it is not known.
     """
     kind = {"{": "JSON", "[": "JSON", "<": "XML or HTML"}.get(line.lstrip()[:1])
     if kind is not None:
@@ -417,7 +423,7 @@ def _expand_sample_prefixes(line: str) -> str:
 
 
 def _find_units(body: Sequence[str]) -> dict[int, str]:
-    """Find the units after the numbers in the cells of lines: column -> unit.
+    """Find the units that are written after the numbers in lines of a log: column -> unit.
 
     The delimiter is the one with which most columns have a unit.
     """

@@ -74,10 +74,11 @@ _Seconds = tuple[Array, dict[str, Any], list[str]]
 
 @dataclass
 class TimeState:
-    """State of a log's time column between two parts of the log; None where a value is not known.
+    """State of a log's time column between two parts of the log, which are read one after the other.
 
     `head`: first times of a column without a unit; `rate`: sampling rate [Hz]; `resolution`: step [s] of coarse times
-    that several samples share; `last_time`: last time as in the file; `last_seconds`: the same in seconds.
+    that several samples share; `last_time`: last time as in the file; `last_seconds`: the same in seconds. Values are
+    None, or 0.0 for `last_seconds`, where they are not known.
     """
 
     head: Array | None = None
@@ -88,7 +89,7 @@ class TimeState:
 
 
 def _parse_stamp(text: str) -> dict[str, str | None] | None:
-    """Parse a date stamp or time of day to its parts by name (`year`, `clock`, ...); None for any other text.
+    """Split a date stamp or time of day into its parts by name (`year`, `clock`, ...); None for any other text.
 
     Parts that the stamp lacks are None.
     """
@@ -139,15 +140,15 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Collect the dates in which either the day or the month may come first, such as 05/06/2024, each once, in order.
+    """Collect the dates in which either the day or the month may come first, such as 05/06/2024.
 
-    The result is a dict without values, whose keys are the dates.
+    The result is a dict without values, whose keys are the dates, each once and in order.
     """
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide whether the day precedes the month, from the first date with a day or month over 12.
+    """Decide from dates if the day precedes the month, by the first date with a day or month over 12.
 
     None if there is no such date.
     """
@@ -156,7 +157,7 @@ def explicit_order(dates: Iterable[str]) -> bool | None:
 
 
 def is_day_first(columns: Collection[Iterable[str]]) -> bool:
-    """Decide whether the day precedes the month in dates such as 05/06/2024.
+    """Decide if the day precedes the month in dates such as 05/06/2024.
 
     `columns`: the `ambiguous_dates` of columns with the same format. Criteria in order: a number over 12
     (`explicit_order`); the order in which no column goes back in time; the order with the shorter time span.
@@ -176,7 +177,10 @@ def is_day_first(columns: Collection[Iterable[str]]) -> bool:
 
 
 def _ordinal_day(text: str, day_first: bool) -> int:
-    """Compute the day number (`date.toordinal`) of an ambiguous date in the given order; 0 if that is no date."""
+    """Compute the day number (`date.toordinal`) of a date such as 05/06/2024; 0 if that is no date.
+
+    `day_first`: True if the day precedes the month.
+    """
     first, second, year = _date_numbers(text)
     try:
         return date(year, *((second, first) if day_first else (first, second))).toordinal()
@@ -185,7 +189,7 @@ def _ordinal_day(text: str, day_first: bool) -> int:
 
 
 def _date_numbers(text: str) -> tuple[int, int, int]:
-    """Split an ambiguous date into its first number, its second number and its year."""
+    """Split a date such as 05/06/2024 into its first number, its second number and its year."""
     first, second, year = re.split("[/-]", text)
     return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
 
@@ -205,7 +209,7 @@ def counts_from_1970(clock: float) -> bool:
 
 
 def iso_moment(moment: np.datetime64) -> str:
-    """Format a time stamp in ISO form without trailing zeros: `2024-05-31T12:00:00.25`."""
+    """Format a time stamp in ISO form without trailing zeros, such as `2024-05-31T12:00:00.25`."""
     text = str(moment)
     return text.rstrip("0").rstrip(".") if "." in text else text
 
@@ -281,11 +285,11 @@ def is_falling(times: NDArray[Any]) -> bool:
 
 
 def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
-    """Convert date stamps (n,) to seconds from the first of them.
+    """Convert date stamps (n,) of a time column to seconds from the first of them.
 
-    Also returns the provenance of the start and lines for the history. Times of day without a date continue from part
-    to part of a log. Jumps back at midnight or at the full hour, and those of daylight saving time, are removed.
-    `name`: the column in messages. Raises InputError if no row has a stamp.
+    Returns (times (n,) [s], provenance of the start, lines for the history). Times of day without a date continue
+    from part to part of a log. Jumps back at midnight or at the full hour, and those of daylight saving time, are
+    removed. `name`: the column in messages. Raises InputError if no row has a stamp.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -334,8 +338,8 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds.
 
-    Also returns the provenance of the start and lines for the history. `unit`: unit of the column; without one the
-    magnitude of the numbers decides. `name`: the column in messages. Raises InputError if no row has a number.
+    Returns (times (n,) [s], provenance of the start, lines for the history). `unit`: unit of the column; without one
+    the magnitude of the numbers decides. `name`: the column in messages. Raises InputError if no row has a number.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -361,8 +365,8 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) without a unit to seconds.
 
-    Also returns the provenance of the start and lines for the history. The size and the steps of the `finite` numbers
-    show whether they are days or seconds, and since when. Raises InputError if they count rows.
+    Returns (times (n,) [s], provenance of the start, lines for the history). The size and the steps of the `finite`
+    numbers show if they are days or seconds, and since when. Raises InputError if they count rows.
     """
     first, is_first_part = float(finite[0]), state.head is None
     state.head = head = finite if state.head is None else state.head
@@ -390,10 +394,10 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
-    """Detect whether numbers (n,) without a unit count days; return (origin, meaning in words), or None for seconds.
+    """Find out if the numbers (n,) of a time column without a unit count days.
 
-    They count days if their steps, taken as seconds, would be shorter than those of any logger. The origin is None
-    for fractions of a day.
+    Returns (origin, meaning in words), or None if they count seconds. They count days if their steps, taken as
+    seconds, would be shorter than those of any logger. The origin is None for fractions of a day.
     """
     steps = np.diff(values)
     steps = steps[steps > 0]
@@ -442,10 +446,10 @@ def time_base(
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
-    """Spread samples that share a coarse time evenly over its step.
+    """Spread samples that share a coarse time evenly over the step of that time.
 
-    `t` (n,): times [s]. Returns (resolution [s], new times (n,)), or None if no samples share times regularly. A part
-    that is too short for estimating the resolution uses that of `state`, and its rate, unless it has a gap.
+    `t` (n,): times [s]. Returns (step [s], new times (n,)), or None if no samples share times regularly. A part of a
+    log that is too short for estimating the step uses that of `state`, and its rate, unless it has a gap.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)

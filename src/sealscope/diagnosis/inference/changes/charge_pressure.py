@@ -56,16 +56,20 @@ class LowDrifts(NamedTuple):
     low_B_error: float
 
     def estimate(self, side: str) -> Estimate | None:
-        """Return the drift of one chamber, "A" or "B", with its error; None if it is unknown."""
+        """Return the drift of the low pressures of chamber `side`, "A" or "B" [Pa/s], with its standard error.
+
+        The result is None if the drift is unknown.
+        """
         estimate = Estimate(self.low_A, self.low_A_error) if side == "A" else Estimate(self.low_B, self.low_B_error)
         return estimate if np.isfinite(estimate).all() else None
 
 
 @np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
-    """Estimate the drifts of the low values of both pressures; None without both.
+    """Estimate how fast the lowest pressures of each chamber drift [Pa/s], i.e. its charge pressure.
 
-    The result is also None without the pump's angle or speed, or if neither pressure can be fitted.
+    In a closed circuit a chamber that carries no load is at the charge pressure. The result is None without both
+    pressures and the pump's angle or speed, or if neither pressure can be fitted.
     """
     source = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -98,9 +102,10 @@ def _average(values: Array, rate: float) -> Array:
 
 
 def _regressors(recording: Recording, source: str) -> Array:
-    """Compute the columns (n, 2 or 3) of the fit: the position, if recorded, and the pump's flow in either direction.
+    """Compute the columns of the fit (n, 2 or 3): positive and negative flow of the pump, and the recorded position.
 
-    `source`: channel of the pump, its angle or its speed.
+    The flow is relative to its largest magnitude, the position to its mean. `source`: channel of the pump, "theta" or
+    "omega".
     """
     drive = _average(recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive
@@ -153,10 +158,11 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
 
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
-    """Yield the drift of the low values of each pressure, and the fall of the charge pressure, beside healthy ones.
+    """Compare the drifts of the low pressures with those of healthy recordings; yield a test for each explanation.
 
-    They are alternatives. The fall lowers both pressures alike; its chance is that of the fall of their weighted mean
-    over that of the difference between them, which it does not explain.
+    The explanations are a drift of the sensor of p_A, one of p_B, and a fall of the charge pressure, which lowers
+    both alike. The chance of the fall is that of the weighted mean of both drifts, divided by the chance of their
+    difference, which a fall does not explain.
     """
     prior = CHANGES.charge
     scatter = PriorScatter(prior.scatter, prior.recordings)
@@ -186,8 +192,9 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
 
 
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
-    """Compute minus the mean drift of the low pressures, weighted by the inverse `variances` of the sides [Pa^2/s^2].
+    """Compute the mean fall of the low pressures of both chambers [Pa/s], with its standard error.
 
+    It is minus the mean of their drifts, weighted by the inverse `variances` [Pa^2/s^2] of the sides "A" and "B".
     None if the recording has no drift of these sides.
     """
     known = [
@@ -201,11 +208,14 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
 
 
 def _difference(drifts: LowDrifts) -> Estimate:
-    """Compute the drift of low p_A less that of low p_B."""
+    """Compute the drift of low p_A minus that of low p_B [Pa/s], with its standard error."""
     error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
     return Estimate(drifts.low_A - drifts.low_B, error)
 
 
 def _with_size(observable: Observable, size: StepSize) -> Observable:
-    """Set the advantage of a description by the prior on the size of its drift."""
+    """Return the observable of a drift with its `advantage` set by the prior on the size of drifts.
+
+    The advantage is twice the log prior density of its size, relative to the maximum of that density.
+    """
     return replace(observable, advantage=-size_penalty(size, observable.size))

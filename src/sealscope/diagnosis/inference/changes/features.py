@@ -29,9 +29,10 @@ _NEIGHBOURS = _PRIORS.neighbours
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step; no test if either is constant.
+    """Test the amplitudes of command and motion for a step, i.e. for a change of the machine's duty.
 
-    A change of the duty changes both alike; a leak changes one of them, in open or closed loop.
+    Returns a test for each of the two that is recorded; none if either is constant. A change of the duty changes both
+    alike; a leak changes one of them, in open or closed loop.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -54,9 +55,10 @@ def time_in_motion(speeds: Array, max_speed: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) that move for at least `_PRIORS.busy` of the time of the busiest block.
+    """Flag the blocks (K,) in which the piston moves for long enough.
 
-    `fractions` (K,): fraction of time in motion of each block, from `time_in_motion`.
+    `fractions` (K,): fraction of each block's time in motion, from `time_in_motion`. It must be at least that of the
+    busiest block, times `features.busy` of `priors.toml`.
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
@@ -71,9 +73,10 @@ def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
-    """Yield the log range (K,), from the 2 % to the 98 % quantile, of command and of motion in blocks (K, length).
+    """Yield the names "command" and "motion", each with the log amplitude (K,) of its channel in K blocks.
 
-    NaN for a block without samples.
+    The amplitude is the range from the 2 % to the 98 % quantile; it is NaN for a block without samples. `blocks`:
+    samples (K, length) of each channel, by its name. A name without a recorded channel is left out.
     """
     for kind, names in (("command", COMMANDS), ("motion", MOTIONS)):
         if name := next((channel for channel in names if channel in blocks), None):
@@ -112,7 +115,10 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
 
 
 def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
-    """Return the middles (K,) [s] of blocks of `length` samples, and their channels (K, length), NaN if missing."""
+    """Split the channels of a recording into K blocks of `length` samples.
+
+    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing.
+    """
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
     if recording.bridged is not None:
@@ -124,7 +130,8 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
     """Yield name and values (K,) of each feature that only a change of a sensor shifts: wiring, noise, and hum.
 
-    `blocks`: channels (K, length), among them p_A and p_B, NaN for missing samples; `rate` [Hz].
+    `blocks`: samples (K, length) by channel name, among them p_A and p_B, NaN where missing; `rate`: sampling rate
+    [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if name := next((channel for channel in ("omega", "u", "theta", "x") if channel in blocks), None):
@@ -146,8 +153,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to that of the neighbouring bins.
 
-    Ringing is wider than a line and raises both. Welch's estimate from both halves of each block; `frequency`: over the
-    sampling rate.
+    `frequency`: that of the line, divided by the sampling rate. Ringing is wider than a line and raises the
+    neighbouring bins as well. The spectrum is Welch's estimate from both halves of each block.
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)

@@ -48,14 +48,19 @@ class HealthyLevels:
     name = SIGNALS
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Estimate friction, drifts of p_A and p_B [Pa] and the ratio of their spectra, once for a recording.
+        """Summarise a recording by friction, drifts and spectra of p_A and p_B, for comparison with other recordings.
 
-        The result lacks what the channels or too little motion do not allow; it is None if nothing can be estimated.
+        The summary maps the name of each number to its value, without those that the channels or too little motion do
+        not allow. It is None if nothing can be estimated, and is computed only once for a recording.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
-        """Yield the differences of friction, drifts and spectra from those of healthy recordings."""
+        """Compare friction, drifts and spectra of a recording with those of healthy ones; yield the observables.
+
+        Each observable is the test of one difference. Numbers that the recording, or too many of the healthy ones in
+        `baseline`, do not have are left out.
+        """
         summaries, judged = healthy_summaries(self, baseline), self.learn(recording)
         if judged is None:
             return
@@ -80,14 +85,14 @@ class HealthyLevels:
 
 
 def _octaves(summary: Summary) -> Octaves | None:
-    """Restore the comparison of the spectra from a summary; None if it lacks one of its numbers."""
+    """Read the comparison of the spectra of p_A and p_B from a recording's summary; None if it is not complete."""
     if not set(Octaves._fields) <= set(summary):
         return None
     return Octaves(*(float(summary[name]) for name in Octaves._fields))
 
 
 def _low_drifts(summary: Summary) -> LowDrifts | None:
-    """Restore the drifts of the low pressures from a summary; None if it has none."""
+    """Read the drifts of the low pressures from a recording's summary; None if it has none."""
     if not set(LowDrifts._fields) & set(summary):
         return None
     return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
@@ -116,9 +121,10 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
 
 
 def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Observable) -> Iterator[Observable]:
-    """Yield three alternatives: a drift of p_A alone, of p_B alone, and of both alike, which leaves their difference.
+    """Yield three alternative explanations of drifting pressures: by p_A alone, by p_B alone, and by both alike.
 
-    `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B.
+    `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. A drift of both alike does
+    not explain that of their difference, so its chance is chance_A chance_B / chance_difference, at most 1.
     """
     yield drift_A
     yield drift_B
@@ -130,7 +136,10 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra, as far as the recording allows; None if it allows none."""
+    """Estimate friction, drifts and spectra of p_A and p_B in a recording, as numbers by their names.
+
+    Numbers that the recording does not allow are left out; the result is None if none is left.
+    """
     motion, fit = select_motion(recording), fit_difference(recording)
     levels = dict[str, float]()
     if motion is not None and fit is not None:

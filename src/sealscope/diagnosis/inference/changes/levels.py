@@ -72,11 +72,11 @@ class LevelChange(NamedTuple):
 
 
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
-    """Compute the columns of a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
+    """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
-    The speed is the difference of x or theta over a fixed time, or else omega or u itself; the acceleration is the
-    difference of the speed over that time; the position is relative to its mean. Missing values are NaN. Return None if
-    none of these channels is recorded.
+    The speed is the difference of x or theta over a fixed time, or else omega or u itself. The acceleration is the
+    difference of the speed over that time. The position is relative to its mean. Missing values are NaN. Return None
+    if none of these channels is recorded.
     """
     name = next((name for name in ("x", "theta", "omega", "u") if name in channels), None)
     if name is None:
@@ -106,11 +106,12 @@ def _central_difference(values: Array, half_length: int) -> Array:
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate the level of each pressure in blocks, and half its difference between directions of motion.
+    """Estimate the level of each chamber pressure in blocks, and half its difference between directions of motion.
 
-    Least squares over the moving samples: the four are free in each block, the slopes b, c and d are common to the
-    recording. Without a recorded motion the levels are means and the halves zero. Return None if a pressure is missing,
-    or if no length of the blocks has enough samples of both directions in each.
+    The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
+    half difference are free in each block; the slopes b, c and d on speed, acceleration and position are common to
+    the recording. Without a recorded motion the levels are means and the half differences zero. Return None if a
+    pressure is missing, or if no length of the blocks has enough samples of both directions in each.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -135,10 +136,11 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
 def pressure_level_rows(
     channels: Mapping[str, Array], rate: float, means: Array, max_speed: float | None = None
 ) -> Array:
-    """Build the regression rows (n, m) of the samples: 1, sign(v), motion, p_A, p_B; all zero at rest.
+    """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
-    `means` (2,) are subtracted from the pressures. Samples faster than a fixed fraction of `max_speed` count as moving;
-    by default it is the `top_speed` of these samples.
+    The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A,
+    p_B. `channels`: samples by channel name; `means` (2,): subtracted from the pressures. Samples faster than a fixed
+    fraction of `max_speed` count as moving; by default it is the `top_speed` of these samples.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -153,10 +155,11 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit level_A, level_B, half_A and half_B (K, 4) to blocks of `length` samples.
+    """Fit the level of p_A and p_B, and half its difference between directions of motion, in each of K blocks.
 
-    Return None if a block has too few samples of one direction. `gram` (K, m, m): products of `pressure_level_rows`;
-    `means` (2,) were subtracted from the pressures.
+    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa]. It is None if a block has too few samples of
+    one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`: samples in a block;
+    `means` (2,): were subtracted from the pressures.
     """
     n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
     if n_free == 2:
@@ -175,16 +178,22 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the pressure levels of a recording for a step of each pattern, the highest rank first.
+    """Test the pressure levels of a recording for a step in each of several patterns, the most likely pattern first.
 
-    The result is empty if the levels cannot be estimated.
+    A pattern is the combination of levels that one cause changes, such as friction or a sensor's offset. The result
+    is empty if the levels cannot be estimated.
     """
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
 
 def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
-    """Test `PressureLevels`, times (K,) [s] and values (K, 4), for a step of each pattern, the highest rank first."""
+    """Test pressure levels for a step in each of several patterns, the highest rank first.
+
+    A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
+    `time` (K,): times of K blocks [s]; `values` (K, 4): their levels, as in `PressureLevels`. A higher rank means a
+    more likely pattern. Patterns that cannot be tested are left out.
+    """
     whitening = _whitening_matrix(values)
     mean, sum_of_levels, changes = values.mean(axis=0), values[:, :2].sum(axis=1), list[LevelChange]()
     # a step of a sensor's scale is proportional to its pressure's level and half difference
@@ -202,7 +211,11 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
 
 def _whitening_matrix(values: Array) -> Array:
-    """Compute S^(-1/2) (c, 4) of the module for values (K, 4), c of which vary between blocks."""
+    """Compute the matrix (c, 4) that transforms pressure levels to numbers with independent errors of unit variance.
+
+    It is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): levels in K
+    blocks, c of which vary.
+    """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
     change = np.diff(values[:, varying], axis=0)
     covariance = change.T @ change / len(change)

@@ -55,8 +55,8 @@ class Motion(NamedTuple):
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit.
 
-    Many samples are thinned. Returns None if a chamber pressure or a signal of the motion is not recorded, or if fewer
-    than `MIN_ROWS` samples move.
+    If they are many, they are thinned out. Returns None if a chamber pressure or a signal of the motion is not
+    recorded, or if fewer than `MIN_ROWS` samples move.
     """
     if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
@@ -121,13 +121,19 @@ class DifferenceFit(NamedTuple):
 
 
 def fit_difference(recording: Recording) -> DifferenceFit | None:
-    """Fit p_A - p_B by the module's equation, once for a recording; None without enough motion."""
+    """Fit p_A - p_B of a recording by friction, which reverses with the motion, and a viscous drop.
+
+    The result is None without enough motion. It is computed only once for a recording.
+    """
     return compute_once(recording, ("motion fit of p_A - p_B",), _fit_difference)
 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording) -> DifferenceFit | None:
-    """Fit p_A - p_B with cluster-robust errors of the coefficients of sign(v) and v."""
+    """Fit friction and viscous drop to p_A - p_B in motion, with their standard errors; None without enough motion.
+
+    The standard errors allow for residuals that are correlated within parts of the recording (`cluster_errors`).
+    """
     motion = select_motion(recording)
     if motion is None:
         return None

@@ -44,8 +44,9 @@ class Octaves(NamedTuple):
 
 
 def compare_octaves(recording: Recording) -> Octaves | None:
-    """Compare the spectra of p_A and p_B by the log ratio of their octaves and its tilt.
+    """Compare the spectra of p_A and p_B of a recording by two numbers, which a filter of one pressure changes.
 
+    They are the log ratio of their RMS in the upper octaves, and its difference from that in the lower ones (tilt).
     Return None without both pressures, or if the recording is too short or has too few octaves.
     """
     priors = CHANGES.octaves
@@ -64,11 +65,11 @@ def compare_octaves(recording: Recording) -> Octaves | None:
 
 
 def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
-    """Compute the log RMS (k,) of values (n,) in the octaves between `edges` (k + 1,) [Hz], each in a busy window.
+    """Compute the log RMS (k,) of a signal in the octaves between `edges` (k + 1,) [Hz], while the machine is busy.
 
-    The spectra are those of half-overlapping windows of `length` samples. Of each octave a high quantile over the
-    windows counts (`busy` in `priors.toml`), to which neither rests nor a single shock contribute. Single wrong samples
-    are removed by a median of three.
+    `values` (n,): samples at `rate` [Hz]. The spectra are those of half-overlapping windows of `length` samples. A
+    high quantile over the windows is taken in each octave (`octaves.busy` in `priors.toml`), to which neither rests
+    nor a single shock contribute. Single wrong samples are removed by a median of three.
     """
     from scipy.ndimage import median_filter
 
@@ -84,15 +85,15 @@ def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Ar
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
-    """Test for a filter of one pressure, by ratio and tilt of the spectra against healthy recordings.
+    """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    A filter changes both in the same direction; a tilt smaller than filters cause counts against one. Return None for
-    too few healthy recordings.
+    A filter changes ratio and tilt of the spectra in the same direction; otherwise the chance is 1. A tilt smaller
+    than filters usually cause lowers the observable's advantage. Return None for too few healthy recordings.
     """
     prior, filtered = CHANGES.octaves, CHANGES.filtered
 
     def compare(values: Sequence[float], value: float) -> Observable | None:
-        """Compare the ratio or the tilt with those of the healthy recordings."""
+        """Test if the judged ratio or tilt `value` differs from the healthy `values`; None if these are too few."""
         estimates = [Estimate(healthy_value, prior.error) for healthy_value in values]
         scatter = PriorScatter(prior.scatter, prior.recordings)
         return compare_estimates(BESIDE, SIDES, Estimate(value, prior.error), estimates, scatter)

@@ -22,13 +22,16 @@ SIGNALS = "signals"
 
 
 def observe_signals(recording: Recording) -> Observed:
-    """Test the signals of a recording for steps of quantities that no balance contains."""
+    """Test duty, sensors and pressure levels of a recording for steps that a leak does not cause.
+
+    The report is computed only once for a recording.
+    """
     return compute_once(recording, (SIGNALS,), _test_signals)
 
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Run all tests of the signals."""
+    """Test duty, sensors and pressure levels of a recording for steps; the report is empty if it is too short."""
     shortest = CHANGES.features.shortest
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return Observed(SIGNALS, lack="too short for changes of its signals")
@@ -57,9 +60,9 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield the step of the duty, if command and motion change by similar ratios.
+    """Yield an observable of the step of the duty if command and motion change by similar ratios, else nothing.
 
-    A leak changes only one of them. `tests`: of the log amplitudes of command and motion.
+    A leak changes only one of them. `tests`: step tests of the log amplitudes of command and motion (`duty_tests`).
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
@@ -76,7 +79,11 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 
 
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert the named tests of `sensor_tests`, each the better of a rise and a fall, to observables."""
+    """Convert step tests of sensor features, such as noise and hum, to observables.
+
+    `tests`: pairs of a feature's name and its test (`sensor_tests`). Each test is the better of a rise and a fall, so
+    its chance is doubled.
+    """
     for name, test in tests:
         data = name.split()[0]
         yield Observable.from_test(name, data if data in ("noise", "hum") else "sense", test, n_tests=2.0)
@@ -87,11 +94,12 @@ _MAX_EXPONENT = 700.0
 
 
 def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
-    """Convert changes of the pressure levels, the highest rank first, to observables.
+    """Convert tests for steps of the pressure levels to observables.
 
-    chance_k = min(1, chance_1 exp(rank_1 - rank_k)), rank = 2 log likelihood ratio - (coefficients - 1) log(blocks).
-    Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the other half, a
-    prior against descriptions that need further coefficients.
+    `changes`: one test for each pattern, the highest rank first. The rank is twice the log likelihood ratio, less
+    log(blocks) for each coefficient after the first. The chance is chance_k = min(1, chance_1 exp(rank_1 - rank_k)).
+    Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the other half
+    is a prior against descriptions that need further coefficients.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

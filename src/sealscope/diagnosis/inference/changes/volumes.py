@@ -47,12 +47,13 @@ def volume_observables(
     oil_loss: Mapping[str, StepTest],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Test the coefficients of the balance's terms for a step, up or down, or only up for leaks.
+    """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
-    Leaks are also tested under other laws, the motion by its scale. `blocks`, with the offset of p_A - p_B removed, are
-    for the tests of leaks, `plain` ones, with the pressures as recorded, for all other terms; `oil_loss`: tests of the
-    oil that the accumulator lost, by the name of the external leak's term; `volume_ratio`: measured over assumed ratio
-    of area to displacement. The result with the largest score is the first.
+    Leaks are also tested under other laws of flow, the motion by its scale. `blocks`: sums of the balance without the
+    sensor offset of p_A - p_B, for the tests of leaks; `plain`: sums with the pressures as recorded, for all other
+    terms. `columns`: roles of the columns (leak, motion, left side) in each equation; `oil_loss`: tests for an
+    external leak by the oil that the accumulator lost, by the name of the term; `volume_ratio`: measured over assumed
+    ratio of area to displacement.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -79,7 +80,8 @@ def volume_observables(
 def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, volume_ratio: float) -> float:
     """Compute -2 log of the prior density of a step's size, relative to its maximum, for the term `name`.
 
-    It is 0 for a term without a prior on the size.
+    `size`: size of the step, in the unit of the coefficient; `volume_ratio`: measured over assumed ratio of area to
+    displacement. The result is 0 for a term without a prior on the size.
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -104,7 +106,11 @@ class _Hypothesis(NamedTuple):
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
 ) -> Iterator[_Hypothesis]:
-    """Yield the steps of each term, of leaks under other laws, and of the motion's scale."""
+    """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
+
+    `centred`: sums of the balance without the sensor offset of p_A - p_B, for leaks; `recorded`: sums with the
+    pressures as recorded; `has_accumulator`: True if the accumulator's volume shows external leaks.
+    """
     first = columns[0]
     for index, term in enumerate(terms):
         if _is_tested(term, first, has_accumulator):
@@ -121,11 +127,11 @@ def _step_hypotheses(
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
-    """Test whether the coefficient of a term of the volume balance is tested for a step by itself.
+    """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    `roles`: roles of the balance's columns; `has_accumulator`: True if the recording shows the volume of an
-    accumulator. A term is not tested by itself if its coefficient changes only together with others, if it is zero
-    within a recording, or if another test covers it.
+    It is not if the coefficient changes only together with others, is zero within a recording, or is covered by
+    another test. `roles`: roles of the balance's columns (leak, motion, left side); `has_accumulator`: True if the
+    recording shows the volume of an accumulator.
     """
     if term.name.startswith("motion"):
         return False  # area and displacement change together, as a scale
@@ -147,10 +153,10 @@ def _observable_name(term: Term) -> str:
 
 
 def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
-    """Compute the root mean square of the pressure [Pa] that drives a term.
+    """Compute the root mean square of the pressure [Pa] that drives the term `name` of a balance.
 
-    It is that of the term's increments over that of the sampling intervals; if the balance has no flow offset, the mean
-    of abs(p_A - p_B) instead.
+    It follows from the sums of squares of the term's column and of the flow offset's. If the balance has no flow
+    offset, the result is the mean of abs(p_A - p_B) instead.
     """
     if roles.bias is None:
         return float(np.mean(blocks.mean_pressure()))
@@ -161,7 +167,8 @@ def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
     """Compute twice the log likelihood ratio of an external leak to none, by the accumulator's data.
 
-    `balance_test`: of the step by the balance; `accumulator_test`: by the oil that the accumulator lost.
+    `balance_test`: test for a step of the leak by the volume balance; `accumulator_test`: the same by the oil that
+    the accumulator lost.
     """
     nearest = int(np.abs(accumulator_test.onsets - balance_test.onsets[balance_test.best]).argmin())
     sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])
@@ -170,7 +177,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Replace the column `index` by the fitted volume of the motion, whose coefficient is the change of its scale."""
+    """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
+
+    The coefficient of this column is the relative change of the motion's scale. `columns`: roles of the columns
+    (leak, motion, left side) in each equation.
+    """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
         nuisance, motion = list(roles.nuisance), list(roles.motion)

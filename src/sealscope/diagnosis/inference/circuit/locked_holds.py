@@ -79,7 +79,7 @@ class LockedHold(NamedTuple):
     edges: NDArray[np.intp]
 
     def mean(self, values: Array) -> Array:
-        """Average samples (..., n) of the hold to its k readings, shape (..., k)."""
+        """Average samples (..., n) of the hold over the intervals between `edges`, to k readings, shape (..., k)."""
         sums = np.add.reduceat(values, self.edges[:-1], axis=-1)
         return np.asarray(sums / np.diff(self.edges))
 
@@ -112,10 +112,10 @@ class LockedHold(NamedTuple):
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
-    The times in which the valves shut or open are left out.
-    `channels`: time [s], absolute pressures of A and B [Pa], and position [m], (n,) each; `rests` (n - 1,): flags of
-    the sampling intervals in which the pump rests; `rate`: sampling rate [Hz], which is reduced to about `MAX_RATE`.
-    Holds that are too short, or have missing samples, are omitted.
+    The times in which the valves shut or open are left out. Holds that are too short, or have missing samples, are
+    omitted. `channels`: time [s], absolute pressures of A and B [Pa], and position [m], (n,) each; `rests` (n - 1,):
+    flags of the sampling intervals in which the pump rests; `rate`: sampling rate [Hz], which is reduced to about
+    `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # samples that are averaged to one
@@ -255,7 +255,7 @@ class HeldChambers:
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of the displaced volumes: without check valves, and with check valves that refill a chamber."""
+        """Regressions of displaced volumes on oil properties, without and with check valves that refill a chamber."""
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
@@ -295,9 +295,10 @@ class HeldChambers:
         return np.asarray(p > self.charge * (1.0 + INFERENCE.held_oil.charge))
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute the flow of a leak past the piston, sign(dp) |dp|^`exponent` of dp = p_A - p_B - z.
+        """Compute the flow during holds of a leak past the piston with a coefficient of 1.
 
-        The offset z of a hold is near `offset` [Pa], as `LockedHold.own_offset` states it.
+        It is sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. The sensor offset z of a hold is near `offset` [Pa]
+        (`LockedHold.own_offset`).
         """
         differences = [hold.p_A - hold.p_B - hold.own_offset(offset)[0] for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
@@ -345,7 +346,7 @@ class HeldChambers:
 
     @cached_property
     def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
-        """Fits of the oil's properties without any leak: without check valves, and with check valves."""
+        """Fits of the oil's properties without any leak, first without and then with check valves."""
         without, refilled = (np.empty((len(regression.left), 0)) for regression in self._regressions)
         return self._fit(without, False), self._fit(refilled, True)
 
@@ -363,9 +364,10 @@ class HeldChambers:
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
-        """Estimate the leaks of the recording as `HeldLeaks` (6,), with the leak past the piston since `onset` [s].
+        """Estimate the leaks past the piston and to the outside from the holds, with standard deviations, shape (6,).
 
-        The leaks to the outside are means over the whole recording. Return None if no hold shows a flow past the
+        The conductances [m^3/(s Pa)] are in the order of `HeldLeaks`. The leak past the piston is that since `onset`
+        [s]; the leaks to the outside are means over the whole recording. Return None if no hold shows a flow past the
         piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
@@ -386,7 +388,8 @@ class HeldChambers:
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit the coefficient, at least 0, of a leak that begins at `onset` [s] to all holds of the recording.
 
-        Its standard deviation is `UNKNOWN` if no oil would flow in the holds after the onset.
+        `leak`: its flow with a coefficient of 1. The standard deviation of the coefficient is `UNKNOWN` if no oil
+        would flow in the holds after the onset.
         """
         column = self._leak_columns(leak, np.array([onset]))
         has_flow = column.any()
@@ -415,14 +418,18 @@ class HeldChambers:
 
     @cached_property
     def _onset_log_priors(self) -> Array:
-        """Log prior probability of each of `onsets`: half of all leaks are assumed to exist from the start."""
+        """Log prior probability of each possible onset of a leak in `onsets`, shape (o,).
+
+        Half of all leaks are assumed to exist from the start of the recording.
+        """
         n_later = len(self.onsets) - 1
         return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume that a leak of unit coefficient loses since each of o onsets, at all r readings, (r, o).
 
-        The volumes have the sign of the flow in each side's balance, and are relative to their mean over the hold.
+        A reading is a mean over several samples of a hold. The volumes have the sign of the flow in each side's
+        balance, and are relative to their mean over the hold.
         """
         columns = []
         for hold, flow in zip(self.holds, leak.flows, strict=True):
@@ -437,8 +444,8 @@ class HeldChambers:
     def _onset_posteriors(self, leak: UnitLeak) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
-        It is log prior - N/2 log(residual sum of squares), for N independent readings and a coefficient >= 0, with
-        the properties of the oil eliminated.
+        `leak`: its flow with a coefficient of 1. The result is log prior - N/2 log(residual sum of squares), for N
+        independent readings and a coefficient >= 0, with the properties of the oil eliminated.
         """
         left, oil, deviations, inflation, min_variance = self._regressions[leak.is_refilled]
         design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
@@ -485,7 +492,7 @@ class HeldChambers:
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
-        """The possible leaks, each with its probability: past the piston, to the outside from A, and from B."""
+        """Three possible leaks with their probabilities, past the piston, to the outside from A, and from B."""
         piston_onset, offset = self.piston_fit
         # each fit with the index of its onset
         fits = [(self.fit_piston_leak(piston_onset, offset), int(np.abs(self.onsets - piston_onset).argmin()))]
@@ -503,7 +510,7 @@ class HeldChambers:
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Mean leaks over the recording: past the piston, and to the outside from A and from B.
+        """Mean leaks over the recording, past the piston and to the outside from A and from B, as the holds show.
 
         Each is its estimate times the probability of that leak; the standard deviations are not weighted in this way.
         """
@@ -532,7 +539,7 @@ class HeldChambers:
     def piston_onset(self) -> Interval | None:
         """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
 
-        The interval is widened to the neighbouring onsets of the grid `onsets`.
+        The interval is widened to the next possible onsets (`onsets`) on either side.
         """
         posteriors = self._onset_posteriors(self._unit_piston_leak(self.piston_fit.offset))
         weights = np.exp(posteriors - posteriors.max())
@@ -544,6 +551,9 @@ class HeldChambers:
 
 
 def _average_fits(fits: Sequence[LeakFit]) -> Flow:
-    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods."""
+    """Average the coefficients of alternative fits of a leak, weighted by their likelihoods.
+
+    Returns the mean and the standard deviation, due to noise and to the uncertain properties of the oil.
+    """
     values, deviations, by_oil, likelihoods = np.array(fits).T
     return mixture_flow(np.exp(likelihoods - likelihoods.max()), values, np.hypot(deviations, by_oil))

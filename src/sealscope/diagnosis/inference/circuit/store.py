@@ -47,8 +47,9 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
     """Test a recording with a position for an external leak of either side that begins within it.
 
-    `offset`: sensor offset of p_A - p_B [Pa]. The tests are returned by the name of the term (`oil_loss_tests`).
-    There are none for a double rod, in whose circuit check valves let either side keep its pressure.
+    The tests use the volume of oil in the accumulator, and are returned by the name of the leak (`oil_loss_tests`).
+    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod, in whose circuit check valves let
+    either side keep its pressure.
     """
     if not rig.cylinder.single_rod:
         return {}

@@ -58,10 +58,10 @@ class CycleBalance(NamedTuple):
 
 
 def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
-    """Compute the volume balances of a recording without position: over whole cycles, and over holds.
+    """Compute the volume balances that a recording allows without a position, over whole cycles and over holds.
 
-    A recording with a position but without flow gives one over holds behind shut valves only. The list is empty if no
-    balance is possible.
+    A hold is a time in which the piston is held at standstill. A recording with a position but without flow gives a
+    balance over holds behind shut valves only. The list is empty if no balance is possible.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
@@ -115,7 +115,7 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
 def _build_blocks(
     signals: Signals, equation: Equation, half_width: float, is_used: NDArray[np.bool_], begin: float, one_sided: bool
 ) -> Blocks | None:
-    """Compute the blocks of a balance with triangular test functions of a `half_width` [s].
+    """Compute the blocks of a balance whose rows are means over triangular windows of a `half_width` [s].
 
     `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
     `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None if fewer than
@@ -157,7 +157,7 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
     indices = np.arange(n_samples + 1)
 
     def integrate(values: Array) -> Array:
-        """Integrate values (n,) over the triangular window about each of the `centres`."""
+        """Integrate values (n,) over the triangular window about each of the r `centres`, shape (r,)."""
         integral = np.concatenate([[0.0], np.cumsum(values)])
         double_integral = np.concatenate([[0.0], np.cumsum(0.5 * (integral[1:] + integral[:-1]))])
         before, middle, after = (
@@ -172,7 +172,7 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 
 
 def _shrink_offset(values: Array, names: list[str]) -> None:
-    """Reduce the leak's columns in rows (r, c) by the part that sensor offsets may cause, in place.
+    """Reduce the columns of the leak in rows (r, c) of a balance by the part that sensor offsets may cause, in place.
 
     `names`: names of the columns. The mean pressure difference d of a row becomes d - z^2/d, or 0 if it is smaller
     than the largest usual offset z (Breiman's garrote). The column of an orifice is scaled by the same factor.

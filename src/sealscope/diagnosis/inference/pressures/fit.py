@@ -52,7 +52,7 @@ class Priors(NamedTuple):
 
     @property
     def unit(self) -> Array:
-        """Units of the parameters (p,): fractions of their prior widths, small enough for finite differences."""
+        """Units of the parameters, shape (p,), fractions of their prior widths that suit finite differences."""
         return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
@@ -85,7 +85,10 @@ class Linearisation(NamedTuple):
     squares: Array
 
     def cost(self, variance: float, prior: Normal) -> float:
-        """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise variance [Pa^2]."""
+        """Compute -2 log posterior of the parameters `theta`, up to a constant.
+
+        `variance`: that of the noise [Pa^2]; `prior`: prior on the parameters.
+        """
         deviations = prior.deviations(self.theta)
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
 
@@ -124,8 +127,8 @@ class Joint:
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
         """Fit the parameters of all blocks, each `block_s` [s] long, together.
 
-        `parameter`: index of the tested parameter, whose scores show how much the correlation of the noise inflates
-        the variance of the estimates.
+        `parameter`: index of the tested parameter. The scatter of its scores, i.e. products of residual and
+        derivative, shows how much the correlation of the noise inflates the variance of the estimates.
         """
         theta = np.array([block.theta for block in blocks])
         prior_precision = _prior_precision(len(blocks), priors, block_s)
@@ -174,8 +177,9 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
     """Compute the variance of the residual [Pa^2], and a factor by which correlation of the noise inflates it.
 
-    `deviations` (K p,): deviations of the parameters from `theta` of each block, in units. The factor is the variance
-    of the scores of one `parameter` (an index), relative to that under white noise, at least 1.
+    `deviations` (K p,): deviations of the parameters from `theta` of each block, in multiples of `Priors.unit`. The
+    factor is the variance of the scores of one `parameter` (an index) relative to that under white noise, at least 1.
+    A score is the product of the residual and its derivative by the parameter.
     """
     # (1, -deviation) times residual and Jacobian is the residual at these deviations
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

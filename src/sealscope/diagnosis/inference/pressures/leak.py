@@ -26,7 +26,7 @@ ORIFICE_RATIO: float = PRESSURE.conductance.orifice
 
 
 def conductance_scale_error() -> float:
-    """Compute the relative standard deviation of the common scale of all conductances.
+    """Compute the relative standard deviation of the scale error that all fitted conductances share.
 
     The response of the pressures determines G M/A^2, so errors of the stated mass M and piston area A scale the
     conductance G.
@@ -141,7 +141,7 @@ class ResponseLeak:
         return LeakRise(self.rise, self.rise.log_ratio(mean_step))
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean conductance that comes from after a step's onset."""
+        """Compute the fraction of the information on the mean conductance that lies after a step's onset."""
         weights = self.information.precision.sum(axis=0)
         is_after = self.information.time >= step.onset().value
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))

@@ -60,7 +60,7 @@ _MAX_STEP, _SEGMENT = 1.01e-3, 256
 def _direction_factor(v: float, theta: Parameters) -> float:
     """Compute the factor on the friction for the direction of the piston's speed v [m/s].
 
-    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in.
+    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in. `theta`: fitted parameters.
     """
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
@@ -69,8 +69,9 @@ def _direction_factor(v: float, theta: Parameters) -> float:
 def _steady_friction(v: float, theta: Parameters, m: Reduced) -> tuple[float, float, float]:
     """Compute the friction of steady sliding at a speed v [m/s] by Stribeck's law.
 
-    Returns the friction force [N], which falls linearly to zero below the creep speed `m.v_th`; its magnitude without
-    this reduction [N]; and the magnitude of the speed, at least the creep speed [m/s].
+    `theta`: fitted parameters; `m`: sizes of the rig. Returns the friction force [N], which falls linearly to zero
+    below the creep speed `m.v_th`; its magnitude without this reduction [N]; and the magnitude of the speed, at least
+    the creep speed [m/s].
     """
     speed = max(abs(v), m.v_th)
     magnitude = stribeck_force(speed, theta[F_C], theta[K_BRK], theta[C_C]) * _direction_factor(v, theta)
@@ -100,10 +101,11 @@ def _advance_friction(
 
 @contracted
 def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
-    """Compute the time derivative of the state y = (p, v, omega, i, I, x).
+    """Compute the time derivative of the state y = (p, v, omega, i, I, x) of the reduced rig.
 
     The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the
-    integral of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s].
+    integral of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s];
+    `theta`: fitted parameters; `m`: sizes of the rig.
     """
     p, v, omega, i, integral, x = y
     outflow, viscous = m.A_A * v + laminar_leakage(p, theta[G]), theta[F_V] * v * _direction_factor(v, theta)

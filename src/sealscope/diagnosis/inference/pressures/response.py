@@ -98,9 +98,10 @@ class Segment:
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth rows (m, n) over the samples, set missing samples to zero, and fit k waves of the mains hum to them.
+        """Smooth rows (m, n) of samples, set missing samples to zero, and fit k waves of the mains hum to each row.
 
-        Returns the rows, their products with the waves (m, k), and the fitted amplitudes of the waves (m, k).
+        Returns the smoothed rows, their products with the waves and the fitted amplitudes of the waves, shape (m, k)
+        each.
         """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
@@ -109,9 +110,9 @@ class Segment:
         return rows, products, products @ self._wave_gram_inverse
 
     def residual_squares(self, sets: Array) -> Array:
-        """Compute the residual sum of squares about the mean [Pa^2] for each of up to 16 parameter sets (m, p).
+        """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
 
-        The result has the shape (m,); it is infinite for a set whose simulation diverges.
+        It is taken about the mean, and has the shape (m,). It is infinite for a set whose simulation diverges.
         """
         simulated, _ = self.machine.simulate(self.command, sets, self.states[:, np.zeros(len(sets), dtype=int)])
         residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
@@ -144,9 +145,10 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the derivatives of the response by lead, lag and scale, (3, n), in their units, without simulation.
+        """Compute the derivatives of the response by three parameters without simulation, (3, n), in their units.
 
-        `theta` (p,): parameters; `response` (n,): simulated p_A - p_B [Pa].
+        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B. `theta`
+        (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # to fourth order, since the ringing is fast
@@ -157,12 +159,12 @@ class Segment:
         return np.array([by_lead, by_lag, response]) * self.priors.unit[LEAD:OFFSET, None]
 
     def descend(self, fit: Linearisation, prior: Normal, n_steps: int, noise: float | None = None) -> Linearisation:
-        """Fit the parameters by up to `n_steps` Gauss-Newton steps from a linearisation, and return the last one.
+        """Fit the parameters by up to `n_steps` Gauss-Newton steps, and return the linearisation at the best fit.
 
-        The steps minimise -2 log posterior under a `prior`, with Levenberg-Marquardt damping. `noise`: variance of
-        the noise [Pa^2], None to estimate it from the residual. Fractions of each step are simulated together with
-        the Jacobian at the full step; if none is an improvement, the step is damped. The fit ends if the expected
-        decrease of -2 log posterior is below `_MIN_GAIN`.
+        `fit`: linearisation at the start. The steps minimise -2 log posterior under a `prior`, with
+        Levenberg-Marquardt damping. `noise`: variance of the noise [Pa^2], None to estimate it from the residual.
+        Fractions of each step are simulated together with the Jacobian at the full step; if none is an improvement,
+        the step is damped. The fit ends if the expected decrease of -2 log posterior is below `_MIN_GAIN`.
         """
         damping = 0.0
         for _ in range(n_steps):
@@ -208,7 +210,7 @@ class Segment:
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
-        """Return the sums of a linearisation for the joint fit (`fit.Joint`).
+        """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
         They include the scores, i.e. products with the derivative by the conductance, in each second.
         """
@@ -411,7 +413,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     """
 
     def compute(recording: Recording) -> Joint | None:
-        """Track the parameters through all blocks, then fit all blocks together."""
+        """Track the parameters through all blocks, then fit all blocks together; None if no parameters fit."""
         edges = block_edges(recording)
         with np.errstate(over="ignore", invalid="ignore"):
             try:

@@ -49,9 +49,10 @@ class Workspace(NamedTuple):
 
 
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the arrays of a `Workspace`, in the order of its fields.
+    """Return the shapes of the scratch arrays of a `Workspace`, in the order of its fields.
 
-    The arguments are the numbers of rows, of blocks, of columns with the left side, and of slow columns without it.
+    The arguments are the numbers of rows, of blocks, of columns with the left side, and of slow columns without it. A
+    slow column has the same coefficient in all blocks.
     """
     return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
@@ -121,9 +122,10 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 @large_law
 def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
-    """Eliminate the fast coefficients from a block's Gram matrix `gram` (m, m), and write the result to `reduced`.
+    """Eliminate the coefficients that are free in each block (fast) from the Gram matrix `gram` (m, m) of one block.
 
-    `column_order`: indices of the c columns of `reduced` (c, c), the `n_fast` fast ones first.
+    The result is written to `reduced` (c, c). `column_order`: indices of its c columns in `gram`, the `n_fast` fast
+    ones first.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
@@ -136,7 +138,7 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True if they have converged.
 
     `values` (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted
-    columns, the left side last. The fit and the weights, which are replaced, are in `workspace`.
+    columns, the left side last; `workspace`: a `Workspace` with the fit and with the weights, which are replaced.
     """
     count, left, block = len(values), len(column_order) - 1, 0
     for r in range(count):
@@ -182,9 +184,9 @@ def weigh_rows(
         prior of the fit. They are changed in place, by `update_fraction` of their difference from the sums of these
         blocks.
     update_fraction : float
-        Between 0 and 1.
+        Weight of these blocks in the updated `earlier_sums`, from 0 to 1.
     workspace : Workspace
-        Scratch arrays.
+        Scratch arrays for intermediate results.
     gram : array of float, shape (K, m, m)
         Receives the Gram matrices of the weighted rows.
     """

@@ -49,7 +49,10 @@ class Rows(NamedTuple):
 
 
 def stride_samples(rate: float) -> int:
-    """Compute the number of samples between neighbouring test functions at a sampling `rate` [Hz], at least 1."""
+    """Compute the distance of neighbouring test functions of the weak form [samples], at least 1.
+
+    `rate`: sampling rate [Hz]. The distance is `STRIDE` seconds at any rate.
+    """
     return max(1, round(STRIDE * rate))
 
 
@@ -109,10 +112,10 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
 
 
 def weights_near_holes(holes: Array, rate: float) -> Array:
-    """Compute the weight of each row: the fraction of its test function outside of holes of the recording.
+    """Compute the weight of each row of the regression: the fraction of its test function outside of holes.
 
-    Holes are long gaps of missing samples that were bridged. `holes` (n,): 1 for a sample in a hole, else 0. The
-    weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
+    Holes are long gaps of missing samples that were filled in. `holes` (n,): 1 for a sample in a hole, else 0;
+    `rate`: sampling rate [Hz]. The weights (r,) are between 0 and 1; a weight below `MIN_WEIGHT` is replaced by 0.
     """
     weights = 1.0 - weak_form_rows([np.maximum(holes[1:], holes[:-1]) / rate], rate).values[:, 0]
     return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))

@@ -72,7 +72,7 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak that the balance can state: "piston leak" or "piston or pump leak".
+        """Cause of a leak, "piston leak" or "piston or pump leak", as precisely as the balance can state it.
 
         Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
         the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine.
@@ -107,7 +107,10 @@ class BalanceLeak:
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
-        """Add the uncertainty of the leak's law and of averaged pressures to the standard error of a flow."""
+        """Add to a flow's standard error the uncertainty of the leak's law and of averaged pressures.
+
+        The law of the flow lies between laminar flow and an orifice.
+        """
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
@@ -121,7 +124,7 @@ class BalanceLeak:
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
-        """Leakage of the whole recording above that of the healthy recordings; None if there are none."""
+        """Rise of the leakage in the whole recording over the healthy recordings; None if there are none."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
@@ -183,14 +186,15 @@ class BalanceLeak:
     def _hold_flow(self, rise: Rise) -> Flow:
         """Estimate the mean flow of the leak that holds show, averaged over its laws by their likelihoods.
 
-        `rise`: the rise during holds, whose uncertainty is added to that of the fits.
+        `rise`: rise of the leakage over healthy recordings during holds, whose uncertainty is added to that of the
+        fits.
         """
         laws, (low, high) = self._hold_laws(), rise.interval()
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
     def _hold_laws(self) -> _HoldLaws:
-        """Fit a leak past the piston to the holds of the load, under each law with an exponent in `EXPONENTS`."""
+        """Fit a leak past the piston to the holds of the load, under each law of flow in `EXPONENTS`."""
         balance, chambers = self.balance, self.balance.chambers
         assert chambers is not None
         recording, (onset, offset) = balance.recording, chambers.piston_fit
@@ -203,10 +207,10 @@ class BalanceLeak:
         return _HoldLaws(weights / weights.sum(), units, values * units, deviations * units)
 
     def _rise_laws(self) -> list[LawWeight]:
-        """Compute for each law of a leak the mean flow if the coefficient rises by 1, and the law's log weight.
+        """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
 
-        A law with an exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice
-        flow:
+        Returns for each law its mean flow if the leak's coefficient rises by 1, and its log weight. A law with an
+        exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one reading),
 
@@ -291,7 +295,7 @@ class BalanceLeak:
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s]: over the whole recording, and while the pump delivers."""
+        """Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers."""
         return self.balance.mean_flow, self.balance.blocks.moving_flow
 
     @cached_property
@@ -322,7 +326,7 @@ class BalanceLeak:
         return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean leakage that comes from after a step's onset."""
+        """Compute the fraction of the information on the mean leakage that lies after a step's onset."""
         is_after = self.balance.running_blocks.time >= step.onset().value
         weights = self.balance.leak.precision.sum(axis=0)
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))

@@ -65,10 +65,10 @@ MIN_STRIDE = 2
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Return True if the lower limit of the leakage exceeds a minimum fraction of the pump's mean flow.
+    """Return True if the pump replaces the oil that leaks, so that the balance shows the leakage.
 
-    Every pump leaks at least that fraction (`held.share` in `priors.toml`). A smaller leakage means that no control
-    loop returns or holds the piston: the pump does not replace what leaks, and the balance does not show it.
+    Every pump leaks at least a fraction of its mean flow (`held.share` in `priors.toml`). The lower end of the
+    leakage's 95 % interval must exceed it. A smaller leakage means that no control loop returns or holds the piston.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
@@ -145,7 +145,7 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        """Return the blocks of a recording, computed only once; None if it allows no balance with a position."""
+        """Return the blocks of a recording for a balance with a position, computed once; None if it allows none."""
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
@@ -188,7 +188,8 @@ class VolumeBalance:
         """Predict the rise that a healthy recording of a later day will show, and its uncertainty.
 
         The rise is the leakage above that of the healthy recordings with the given `summaries` (`learn`). `channels`:
-        names of their channels; `repeated`: predict for that many times as many healthy days.
+        names of their channels; `repeated`: number of times that these recordings count, each time as further
+        sessions.
         """
         shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -200,11 +201,11 @@ class VolumeBalance:
         return rise(judged, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
-        """Compute the log odds that valves cut the pump off at rest, from the summaries of healthy recordings.
+        """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        With at least `MIN_FOR_SCATTER` recordings it is the log likelihood ratio of two assumptions, by the scatter
-        of their leakage if the pump is cut off and if it stays connected, for an unknown scale. With fewer recordings
-        it is the sum of the log odds of each.
+        If the pump is cut off, the leakage under that assumption scatters less between recordings. With at least
+        `MIN_FOR_SCATTER` recordings the log odds are therefore (n - 1) log(scatter if connected / scatter if cut
+        off). With fewer recordings they are the sum of the limited log odds of each.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -220,7 +221,7 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Determine for each volume balance which role each of its columns has, such as the leak or the left side.
+        """Make the column roles of each volume balance, i.e. which column is the leak, the left side and so on.
 
         `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
         off at rest.
@@ -289,11 +290,11 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Test whether the flow that the piston's motion takes differs from that of healthy recordings.
+    """Compare the flow that the piston's motion takes with that of healthy recordings.
 
-    A change means another machine or another scale of a sensor. Load and speed outside of the range of the healthy
-    recordings make the comparison less certain. Yields one observable, or none if there are too few healthy
-    recordings. `roles`: roles of the columns in the balance.
+    Yields one observable, or none if there are too few healthy recordings. A change means another machine or another
+    scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
+    `roles`: roles of the columns in the balance (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
@@ -322,7 +323,7 @@ def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Return the start of a recording [s since 1970], delayed by `n_ages` times the maximum age of a machine.
+    """Return the start of a recording [s since 1970], delayed by `n_ages` times the longest life of a machine.
 
     Recordings delayed by different multiples belong to different sessions. Return None if the recording is undated.
     """
@@ -330,7 +331,7 @@ def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the sums of a healthy recording from its summary (`VolumeBalance.learn`).
+    """Restore the regression sums of a healthy recording from its summary (`VolumeBalance.learn`).
 
     `shut`: true for the sums under the assumption that valves cut the pump off at rest; `locked`: true to include the
     leaks during holds, if the summary has them.

@@ -138,7 +138,7 @@ class RecordedBalance:
     def volume_ratio(self) -> float:
         """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured.
 
-        The balance scales the volumes of the cylinder by it.
+        In the balance the volumes of the cylinder are larger by this factor than those from the rig's file.
         """
         ratio = self.size.ratio
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
@@ -272,7 +272,10 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Sensor offset of p_A - p_B [Pa]; it stays near 0 unless the leak changes, which alone reveals it."""
+        """Sensor offset of p_A - p_B [Pa].
+
+        Only a change of the leak reveals it; without one the estimate stays near 0.
+        """
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
@@ -311,7 +314,7 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Scale of the machine's flows, relative to those computed with the assumed displacement."""
+        """Scale of the machine's flows, relative to those computed with the pump's assumed displacement."""
         return _flow_scale(self)
 
     @cached_property
@@ -326,7 +329,7 @@ class RecordedBalance:
 
     @cached_property
     def total_history(self) -> History:
-        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)]."""
+        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with covariance."""
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
         total = information(self.blocks, self.columns, roles.leak, pump)
@@ -334,7 +337,10 @@ class RecordedBalance:
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
     def leak_history(self, *, with_step: bool) -> History:
-        """Estimate the leak's coefficient in each of the `running_blocks`, with the best step or without any step."""
+        """Estimate the leak's coefficient in each block, with a step at its most likely onset or without any step.
+
+        The blocks are those from the first motion on (`running_blocks`).
+        """
         return fit_history(self.leak, self.test, with_step=with_step)
 
 

@@ -33,7 +33,7 @@ def rival_rises(
     columns: Sequence[ColumnRoles],
     volume_ratio: float = 1.0,
 ) -> tuple[Observable, ...]:
-    """Test whether faults other than a leak past the piston explain a change since the healthy recordings.
+    """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
     These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are
     compared during holds if possible (`held_rivals`).
@@ -90,7 +90,7 @@ def rival_rises(
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Test whether the external leaks of chambers A and B during holds exceed those of healthy recordings.
+    """Test for external leaks of chambers A and B, during holds, that exceed those of healthy recordings.
 
     In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
     judged recording has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any.
@@ -112,7 +112,11 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Set the advantage of an external leak from the prior on its flow: a large one is improbable, as oil is seen."""
+    """Return the observable of an external leak with its `advantage` lowered if the leak would be large.
+
+    A large external leak is improbable, since oil outside is seen. The flow is the observable's conductance times the
+    mean pressure of the recording `judged`.
+    """
     return replace(
         observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
     )

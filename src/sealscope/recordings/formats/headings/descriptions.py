@@ -22,10 +22,11 @@ _SCOPE_ROWS, _UNIT_WITH_QUANTITY = (
 
 
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
-    """Rename labels by descriptions above the heading, in a table of channels or in a row of labels.
+    """Replace the names of columns by the descriptions that a user has entered for them in the logger.
 
-    `rows`: cells of the lines above the heading, and of rows of labels in it. A description may state the unit if the
-    heading does not. The columns' own names are kept in `Label.called`.
+    They are in a table of channels above the heading, or in a row of labels. `rows`: cells of the lines above the
+    heading, and of rows of labels in it. A description may state the unit if the heading does not. The columns' own
+    names are kept in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
@@ -45,7 +46,7 @@ def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -
 
 
 def _fold(text: str) -> str:
-    """Remove blanks and upper case from a text, for comparison."""
+    """Remove blanks from a text and convert it to lower case, for comparison."""
     return text.replace(" ", "").casefold()
 
 
@@ -55,7 +56,7 @@ def _column_key(label: Label) -> str:
 
 
 def _rename_label(label: Label, name: str) -> Label:
-    """Rename a label, unless the new name is empty, too long or the column's own name."""
+    """Replace the name of a column by a description, unless that is empty, too long or the column's own name."""
     if not name or len(name) > _MAX_NAME or _fold(name) == _column_key(label):
         return label
     renamed = Label.parse(name)  # the description may end in a unit
@@ -64,10 +65,10 @@ def _rename_label(label: Label, name: str) -> Label:
 
 
 def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Label], int] | None:
-    """Parse the heading of a TwinCAT Scope export to (labels, number of its lines); None for any other text.
+    """Parse the heading of a TwinCAT Scope export to (labels of the columns, number of its lines).
 
-    `lines`: the lines above the first sample. In an export each row of a property, such as the units, repeats its
-    name above the time columns, which are in milliseconds since the start of the export.
+    None for any other text. `lines`: the lines above the first sample. In an export each row of a property, such as
+    the units, repeats its name above the time columns, which are in milliseconds since the start of the export.
     """
     rows = [[cell.strip() for cell in line.split(delimiter)] for line in lines]
     begin = max((index for index, row in enumerate(rows) if row[0] == "Name" and len(row) > 2), default=None)
@@ -84,10 +85,11 @@ def parse_scope_heading(lines: Sequence[str], delimiter: str) -> tuple[list[Labe
 
 
 def split_pairs(labels: Sequence[Label]) -> list[Label]:
-    """Rename alternating columns of times X and values Y to `t` and the channels' names; other labels stay.
+    """Rename the columns of a table in which each channel has its own time column; other tables stay as they are.
 
-    Pairs are named as in `X [s], p_A [bar], X [s], p_B [bar]` or in `p_A X, p_A Y [bar], p_B X, p_B Y [bar]`. An X
-    without a unit is in seconds.
+    Columns of times X and of values Y alternate, named as in `X [s], p_A [bar], X [s], p_B [bar]` or in `p_A X, p_A Y
+    [bar], p_B X, p_B Y [bar]`. The times become `t`, and the values get the channels' names. An X without a unit is
+    in seconds.
     """
     times, values = labels[::2], labels[1::2]
     are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)

@@ -36,18 +36,21 @@ class Formula(Generic[K]):
 
     @property
     def column(self) -> K | None:
-        """The column, if the formula is a single column without factor and constant; else None."""
+        """The column, if the formula is a single column without factor and constant; None for other formulas."""
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
-        """Add another formula, multiplied by the number `times`; the sum has no unit."""
+        """Return the sum of this formula and another one, which is multiplied by the number `times`.
+
+        The sum states no unit.
+        """
         factors = dict(self.factors)
         for name, factor in other.factors.items():
             factors[name] = factors.get(name, 0.0) + times * factor
         return Formula(factors, self.constant + times * other.constant)
 
     def values(self, columns: Mapping[K, Array]) -> Array:
-        """Compute the formula's values (n,) from the samples of the columns; they are in `unit`.
+        """Compute the values (n,) of the formula, in its unit, from the samples (n,) of its columns.
 
         A column without factor and constant is returned itself, not as a copy.
         """
@@ -71,7 +74,10 @@ def parse_formula(text: str) -> Formula[str]:
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
-            """Replace the name of a column, which Python may not parse, by `columnN`."""
+            """Append the name of a column to `names`, and return `columnN` to replace it in the text.
+
+            The name may be none that Python can parse.
+            """
             names.append(match[1] or match[2])
             return _COLUMN.format(len(names) - 1)
 

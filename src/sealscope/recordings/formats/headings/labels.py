@@ -17,10 +17,10 @@ _TRAILING_UNIT = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<uni
 
 @dataclass(frozen=True)
 class Label:
-    """Heading of a column.
+    """Heading of a column of a table.
 
-    `whole`: the heading as written; `name`: without the unit; `unit`: the unit, or None; `called`: the column's own
-    name, if `name` is a description that the user has entered for the channel.
+    `whole`: the heading as written; `name`: the heading without the unit; `unit`: the unit, or None; `called`: the
+    column's own name if `name` is a description that the user has entered for the channel, else "".
     """
 
     whole: str

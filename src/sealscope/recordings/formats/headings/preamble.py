@@ -56,7 +56,7 @@ def stated_rate(remarks: Mapping[str, str]) -> float | None:
 
 
 def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
-    """Find the start time in the remarks of a TwinCAT Scope export; None if it is not stated."""
+    """Find the start time of a TwinCAT Scope export in the remarks of its header; None if it is not stated."""
     for name, entry in remarks.items():
         match = _FILETIME.match(entry) if name.casefold().startswith(("starttime", "start time")) else None
         if match is not None:
@@ -65,9 +65,10 @@ def scope_start(remarks: Mapping[str, str]) -> np.datetime64 | None:
 
 
 def collect_remarks(pairs: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Collect remarks, name -> text, from pairs of name and text, made printable and shortened.
+    """Collect remarks on a recording, name -> text, from pairs of name and text.
 
-    Of several remarks with one name the first is kept, and at most `_MAX_REMARKS` in all.
+    Names and texts are made printable and shortened. Of several remarks with one name the first is kept, and at most
+    `_MAX_REMARKS` in all.
     """
     remarks: dict[str, str] = {}
     for name, value in pairs:

@@ -36,7 +36,7 @@ _MAX_NAME = 80
 
 
 class _Guess(NamedTuple):
-    """Guessed meaning of a column.
+    """Guessed meaning of a column, from its name and its unit.
 
     `kind`: the quantity, such as "pressure"; `side`: chamber or pump port, as from `_find_side`; `unit`: the unit, or
     None.
@@ -48,7 +48,7 @@ class _Guess(NamedTuple):
 
     @property
     def channel(self) -> str | None:
-        """Name of the channel with this meaning; None if there is none."""
+        """Name of the channel that a column with this meaning contains; None if there is none."""
         if self.kind == "flow":
             return "q_pump" if self.side == "A" else None
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
@@ -95,12 +95,12 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
 
 
 def format_map(channel_map: Mapping[str, str]) -> str:
-    """Format a map as text: `p_A=PG_1, p_B=PG_2`."""
+    """Format a map from channels to columns as text, such as `p_A=PG_1, p_B=PG_2`."""
     return ", ".join(f"{channel}={column}" for channel, column in channel_map.items())
 
 
 def is_time(label: Label) -> bool:
-    """Test whether a column is a time by its name, which may end in a number."""
+    """Return True if the name of a column means a time, possibly with a number at its end."""
     guess = _guess_meaning(label)
     return _is_named_time(label) or (guess is not None and guess.kind == "time")
 
@@ -152,7 +152,10 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` does in `ch2` and `Main_Pa` in `Pa`."""
+    """Return True if the name of a column ends in `words`.
+
+    For example, `ADC1_Channel_2` ends in `ch2`, and `Main_Pa` in `Pa`.
+    """
     tokens = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if token in WORDS["input"] else token for token in text] for text in tokens)
@@ -166,7 +169,7 @@ def is_temperature(label: Label) -> bool:
 
 
 def is_measured(label: Label) -> bool:
-    """Test whether a column is a measured pressure, position, speed or flow, by its name or unit.
+    """Return True if a column is a measured pressure, position, speed or flow, by its name or unit.
 
     Demands, and values computed from others, are not measured.
     """
@@ -208,9 +211,9 @@ def _split_words(name: str) -> set[str]:
 
 
 def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that columns called "head" mean: A if others are called rod, B if others are called cap.
+    """Find the chamber, "A" or "B", that columns called "head" mean; "" if that is not known.
 
-    Empty if that is not known.
+    It is A if other columns are called rod, and B if others are called cap.
     """
     words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
     if not words & _SIDE["head"]:
@@ -262,14 +265,17 @@ def _is_command_unit(unit: str) -> bool:
 
 
 def is_current_or_fraction(unit: str) -> bool:
-    """Test whether a unit is one of current, for the command of a valve, or a fraction of full scale, such as %."""
+    """Return True if a unit is one of current, as for the command of a valve, or a fraction of full scale.
+
+    A fraction is, for example, %.
+    """
     return unit in _FRACTION_UNITS or same_dimension(unit, "A")
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess from the name of a column that it is the pressure before or behind a valve; None for other columns.
+    """Find out from its name if a column is the pressure before or behind a valve; None for other columns.
 
-    `kind`: "before" or "behind".
+    `kind`: "before" or "behind". Returns the guessed meaning with the unit.
     """
     name, ending = split_unit(label.name)
     unit = ending if label.unit is None else label.unit
@@ -293,7 +299,10 @@ def suggest_map_entry(label: Label) -> str:
 
 
 def _find_side(words: set[str]) -> str:
-    """Find the side that the words of a name mean: A, B, pump, pump 1, pump 2, 1 or 2; empty if it is not known."""
+    """Find the side of the machine that the words of a name mean; "" if it is not known.
+
+    The result is "A" or "B" for a chamber, "pump", "pump 1" or "pump 2" for a port of the pump, or "1" or "2".
+    """
     cap, rod = bool(words & _SIDE["A"]), bool(words & _SIDE["B"])
     number = next((digit for digit in ("1", "2") if digit in words), "")
     if words & _SIDE["pump"] or (words & _SIDE["port"] and cap == rod):

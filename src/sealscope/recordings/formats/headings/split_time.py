@@ -27,8 +27,8 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
     """Find the columns that together form the time: part of the time, such as "hour" -> column.
 
     There must be one column each of hours, minutes and seconds; otherwise the result is empty. Columns of milli-,
-    micro- and nanoseconds are added, and year, month and day if all three exist. `used`: columns to ignore;
-    `only_subsecond`: find only the parts of a second, which accompany a column of whole seconds.
+    micro- and nanoseconds are added, and year, month and day if all three exist. `used`: columns to ignore. With
+    `only_subsecond`, only parts of a second are searched for, which accompany a column of whole seconds.
     """
     columns_of_part: dict[str, int] = {}
     for part, words in WORDS["part"].items():
@@ -49,11 +49,11 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 
 
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
-    """Combine a column of dates or whole seconds with columns of time parts to time stamps or seconds (n,).
+    """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
     `base` (n,): datetime64, or doubles in `unit`; if the parts have hours, only its dates are used. `parts`: part of
-    the time -> values (n,). None if the parts do not belong to this time, such as fractional hours, or milliseconds
-    since the start beside stamps.
+    the time, such as "hour" -> values (n,). None if the parts do not belong to this time, such as fractional hours,
+    or milliseconds since the start beside stamps.
     """
     second_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = second_parts[-1] if second_parts else "second"
@@ -80,7 +80,7 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 
 
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
-    """Test whether parts of a second grow within each second and fall at the next one, as they should.
+    """Return True if parts of a second grow within each second and fall at the next one, as they should.
 
     `base` (n,): whole seconds or stamps; `offset` (n,): the parts of a second. A tenth of the steps may differ.
     """
@@ -95,7 +95,7 @@ def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
 
 
 def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
-    """Make date stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,).
+    """Build date stamps (n,) at midnight from the columns year, month and day in `parts`, else from `base` (n,).
 
     They are 1970-01-01 if neither has dates.
     """

@@ -8,7 +8,7 @@ from typing import Any
 
 
 def _split_lists(tree: Any) -> Any:
-    """Split each text in a tree of tables into the tuple of its comma-separated words."""
+    """Convert the comma-separated texts in nested tables, at any depth, to tuples of words."""
     if isinstance(tree, str):
         return tuple(tree.replace("\n", "").split(", "))
     return {key: _split_lists(value) for key, value in tree.items()}

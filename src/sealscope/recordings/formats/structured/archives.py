@@ -34,13 +34,19 @@ _CHUNK, _MEMORY = 2**20, 2**30
 
 
 def is_workbook(path: Path) -> bool:
-    """Test in a subprocess whether a ZIP archive is a spreadsheet; raise UnreadableFile if it is damaged."""
+    """Return True if a ZIP archive is a spreadsheet; raise UnreadableFile if it is damaged.
+
+    The archive is opened in a subprocess with a time limit.
+    """
     with raising_unreadable("a zip archive", path):
         return _run_limited(_is_workbook, path)
 
 
 def _run_limited(work: Callable[..., T], path: Path, *arguments: Any) -> T:
-    """Run `work(path, *arguments)` in a subprocess, with a time limit that grows with the size of the file."""
+    """Run `work(path, *arguments)` in a subprocess and return its result.
+
+    The time limit grows with the size of the file.
+    """
     limit = _BASE_TIME + path.stat().st_size / _MIN_SPEED
     return run_on_file(work, path, *arguments, limit=limit, memory=_MEMORY)
 
@@ -85,7 +91,7 @@ def _unpack(path: Path, kind: str, folder: Path, max_bytes: int) -> Path:
 
 @contextmanager
 def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
-    """Open the single file in an archive; yield (stream, name, size [bytes]).
+    """Open the single file in an archive of the `kind`; yield (stream, name, size [bytes]).
 
     If the archive does not state name and size, they are "" and 0.
     """

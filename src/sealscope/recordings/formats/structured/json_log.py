@@ -82,7 +82,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
-    """Read the values in a JSON text; return them, and True if a truncated last one was left out.
+    """Read the values in a JSON text; also return True if a truncated last one was left out.
 
     `place`: the file, for messages. Raises InputError for damaged JSON.
     """
@@ -121,9 +121,9 @@ def _is_cell(value: object) -> bool:
 
 
 def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple[str, str, Any, str | None]]:
-    """Yield (group, name, cell, unit) for each cell in a value of a record.
+    """Yield the single values in an entry of a JSON record, as (group, name, cell, unit); the unit may be None.
 
-    The value is a cell itself, a vector, or a record of further values, whose name then belongs to the group.
+    `value` is such a cell itself, a vector, or a record of further values, whose name then belongs to the group.
     `depth`: number of records and vectors around it. Raises InputError for other values.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
@@ -143,9 +143,10 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
 
 
 def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
-    """Make a series for each name in a sequence of records, of rows after a row of names, or of blocks of columns.
+    """Make a series of samples for each name in a sequence of JSON values.
 
-    `place`: the file, for messages. Raises InputError for other values, and for a name with several units.
+    The values are records, rows after a row of names, or blocks of columns. `place`: the file, for messages. Raises
+    InputError for other values, and for a name with several units.
     """
     columns: dict[tuple[str, str], dict[int, Any]] = {}
     units: dict[tuple[str, str], str] = {}
@@ -182,7 +183,7 @@ def _parse_records(members: Sequence[Any], place: str) -> list[Series]:
     check_size(rows, len(columns))
 
     def read_values(key: tuple[str, str]) -> NDArray[Any]:
-        """Convert the cells of a column to an array, with one for each row; `key`: its group and name."""
+        """Convert the cells of a column to an array (n,) with one for each row; `key`: its group and name."""
         return _parse_array([columns[key].get(row) for row in range(rows)], key[1])
 
     return [Series(key[0], Label.parse(key[1], units.get(key)), rows, partial(read_values, key)) for key in columns]
@@ -200,7 +201,7 @@ def _block_length(member: Mapping[str, Any]) -> int | None:
 
 
 def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
-    """Convert cells to doubles (n,), NaN if missing, or to texts (n,) if any of them is a text.
+    """Convert JSON values to doubles (n,), NaN if missing, or to texts (n,) if any of them is a text.
 
     `name`: the column in messages. Raises InputError for an infinite number.
     """
@@ -218,10 +219,11 @@ def _parse_array(cells: Sequence[Any], name: str) -> NDArray[Any]:
 
 
 def _convert_lists(value: Any, place: str, depth: int = 0) -> Any:
-    """Convert the lists in a JSON document to arrays, for `iter_series`.
+    """Convert the lists in a JSON document, at any depth, to arrays or mappings of columns.
 
-    A list of samples or of equally long rows becomes an array, a list of records a mapping of columns by name, and
-    another list of mappings a mapping with the names `(1)`, `(2)`, ... `depth`: number of mappings around the value.
+    A list of samples or of equally long rows becomes an array. A list of records becomes a mapping of columns by
+    name, and another list of mappings a mapping with the names `(1)`, `(2)`, ... `depth`: number of mappings around
+    the value; `place`: the file, for messages.
     """
     if isinstance(value, Mapping) and depth < _MAX_TREE_DEPTH:
         return {key: _convert_lists(member, place, depth + 1) for key, member in value.items()}

@@ -26,10 +26,10 @@ _END_MARK = "***End_of_Header***"
 
 @dataclass
 class _Packet:
-    """A packet of samples in a LabVIEW measurement file.
+    """A block of samples in a LabVIEW measurement file, with a header of its own.
 
-    `head`: rows of the packet's header, name -> an entry for each channel; `names`: names of the columns; `rows`:
-    samples of each row, NaN where it is shorter than others.
+    `head`: rows of the header, name -> an entry for each channel; `names`: names of the columns; `rows`: samples of
+    each row, NaN where it is shorter than others.
     """
 
     head: Mapping[str, list[str]]
@@ -37,12 +37,12 @@ class _Packet:
     rows: list[Array] = field(default_factory=list)
 
     def entry(self, name: str, index: int) -> str:
-        """Return the entry of channel `index` in the header's row `name`; empty if there is none."""
+        """Return the entry of channel `index` in the row `name` of the packet's header; "" if there is none."""
         cells = self.head.get(name, [])
         return cells[index] if index < len(cells) else ""
 
     def number(self, name: str, index: int) -> float:
-        """Return the number of channel `index` in the header's row `name`; NaN if there is none."""
+        """Return the number of channel `index` in the row `name` of the packet's header; NaN if there is none."""
         try:
             return float(self.entry(name, index).replace(",", "."))
         except ValueError:
@@ -51,7 +51,7 @@ class _Packet:
     def moment(self, index: int, day_first: bool) -> np.datetime64 | None:
         """Return the time stamp of the first sample of channel `index`; None if the header does not state it.
 
-        `day_first`: order of day and month in dates.
+        `day_first`: True if the day precedes the month in dates.
         """
         day, time = self.entry("date", index), self.entry("time", index).replace(",", ".")
         seconds, _, fraction = time.partition(".")
@@ -61,12 +61,15 @@ class _Packet:
             return None
 
     def column(self, index: int) -> Array:
-        """Return the samples (n,) of the column `index`."""
+        """Return the samples (n,) of the packet's column with the number `index`."""
         return np.array([row[index] for row in self.rows])
 
 
 def is_lvm(head: bytes) -> bool:
-    """Test whether `head` begins a LabVIEW measurement file: a line of it begins with the end mark of a header."""
+    """Return True if `head`, the first bytes of a file, begins a LabVIEW measurement file.
+
+    In such a file a line begins with the end mark of a header.
+    """
     return any(f"{end}{_END_MARK}".encode(encoding) in head for end in "\n\r" for encoding in ("ascii", "utf-16-le"))
 
 
@@ -97,8 +100,9 @@ def read_lvm(path: Path, request: Request) -> RecordingFields:
 
 
 def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str, place: str) -> Iterator[_Packet]:
-    """Yield the packets of a file from its numbered lines; the rows of a packet are added after it was yielded.
+    """Yield the packets of samples in a LabVIEW measurement file, from its numbered lines.
 
+    The rows of a packet are added after it was yielded. `delimiter`, `decimal`: separators of cells and of decimals;
     `place`: the file, for messages. Raises InputError for a word in place of a number.
     """
     head: dict[str, list[str]] = {}
@@ -134,10 +138,10 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
 
 
 def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
-    """Make a series for each channel from all packets that have the same columns as the first one.
+    """Join the samples of each channel from all packets that have the same columns as the first one.
 
-    `x_columns`: "one" if there is one column of times for all channels, "multi" if there is one before each channel,
-    or "no" if the headers of the packets state start and step instead.
+    Returns a series for each channel. `x_columns`: "one" if there is one column of times for all channels, "multi" if
+    there is one before each channel, or "no" if the headers of the packets state start and step instead.
     """
     first, names = packets[0], packets[0].names
     times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
@@ -171,7 +175,7 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
     """Compute the times (count,) [s] of channel `index` from start and step in the header of its packet.
 
-    Raises InputError if the step is not positive.
+    Start is `X0`, 0 if it is not stated, and step `Delta_X`. Raises InputError if the step is not positive.
     """
     step = packet.number("delta_x", index)
     if not step > 0:
@@ -180,9 +184,10 @@ def _compute_times(packet: _Packet, index: int, count: int) -> Array:
 
 
 def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
-    """Compute the offset of each packet's times from the first packet [s].
+    """Compute the time [s] from the first packet of samples to each packet.
 
-    All offsets are 0 if the times continue from packet to packet, or if the date of a packet is not known.
+    All are 0 if the times continue from packet to packet, or if the date of a packet is not known. `day_first`: True
+    if the day precedes the month in dates.
     """
     moments = [packet.moment(0, day_first) for packet in packets]
     first_times = [packet.number("x0", 0) for packet in packets]

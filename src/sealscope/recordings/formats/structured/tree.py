@@ -26,7 +26,7 @@ _COLUMN_NAME_FIELDS = ("colheaders", "header", "headers", "labels", "channels", 
 
 
 def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
-    """Yield the series in the values of a file.
+    """Yield the series of samples in the values of a MATLAB or JSON file.
 
     `fields`: name -> value, which is an array (n,) or (n, m), a struct as a mapping, a table or an object.
     """
@@ -34,10 +34,10 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
 
 def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series in a value of any type with the name `name`.
+    """Yield the series of samples in a value of any type.
 
-    `group`: names of the structs around the value, with slashes between; `clock`: times of series that state none,
-    None if unknown; `depth`: number of structs around the value.
+    `name`: name of the value; `group`: names of the structs around it, with slashes between; `clock`: times of series
+    that state none, None if unknown; `depth`: number of structs around the value.
     """
     if depth > _MAX_DEPTH:
         return
@@ -69,9 +69,9 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
 
 
 def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct, which is a time series, a signal with a unit, or a group of other values.
+    """Yield the series of samples in a struct: a time series, a signal with a unit, or a group of other values.
 
-    The arguments are those of `_iter_value`, with the fields of the struct by name.
+    `fields`: the fields of the struct by name; other arguments as for `_iter_value`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
@@ -90,7 +90,7 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
 
 
 def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series in a struct with times.
+    """Yield the series of samples in a struct that also contains their times.
 
     `by_name`: its fields by their names in lower case; `clock`: the times; other arguments as for `_iter_value`.
     """
@@ -108,9 +108,10 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
 
 
 def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series in each field of a struct; fields such as `units` and `names` describe the others.
+    """Yield the series of samples in each field of a struct, with names and units from its descriptive fields.
 
-    `group`: names of the struct and of those around it, with slashes between; other arguments as for `_iter_value`.
+    Descriptive fields are, for example, `units` and `names`. `group`: names of the struct and of those around it,
+    with slashes between; other arguments as for `_iter_value`.
     """
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
@@ -185,7 +186,7 @@ def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None
 
 
 def _list_structs(value: Any) -> list[Mapping[str, Any]]:
-    """List the structs in an array of structs, or the single struct, as mappings of their fields."""
+    """List the structs in an array of structs, or a single struct, as mappings of their fields."""
     fields = _struct_fields(value) or {}
     members = [member for field in fields.values() if (member := _struct_fields(field)) is not None]
     return members if members and all(key.startswith("(") for key in fields) else [fields]
@@ -194,9 +195,9 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
 def _iter_columns(
     group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None
 ) -> Iterator[Series]:
-    """Yield a series for a vector, or for each column of a matrix, with names such as `name(:,1)`.
+    """Yield the series of a vector, or one for each column of a matrix, with names such as `name(:,1)`.
 
-    Arrays of other types, shapes or with too many columns are left out.
+    Arrays of other types or shapes, or with too many columns, are left out.
     """
     if value.dtype.kind not in "fiubmMU":
         return
@@ -211,7 +212,7 @@ def _iter_columns(
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table, a pandas data frame; the row times of a timetable are their clock."""
+    """Yield the columns of a table, a pandas data frame, as series; the row times of a timetable are their clock."""
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
     clock, index = None, np.asarray(frame.index)
     if index.dtype.kind in "mM" and index.size:
