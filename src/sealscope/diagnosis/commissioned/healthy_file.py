@@ -176,6 +176,7 @@ _BALANCE = table_type(
     held=(_Array, None),
     shut_odds=(_Number, None),
     held_odds=(_Number, None),
+    creep_odds=(_Number, None),
     flow=_Magnitude,
     pressure=_Magnitude,
     start_s=(_Time, None),

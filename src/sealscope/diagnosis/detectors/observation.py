@@ -27,6 +27,7 @@ from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.motion import describe_hold
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -132,8 +133,8 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
 
-    The changes are those of the signals and of the volume balance; without a balance, those of the pressure response
-    are used in its place.
+    The changes are those of the signals and of the volume balance; without a balance, or if it is uncertain that
+    valves hold the load (no channel of the flow), those of the pressure response are added.
     """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
@@ -146,7 +147,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     for is_shut, report in reports.items():
         prefix = SHUT if is_shut else ""
         surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
-    if not reports and PRESSURE_RESPONSE in detectors():
+    if (not reports or flow_source(recording.channels) is None) and PRESSURE_RESPONSE in detectors():
         surprisals |= _max_surprisals(run_detector(PRESSURE_RESPONSE, recording, (), rig))
     return surprisals
 

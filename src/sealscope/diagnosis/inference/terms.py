@@ -527,18 +527,21 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a load that is held by shut valves, i.e. while the command is constant.
+    """Return the volume balance of a load that is held by shut valves.
 
-    The piston moves only as far as oil leaks from the loaded side; x must grow as A fills. The channels do not
-    separate leaks of seal, valve and line. Return None for a circuit without such valves, as a pump-controlled one,
-    or if position, command or a pressure is missing.
+    The piston moves only as far as oil leaks from the loaded side. The channels do not separate leaks of seal, valve
+    and line. A constant command means shut valves. If no channel shows a command or a flow, a slow piston may be held
+    by valves or by a control loop that replaces what leaks. x grows as A fills. Return None for a circuit without such
+    valves, as a pump-controlled one, or if position or a pressure is missing.
     """
-    if not rig.circuit.holds_load or not {"x", "u", *_PRESSURES} <= channels:
+    if not {"x", *_PRESSURES} <= channels:
+        return None
+    if flow_source(channels) is not None and not (rig.circuit.holds_load and "u" in channels):
         return None
 
     def displaced_volume(s: Signals) -> Array:
-        """Compute the volume that the piston displaces on the loaded side [m^3] in each interval, shape (n - 1,)."""
-        area = rig.cylinder.A_A if np.nanmean(s.pressure_difference) > 0.0 else rig.cylinder.A_B
+        area_A, area_B = rig.cylinder.A_A, rig.cylinder.A_B
+        area = area_A if np.nanmean(s["p_A"] * area_A - s["p_B"] * area_B) > 0.0 else area_B
         return -area * s.step("x")
 
     return Equation(LOCKED, displaced_volume, _STANDSTILL)

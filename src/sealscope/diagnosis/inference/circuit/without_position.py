@@ -82,7 +82,7 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
         return []
     single_rod = rig.cylinder.single_rod
     # a constant command means shut valves; else a control loop may hold the piston at any command
-    may_hold = is_known & (signals.step("u") == 0.0) if is_locked else is_known
+    may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
     is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, max_creep)
     cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)

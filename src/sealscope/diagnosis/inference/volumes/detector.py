@@ -33,7 +33,6 @@ from sealscope.diagnosis.inference.scatter import (
 )
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
-    LOCKED,
     TURNING,
     circulation,
     equations,
@@ -57,6 +56,11 @@ _NO_BALANCE = {
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
+#: Reason for not judging a load without a command or a flow.
+_NO_CREEP = (
+    "no healthy recordings show that the held load creeps behind valves; a pump may replace what leaks: record the "
+    "pump's theta or omega, a flow meter q_pump or the command u"
+)
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
@@ -137,11 +141,7 @@ class VolumeBalance:
             RecordedBalance(cycle.blocks, (cycle.equation,), (cycle.columns,), self.rig, recording, cycle.oil_loss)
             for cycle in cycle_balances
         )
-        usable = (
-            candidate
-            for candidate in candidates
-            if candidate.equations[0].name == LOCKED or compensates_leakage(candidate)
-        )
+        usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
@@ -169,7 +169,7 @@ class VolumeBalance:
         and `scale`, the factor from the rig's flows to the machine's, 0 if the machine's size is not stated. If the
         machine rests, it also contains `shut_sums`, the sums for a pump that is cut off at rest, and `shut_odds`, the
         log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks during holds, and
-        `held_odds`, the log odds from these.
+        `held_odds`, the log odds from these. Of a load that valves hold: `creep_odds`, the log odds that it creeps.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
@@ -182,6 +182,8 @@ class VolumeBalance:
             summary |= {"shut_sums": shut.recording_sums.sums, "shut_odds": recorded.odds}
             held, odds = shut.recording_sums.held, replace(balance, locked=True).locked_odds()
             summary |= {} if held is None or odds is None else {"held": held, "held_odds": odds}
+        if balance.is_creep:
+            summary["creep_odds"] = balance.creep_log_odds()
         return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
 
     def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], repeated: int = 1) -> Rise:
@@ -220,13 +222,26 @@ class VolumeBalance:
             scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
+    def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
+        """Return True unless a control loop may hold the load of a balance without the pump (`terms.locked`).
+
+        With a recorded command valves hold it. Without one the load must creep in the healthy recordings with these
+        `summaries`: a control loop would replace what leaks, and slow motions are no creep.
+        """
+        if not balance.is_creep or "u" in balance.recording:
+            return True
+        max_odds: float = INFERENCE.rest.alone
+        healthy = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
+        return float(healthy.sum()) > 0.0
+
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
         """Make the column roles of each volume balance, i.e. which column is the leak, the left side and so on.
 
         `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
         off at rest.
         """
-        balances = equations(self.rig, channels)
+        held = None if equations(self.rig, channels) else locked(self.rig, channels)
+        balances = equations(self.rig, channels) if held is None else (held,)
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
@@ -240,6 +255,8 @@ class VolumeBalance:
         balance = self.balance(recording, odds, is_locked=is_locked)
         if balance is None:
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
+        if not self._is_held_by_valves(balance, summaries):
+            return Observed(self.name, lack=_NO_CREEP)
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
         names = [name for name in balance.columns[0].names if name != TURNING]
         return self._report(

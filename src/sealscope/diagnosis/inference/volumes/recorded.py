@@ -41,7 +41,15 @@ from sealscope.diagnosis.inference.onset import (
 )
 from sealscope.diagnosis.inference.regimes import rest_log_odds
 from sealscope.diagnosis.inference.scatter import RecordingSums
-from sealscope.diagnosis.inference.terms import LAG, MIN_ABSOLUTE_PRESSURE, PUMP, Equation, Signals, find_rests
+from sealscope.diagnosis.inference.terms import (
+    LAG,
+    LOCKED,
+    MIN_ABSOLUTE_PRESSURE,
+    PUMP,
+    Equation,
+    Signals,
+    find_rests,
+)
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
@@ -101,6 +109,11 @@ class RecordedBalance:
         """Pairs (name, unit) of all recorded channels."""
         return frozenset(self.recording.units.items())
 
+    @property
+    def is_creep(self) -> bool:
+        """True if the flow is that by which a held load creeps, and no pump's flow is known."""
+        return self.equations[0].name == LOCKED
+
     @cached_property
     def _first_motion(self) -> int:
         """Index of the first block in which the machine moves; 0 if too few blocks follow for a step test."""
@@ -149,6 +162,7 @@ class RecordedBalance:
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         held = None if self.chambers is None else np.array(self.chambers.leaks)
+        sums = sums._replace(flow=self.mean_flow) if self.is_creep else sums
         return sums._replace(held=held, viscous_drop=estimate_viscous_drop(self.recording))
 
     @cached_property
@@ -299,8 +313,14 @@ class RecordedBalance:
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow over the recording [m^3/s]."""
-        return self.mean_of_blocks(self.blocks.flow)
+        """Mean magnitude of the pump's flow over the recording [m^3/s].
+
+        Of a load that valves hold, it is the flow that the motion of the piston takes.
+        """
+        if not self.is_creep:
+            return self.mean_of_blocks(self.blocks.flow)
+        area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
+        return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
         """Average `values` (K,) of the blocks from the time `since` [s] on, weighted by their numbers of rows.
@@ -327,6 +347,19 @@ class RecordedBalance:
         weights = np.maximum(self.blocks.rows, 0.0)
         return self.total_history.average(weights / weights.sum())
 
+    def creep_log_odds(self) -> float:
+        """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
+
+        A loop replaces what leaks, so that the piston hardly moves. The flow by which it moves in holds is compared
+        with zero and with that of a pump that holds a load, as fractions of the flow in motion. The odds are limited
+        by `rest.most` of `priors.toml`.
+        """
+        holding_flow, pressure = INFERENCE.rest.holding * self.mean_flow, self.mean_pressure()
+        flow, low, high = (value * pressure for value in self.conductance)
+        variance = ((high - low) / (2.0 * WITHIN_95)) ** 2
+        max_odds: float = INFERENCE.rest.most
+        return float(np.clip(-rest_log_odds(flow, variance, holding_flow, variance), -max_odds, max_odds))
+
     @cached_property
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with covariance."""
@@ -349,7 +382,8 @@ def _flow_scale(balance: RecordedBalance) -> Size:
 
     The flow of a flow meter needs no scale. Otherwise the balance measures the ratio of displacement to area. A
     stated displacement gives the scale directly, a stated area through that ratio. If both are stated and disagree,
-    their difference is the uncertainty. Behind a servo valve the areas give the flow.
+    their difference is the uncertainty. Behind a servo valve, and for a load
+    that shut valves hold, the areas give the flow.
     """
     roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     prior = INFERENCE.size
@@ -358,7 +392,8 @@ def _flow_scale(balance: RecordedBalance) -> Size:
     has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & balance.units
     states_displacement = rig.states("pump.q_b") and has_flow_unit
     states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
-    if len(balance.columns) > 1:  # behind a valve the area sizes the flow
+    # behind a valve, or of a load that valves hold, the area sizes the flow
+    if len(balance.columns) > 1 or balance.is_creep:
         return Size(1.0, prior.area, stated=states_areas and has_pressure_unit)
     motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
     area = _loaded_area(balance, motion) if motion and ("x", "m") in balance.units else None

@@ -1,0 +1,90 @@
+"""A load that valves hold and whose command nobody records: it creeps by what leaks, and healthy days show that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.recordings.recording import Recording
+from sealscope.units import LITRE_PER_MINUTE
+
+RATE, SECONDS, AREA_A, AREA_B = 50.0, 120.0, 3600e-6, 2700e-6
+#: Conductance of the holding valves of the healthy machine, and of a worn piston [m^3/(s Pa)].
+VALVES, WORN = 5e-13, 3e-12
+#: Positions [m] between which the boom moves for 3 s; it is held for 9 s at each.
+STATIONS = (0.1, 0.4, 0.6, 0.3, 0.5, 0.2, 0.45, 0.25, 0.55, 0.15, 0.4)
+
+
+def record_boom(seed: int, leak: float = 0.0, since: float = 0.0, *, is_held: bool = False) -> Recording:
+    """Record chamber pressures and position of a boom under its load, which creeps in its holds.
+
+    A_A dx/dt = -(G_valves + G_leak) (p_A - p_B) while it is held. With `is_held`, a control loop holds it instead.
+    """
+    random = np.random.default_rng(seed)
+    t = np.arange(round(SECONDS * RATE)) / RATE
+    load = 3e6 * random.uniform(0.8, 1.2) + 4e5 * np.sin(2.0 * np.pi * t / random.uniform(7.0, 11.0))
+    step, phase = (t // 12.0).astype(int), t % 12.0
+    begin, end = np.array(STATIONS)[step], np.array(STATIONS)[step + 1]
+    is_moving = phase < 3.0
+    path = np.where(is_moving, begin + (end - begin) * (1.0 - np.cos(np.pi * phase / 3.0)) / 2.0, end)
+    conductance = VALVES * random.uniform(0.8, 1.25) + np.where(t >= since, leak, 0.0)
+    creep = np.where(is_moving | is_held, 0.0, -conductance * load / AREA_A)
+    x = path + np.cumsum(creep) / RATE + 2e-6 * random.standard_normal(t.size)
+    p_B = 2e6 + 1e4 * random.standard_normal(t.size)
+    channels = {"p_A": p_B + load + 1e4 * random.standard_normal(t.size), "p_B": p_B, "x": x}
+    return Recording(t, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE)
+
+
+def commission(folder: Path, *, is_held: bool = False) -> CommissionedMachine:
+    """Commission the boom from six healthy recordings, with its piston areas stated."""
+    for seed in range(6):
+        ss.write(record_boom(seed, is_held=is_held), folder / f"healthy-{seed}.nc")
+    rig = unstated_rig().with_areas(AREA_A, AREA_B, source="data sheet")
+    return ss.commission(folder, rig=rig)
+
+
+@pytest.fixture(scope="module")
+def boom(tmp_path_factory: pytest.TempPathFactory) -> CommissionedMachine:
+    return commission(tmp_path_factory.mktemp("boom"))
+
+
+def flow_lpm(recording: Recording, conductance: float) -> float:
+    """Mean flow of a leak of `conductance` [m^3/(s Pa)] under the recorded pressures [L/min]."""
+    return conductance * float(np.mean(recording["p_A"] - recording["p_B"])) / LITRE_PER_MINUTE
+
+
+def test_a_worn_piston_shows_in_the_creep_of_the_held_load(boom: CommissionedMachine) -> None:
+    recording = record_boom(20, WORN)
+    diagnosis = boom.diagnose(recording)
+    assert (diagnosis.verdict, diagnosis.cause) == ("leak", "leak inside or outside")
+    assert diagnosis.leak_interval_lpm is not None
+    low, high = diagnosis.leak_interval_lpm
+    assert low < flow_lpm(recording, WORN) < high < 1.5 * flow_lpm(recording, WORN)
+
+
+def test_a_leak_that_begins_in_a_hold_is_dated(boom: CommissionedMachine) -> None:
+    diagnosis = boom.diagnose(record_boom(21, WORN, since=66.0))
+    assert diagnosis.verdict == "leak"
+    assert diagnosis.onset_interval_s is not None
+    assert diagnosis.onset_interval_s[0] <= 66.0 <= diagnosis.onset_interval_s[1]
+
+
+def test_a_healthy_boom_has_no_leak_and_a_bound_in_the_scale_of_its_areas(boom: CommissionedMachine) -> None:
+    recording = record_boom(22)
+    diagnosis = boom.diagnose(recording)
+    assert diagnosis.summary == "no leak"
+    assert diagnosis.bound_lpm is not None
+    assert diagnosis.bound_lpm < flow_lpm(recording, VALVES)
+
+
+def test_nothing_is_said_where_a_loop_may_hold_the_load(tmp_path: Path, boom: CommissionedMachine) -> None:
+    """A loop replaces what leaks, so that even a torn seal moves nothing; nor does one recording tell valves."""
+    held = commission(tmp_path, is_held=True)
+    assert held.diagnose(record_boom(23, WORN, is_held=True)).verdict == "cannot tell"
+    assert boom.rig is not None
+    assert ss.diagnose(record_boom(24, WORN), rig=boom.rig).verdict == "cannot tell"
