@@ -85,6 +85,8 @@ def circulations(recording: Recording, rig: Rig) -> list[CycleBalance]:
     may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
     is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, max_creep)
+    if is_locked and "u" not in channels and not is_held.all():
+        is_held[: int(np.argmin(is_held))] = False  # before the first motion the machine may be off
     cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)
     balances = []
     for half_width, is_used in ((cycle, is_known), (HOLD_HALF_WIDTH, is_held)):
