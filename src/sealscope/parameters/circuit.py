@@ -8,6 +8,9 @@ from typing import NamedTuple
 class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers, either `PUMP_CIRCUIT` or `VALVE_CIRCUIT`; `Rig.circuit` chooses one.
 
+    A third circuit is a third value of this type, with a flag for each property that its users ask for; no user
+    compares the name.
+
     Attributes
     ----------
     name : str

@@ -26,8 +26,9 @@ class Observable:
     name : str
         What changed: a term of the balance, "noise of the pressures", "RMS of d3 of p_A".
     data : str
-        What it is computed from: "volumes", "response", "noise", "hum", "duty", "sense", "levels", "details", or the
-        name of a plug-in. Observables of the same data are alternative descriptions of one change in it.
+        What it is computed from, such as "volumes", "rise", "drift" or "details", as the patterns in
+        `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative descriptions of one
+        change in it.
     score : float
         Twice the logarithm of the likelihood ratio of the change.
     chance : float

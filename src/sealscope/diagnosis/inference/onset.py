@@ -139,7 +139,7 @@ class StepTest:
 
     @cached_property
     def weights(self) -> Array:
-        """Probability of each tried onset, given that there is a step, shape (o,)."""
+        """Probability of each tried onset, given that there is a step, shape (o,); all are equally probable before."""
         weights = np.exp(self.likelihood - self.likelihood.max())
         return np.asarray(weights / weights.sum())
 

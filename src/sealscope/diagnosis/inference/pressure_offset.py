@@ -12,7 +12,8 @@ flow,
 F (level and slope) and B (level, slope and curvature) are projected out. z maximises its prior times the restricted
 likelihood, over onsets and (q, kappa). The prior is a normal density for good sensors, with small odds of a wide one.
 The walk may be no larger than the one fitted without z; otherwise z and a free walk would describe changes that no
-leak explains. If the leak does not change, there is no information on z. It then stays near zero, and no result
+leak explains. What the balance leaves repeats from cycle to cycle: no more than `size.readings` residuals count as
+independent. If the leak does not change, there is no information on z. It then stays near zero, and no result
 depends on it. Behind a servo valve both chambers have the same leak, step and z, so their whitened rows are stacked.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
@@ -75,9 +76,12 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
     # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains
     walks = WALKS[: int(_walk_likelihoods(leak_steps, z, WALKS).argmax()) + 1]
 
+    # what the balance leaves repeats from cycle to cycle, so that fewer residuals are independent
+    independent = min(1.0, INFERENCE.size.readings / len(z))
+
     def log_likelihood(position: float) -> float:
         """Compute the log likelihood of an offset, given by its asinh, at the best onset, step and random walk."""
-        return float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
+        return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
 
     def cost(position: float) -> float:
         """Compute minus the log posterior of an offset, given by its asinh, up to a constant."""

@@ -212,6 +212,7 @@ class HeldOilPriors(PriorTable):
       sensors.
     - `independent`: number of independent readings of one side in a hold.
     - `misfit`: fraction of the compressed volume that this model of the oil does not describe.
+    - `from_start`: fraction of the leaks that exist from the start of a recording.
     - `gain`: relative difference between the gains of two pressure sensors.
     - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
     - `air`: volume fraction of free air in the oil.
@@ -231,6 +232,7 @@ class HeldOilPriors(PriorTable):
     loaded: float
     independent: float
     misfit: float
+    from_start: float
     gain: float
     charge: float
     air: float

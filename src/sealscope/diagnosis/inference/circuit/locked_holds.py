@@ -420,10 +420,10 @@ class HeldChambers:
     def _onset_log_priors(self) -> Array:
         """Log prior probability of each possible onset of a leak in `onsets`, shape (o,).
 
-        Half of all leaks are assumed to exist from the start of the recording.
+        The fraction `held_oil.from_start` of `priors.toml` exists from the start; later onsets are equally probable.
         """
-        n_later = len(self.onsets) - 1
-        return np.asarray(np.log(np.append(0.5, np.full(n_later, 0.5 / max(n_later, 1)))))
+        from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1
+        return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume that a leak of unit coefficient loses since each of o onsets, at all r readings, (r, o).
@@ -531,9 +531,8 @@ class HeldChambers:
     @property
     def probability_after_holds(self) -> float:
         """Prior probability that a leak begins after the last hold of the load, so that no hold shows it."""
-        time_after = self.end - float(self.holds[-1].t[-1])
-        # half of all leaks begin within the recording
-        return 0.5 * time_after / max(self.end - self.begin, np.finfo(float).tiny)
+        time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
+        return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
     @cached_property
     def piston_onset(self) -> Interval | None:

@@ -72,7 +72,7 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak, such as "piston leak" or "piston or pump leak", as precisely as the balance can state it.
+        """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance does not separate them.
 
         Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
         the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine. If only
