@@ -263,7 +263,7 @@ class Experiment:
 
     @property
     def active_controller(self) -> Controller | None:
-        """The controller that follows the position target: the stated one, or else a PI controller for the rig.
+        """The controller that follows the position target, by default a PI controller for the rig.
 
         None if the experiment has a voltage command.
         """

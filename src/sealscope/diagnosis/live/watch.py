@@ -146,10 +146,10 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned: (rig, mapping, learning time [h]).
+        """Settings with which the baseline is learned.
 
-        The mapping tells, for each way of watching ("volumes", "pressures"), if the rig states the sizes that are
-        needed for L/min.
+        They are the rig, a mapping, and the learning time [h]. The mapping tells for each way of watching, "volumes"
+        and "pressures", if the rig states the sizes that are needed for L/min.
         """
         return self._rig, self._litres, self.learn_hours
 
