@@ -45,6 +45,7 @@ from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Recording, compute_once
 
 if TYPE_CHECKING:
@@ -56,11 +57,9 @@ _NO_BALANCE = {
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
-#: Reason for not judging a load without a command or a flow.
-_NO_CREEP = (
-    "no healthy recordings show that the held load creeps behind valves; a pump may replace what leaks: record the "
-    "pump's theta or omega, a flow meter q_pump or the command u"
-)
+#: Reason for having no balance for lack of a channel; the same of a held load, which may still creep.
+_NO_FLOW = "needs p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u"
+_NO_CREEP = f"{_NO_FLOW}; without them it judges a held load that creeps in the healthy recordings"
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
@@ -97,7 +96,7 @@ class VolumeBalance:
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             if self.rig.circuit.valve_controlled:
                 return "needs x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion"
-            return "needs p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u"
+            return _NO_FLOW
         if stride_samples(recording.rate) < MIN_STRIDE:
             return (
                 f"needs {MIN_STRIDE / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
@@ -228,7 +227,7 @@ class VolumeBalance:
         With a recorded command valves hold it. Without one the load must creep in the healthy recordings with these
         `summaries`: a control loop would replace what leaks, and slow motions are no creep.
         """
-        if not balance.is_creep or "u" in balance.recording:
+        if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
         max_odds: float = INFERENCE.rest.alone
         healthy = np.clip([summary.get("creep_odds", 0.0) for summary in summaries], -max_odds, max_odds)
@@ -253,9 +252,10 @@ class VolumeBalance:
         is_locked = _are_valves_shut(summaries, "shut_odds")
         odds = self._shut_log_odds(summaries, frozenset(recording.channels))
         balance = self.balance(recording, odds, is_locked=is_locked)
-        if balance is None:
+        has_flow = flow_source(recording.channels) is not None
+        if balance is None and (has_flow or "x" not in recording):
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
-        if not self._is_held_by_valves(balance, summaries):
+        if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP)
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
         names = [name for name in balance.columns[0].names if name != TURNING]
