@@ -146,8 +146,8 @@ class Case:
             observable: [event for event in named_events if event.affects(observable)]
             for observable in self.observables
         }
-        # each kind of data that shows an event is one more test that may name an event by mistake
-        n_tests = len({observable.data for observable, candidates in candidates_of.items() if candidates})
+        # each distribution in healthy recordings is one more test that may name an event by mistake
+        n_tests = len({null_key(observable) for observable, candidates in candidates_of.items() if candidates})
         allowed = DECISION.explanation.heading * self.false_alarm_probability / max(n_tests, 1)
         chances = {observable: self.null.chance(observable) for observable in self.observables}
         for observable in sorted(self.observables, key=chances.__getitem__):
