@@ -8,8 +8,10 @@ import pytest
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     FALL,
+    ChargeTrend,
     LowDrifts,
     compare_low_drifts,
+    estimate_charge_trend,
     estimate_low_drifts,
 )
 from sealscope.recordings.recording import Recording
@@ -113,3 +115,37 @@ def test_a_recording_without_both_pressures_or_the_pump_has_no_drifts() -> None:
 def test_only_external_leaks_make_the_charge_pressure_fall() -> None:
     change = next(change for change in compare_low_drifts(drifts(record(fall=300.0)), HEALTHY) if change.name == FALL)
     assert {event.cause for event in load_events() if event.affects(change)} == {"external leak"}
+
+
+def lose_oil(flow: float, onset: float, volume: float = 2e-3) -> ChargeTrend:
+    """Trend of the charge pressure of 8 bar of an accumulator that loses a flow [m^3/s] since an onset [s]."""
+    recording = record(seed=3)
+    lost = flow * np.maximum(T - onset, 0.0)
+    pressures = {name: recording[name] - 9e5 * lost / volume for name in ("p_A", "p_B")}
+    trend = estimate_charge_trend(Recording(T, {**recording.channels, **pressures}, recording.units, RATE))
+    assert trend is not None
+    return trend
+
+
+@pytest.mark.parametrize("onset", [0.0, 50.0])
+def test_the_fall_of_a_ramp_is_the_one_that_a_loss_since_its_onset_makes(onset: float) -> None:
+    """The slope that a fit over the whole recording has where the pressure falls from f T on, times (1-f)^2 (1+2f)."""
+    flow, before = 1e-6, onset / SECONDS
+    expected = 9e5 * flow / 2e-3 * (1.0 - before) ** 2 * (1.0 + 2.0 * before)
+    assert lose_oil(flow, onset).fall == pytest.approx(expected, rel=0.1)
+
+
+def test_a_loss_of_oil_is_supported_where_the_charge_pressure_falls_and_refuted_where_it_does_not() -> None:
+    flow, onset = 1e-6, 50.0  # 0.06 L/min
+    assert lose_oil(flow, onset).loss_support(flow, onset) > 2.0
+    assert lose_oil(0.0, onset).loss_support(flow, onset) < -2.0
+    # a loss that empties nothing within the recording is neither
+    assert lose_oil(0.0, onset).loss_support(1e-9, onset) == pytest.approx(0.0, abs=0.2)
+    assert lose_oil(0.0, onset).loss_support(flow, 0.98 * SECONDS) == pytest.approx(0.0, abs=0.2)
+
+
+def test_the_refutation_grows_with_the_flow_and_is_never_certain() -> None:
+    tight = lose_oil(0.0, 0.0)
+    supports = [tight.loss_support(flow, 20.0) for flow in np.geomspace(1e-8, 1e-2, 13)]
+    assert all(np.diff(supports) < 1e-9)
+    assert supports[-1] > -20.0

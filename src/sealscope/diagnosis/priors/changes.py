@@ -101,6 +101,7 @@ class ChargePriors(PriorTable):
     - `seconds` [s]: averaging time.
     - `scatter` [Pa/s]: standard deviation of the drift between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `unlike`: fraction of the recordings in which the charge pressure changes for another cause.
     """
 
     share: float
@@ -108,6 +109,7 @@ class ChargePriors(PriorTable):
     seconds: float
     scatter: float
     recordings: float
+    unlike: float
 
 
 class ChangePriors(PriorTable):
@@ -119,6 +121,7 @@ class ChangePriors(PriorTable):
     octaves: OctavePriors
     filtered: FilteredPriors
     charge: ChargePriors
+    accumulator: StepSize
     charge_fall: StepSize
     zero_drift: StepSize
 

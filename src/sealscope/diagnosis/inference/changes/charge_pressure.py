@@ -30,6 +30,7 @@ from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording
+from sealscope.units import P_ATM
 
 #: `Observable.data` of all drifts, rival descriptions of one another; names of those of low pressures.
 DRIFT, FALL, LOW = "drift", "fall of the charge pressure", "drift of low p_{}"
@@ -43,6 +44,8 @@ MAX_SAMPLES, MIN_SAMPLES, ITERATIONS = 4000, 200, 15
 ABOVE = 0.1
 #: Scale of the weights' decrease over the median residual below the fit, and smallest scale [Pa].
 WEIGHT_SCALE, MIN_SCALE = 2.0, 300.0
+#: Number of gas volumes of the accumulator over which a likelihood is averaged.
+N_VOLUMES = 25
 #: Smallest number that is divided by.
 TINY = 1e-300
 
@@ -84,6 +87,56 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
         is_fed = is_low.mean() > CHANGES.charge.share
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_fed))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
+
+
+class ChargeTrend(NamedTuple):
+    """Trend of the charge pressure in a recording, which tells if oil may have left the circuit.
+
+    `fall` [Pa/s], with its standard `error`; `pressure`: absolute charge pressure [Pa]; `begin`, `end`: times of the
+    first and the last sample [s].
+    """
+
+    fall: float
+    error: float
+    pressure: float
+    begin: float
+    end: float
+
+    def loss_support(self, flow: float, onset: float) -> float:
+        """Compute twice the log likelihood ratio of a loss of oil to none, by the fall of the charge pressure.
+
+        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. The slope fitted
+        over the whole recording is then, with the fraction f of the recording before the onset,
+
+            fall = pressure flow / V (1 - f)^2 (1 + 2 f).
+
+        V has a log-normal prior. A measured fall may also have another cause, with a small probability.
+        """
+        prior, deviations = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)
+        weights = np.exp(-0.5 * deviations**2) / np.exp(-0.5 * deviations**2).sum()
+        before = float(np.clip((onset - self.begin) / max(self.end - self.begin, TINY), 0.0, 1.0))
+        volumes = prior.size * np.exp(prior.spread * deviations)
+        expected = self.pressure * abs(flow) / volumes * (1.0 - before) ** 2 * (1.0 + 2.0 * before)
+        deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
+        unlike = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size  # density of a fall of another cause
+        loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + unlike
+        none = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + unlike
+        return 2.0 * float(np.log(loss / none))
+
+
+def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
+    """Estimate how fast the charge pressure of a closed circuit falls; None if it does not show (`LowDrifts`)."""
+    drifts = estimate_low_drifts(recording)
+    if drifts is None:
+        return None
+    variances = {side: drift.deviation**2 for side in "AB" if (drift := drifts.estimate(side)) is not None}
+    fall = _mean_fall(drifts, {side: max(variance, TINY) for side, variance in variances.items()})
+    if fall is None:
+        return None
+    lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
+    return ChargeTrend(
+        fall.value, fall.deviation, max(lowest, 0.0) + P_ATM, float(recording.t[0]), float(recording.t[-1])
+    )
 
 
 def _average(values: Array, rate: float) -> Array:

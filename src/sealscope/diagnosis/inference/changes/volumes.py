@@ -21,6 +21,7 @@ from sealscope.diagnosis.inference.blocks import (
     solve,
     sum_blocks,
 )
+from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
@@ -46,6 +47,8 @@ def volume_observables(
     columns: Sequence[ColumnRoles],
     oil_loss: Mapping[str, StepTest],
     volume_ratio: float = 1.0,
+    charge: ChargeTrend | None = None,
+    flow_scale: float = 1.0,
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
@@ -53,7 +56,8 @@ def volume_observables(
     sensor offset of p_A - p_B, for the tests of leaks; `plain`: sums with the pressures as recorded, for all other
     terms. `columns`: roles of the columns (leak, motion, left side) in each equation; `oil_loss`: tests for an
     external leak by the oil that the accumulator lost, by the name of the term; `volume_ratio`: measured over assumed
-    ratio of area to displacement.
+    ratio of area to displacement; `charge`: trend of the charge pressure, None if it is unknown; `flow_scale`: true
+    flow over the flow of the balance.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -71,6 +75,10 @@ def volume_observables(
             advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0], volume_ratio)
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
+        elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
+            unit_flow = 1.0 if name == OUTSIDE else _mean_increment(recorded, columns[0], name.removesuffix(MADE_UP))
+            flow = step.fitted.size * unit_flow * flow_scale
+            advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
             Observable.from_test(name, VOLUMES, step, n_tests=len(steps), sign=signs[best], advantage=advantage)
         )

@@ -19,6 +19,7 @@ from sealscope.diagnosis.inference.blocks import (
     offset_cost,
     solve,
 )
+from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
 from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.locked_holds import (
@@ -144,8 +145,9 @@ class RecordedBalance:
         """Results of the tests for a step of each coefficient within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         return volume_observables(
-            self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio
-        )
+            self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio,
+            estimate_charge_trend(self.recording) if self.size.stated else None, self.size.scale,
+        )  # fmt: skip
 
     @property
     def volume_ratio(self) -> float:
