@@ -82,7 +82,8 @@ class VolumeBalance:
 
     It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
     position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
-    position, command, both chambers, supply and return. Without supply and return it measures leaks during holds.
+    position, command, both chambers, supply and return. Without supply and return it measures leaks during holds. A
+    recorded position without any flow or command is enough if the held load creeps in the healthy recordings.
     """
 
     name = VOLUME_BALANCE
