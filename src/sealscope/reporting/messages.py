@@ -70,7 +70,7 @@ def clock(seconds: float | None) -> str:
 def headline(diagnosis: Diagnosis) -> str:
     """Format the verdict as a sentence for the heading of the page, or of the card, a picture of the diagnosis."""
     key = diagnosis.summary
-    if diagnosis.verdict == "leak" and diagnosis.cause == "piston or pump leak":
+    if diagnosis.verdict == "leak" and diagnosis.cause in _texts()["headline"]:
         key = diagnosis.cause
     elif key == "no leak" and not diagnosis.known_healthy:  # a leak from the start cannot be excluded
         key = "none began"

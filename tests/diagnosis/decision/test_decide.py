@@ -234,3 +234,16 @@ def test_scores_are_finite_for_any_chance() -> None:
     for chance in (1.0, 0.5, 1e-300, np.finfo(float).tiny):
         evidence = decide(Observed("mine", (observable("plug-in: mine", chance),)), (), HealthyNull(), ALLOWED)
         assert np.isfinite([evidence.score, evidence.threshold, evidence.chance]).all()
+
+
+@pytest.mark.parametrize(
+    ("likelihood_ratio", "cause"),
+    [(1.0, "internal or external leak"), (1e-3, "piston or pump leak")],
+)
+def test_the_outside_is_named_unless_the_data_exclude_it(likelihood_ratio: float, cause: str) -> None:
+    """Rivals that describe the residual as well as the leak, and a thousand times worse."""
+    leak = MeasuredLeak(step(8.0))
+    chance = leak.step.chance / likelihood_ratio
+    outside = [observable(f"volumes: external leak {side}", chance) for side in "AB"]
+    evidence = judge_leak(leak, *outside)
+    assert (evidence.verdict, evidence.cause) == ("leak", cause)

@@ -19,8 +19,11 @@ from sealscope.storage.plain_values import convert_type
 PISTON_LEAK, NO_CAUSE = "piston leak", "none"
 #: Factor of recordings: the direction of the piston's stroke.
 STROKE = "stroke"
-#: By the cause that a detector names if its channels cannot distinguish two causes: those two.
-_AMBIGUOUS_CAUSES = {"piston or pump leak": (PISTON_LEAK, "pump leak")}
+#: By the cause that a detector names if its channels cannot distinguish several causes: those causes.
+_AMBIGUOUS_CAUSES = {
+    "piston or pump leak": (PISTON_LEAK, "pump leak"),
+    "internal or external leak": (PISTON_LEAK, "pump leak", "external leak"),
+}
 #: By detector: its score, None for `cannot tell`, and the onset [s] that it estimates, None for none.
 Scores = Mapping[str, tuple[float | None, float | None]]
 
@@ -75,7 +78,7 @@ def duty_label(levels: Mapping[str, str | float]) -> str:
 def matches_cause(named: str, true_cause: str) -> bool:
     """Return True if the cause that a detector names is the true one, or an ambiguous one that includes it.
 
-    "piston or pump leak" includes both kinds of leak.
+    "piston or pump leak" includes both kinds of leak, "internal or external leak" also one to the outside.
     """
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 

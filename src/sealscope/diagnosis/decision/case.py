@@ -100,8 +100,21 @@ class Case:
         if alarm.name == LEVEL:
             step_alarm = next((test for test in self.alarms if test.name == WITHIN), None)
             return 1.0 if step_alarm is None else self.leak_probability(step_alarm)
-        data = RISE if alarm.name == AGAINST and self.leak is not None else self.judge.observables[0].data
-        return probability_of(self.explanations, *LEAK_EVENTS, data_kind=data)
+        return probability_of(self.explanations, *LEAK_EVENTS, data_kind=self._data_kind(alarm))
+
+    def external_probability(self, alarm: LeakTest) -> float:
+        """Compute the probability that oil leaves the circuit, given the data that raised the alarm.
+
+        It is 0 if other causes are not weighed (`weigh_rivals`).
+        """
+        if not self.weigh_rivals:
+            return 0.0
+        return probability_of(self.explanations, cause="external leak", data_kind=self._data_kind(alarm))
+
+    def _data_kind(self, alarm: LeakTest) -> str:
+        """Return the kind of data (`Observable.data`) by which a test raised its alarm."""
+        is_rise = alarm.name == AGAINST and self.leak is not None
+        return RISE if is_rise else self.judge.observables[0].data
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:

@@ -103,7 +103,7 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
         else:
             onset = leak.rise_onset if alarm.name == AGAINST else None
         fields = {
-            "cause": _leak_cause(case, leak),
+            "cause": _leak_cause(case, leak, alarm),
             "total_leakage": leak.total(None),
             "course": leak.history(None if onset is None else onset.value),
             **_size_fields(leak, leak.step_flow if alarm.name == WITHIN else leak.rise_flow),
@@ -114,11 +114,14 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
     return replace(evidence, reason=reason_of(case, evidence, alarm, np.inf, None))
 
 
-def _leak_cause(case: Case, leak: LeakMeasure) -> Cause:
-    """Return the cause of a leak as the detector states it, or "piston leak" if a leak of the pump is excluded.
+def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
+    """Return the cause of a leak: as the detector states it, unless other data exclude a part of it or add to it.
 
-    A leak of the pump is excluded if it was tested by an observable of its own and its probability is negligible.
+    An external leak that the data behind the `alarm` do not exclude is named with the piston and the pump. A leak of
+    the pump is left out if it was tested by an observable of its own and its probability is negligible.
     """
+    if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
+        return "internal or external leak"
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST
     return "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause

@@ -73,7 +73,7 @@ class PressureEstimator:
     """
 
     method, data, states_level = "pressures", RESPONSE, False
-    cause: Cause = "leak inside or outside"
+    cause: Cause = "internal or external leak"
     size_error, orifice_factor = conductance_scale_error(), PRESSURE.conductance.orifice
     min_internal_fraction: float = LIVE.watch.inside
     block_seconds: float = _PRIORS.seconds

@@ -147,7 +147,7 @@ def _measure_leak(
     size_deviation = max(point.size_error for point in points)
     return TrendLeak(
         provider=str(points[0].basis),
-        cause="leak inside or outside" if points[0].basis == "pressure response" else "piston or pump leak",
+        cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
         rise=_normal_rise(wear, chance),
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].time_of_day(day) for day in wear.onset)),

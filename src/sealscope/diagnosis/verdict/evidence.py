@@ -15,7 +15,7 @@ LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
-    "leak inside or outside",
+    "internal or external leak",
     "pump leak",
     "external leak",
     "friction change",
@@ -27,7 +27,7 @@ Cause = Literal[
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`. Piston and pump lie in parallel and often no channel separates them;
 #: without a position, a loss to the outside looks the same, too.
-LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "leak inside or outside")
+LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "internal or external leak")
 #: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest chance that is stated.

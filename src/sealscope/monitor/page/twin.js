@@ -21,7 +21,7 @@ function showMachine(machine, summary, alarm) {
   byId("twin-leak-pump").toggleAttribute("hidden", !pump);
   byId("twin-leak-out").toggleAttribute("hidden", !outside);
   const inside = "past the piston, or through the pump";
-  const where = outside ? "to the outside" : pump ? "through the pump" : leak && leak.cause === "leak inside or outside" ? `${inside}, or to the outside` : inside;
+  const where = outside ? "to the outside" : pump ? "through the pump" : leak && leak.cause === "internal or external leak" ? `${inside}, or to the outside` : inside;
   byId("twin-leak-text").textContent = leak ? `leak ${leak.text}` : "";
   byId("twin-where").textContent = leak ? `Oil leaks ${leak.cause === "piston leak" ? "past the piston" : where}.` : "";
 }

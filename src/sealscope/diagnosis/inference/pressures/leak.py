@@ -58,7 +58,7 @@ class ResponseLeak:
 
     provider: str = PRESSURE_RESPONSE
     #: Without a position, external leakage has the same effect.
-    cause: Cause = "leak inside or outside"
+    cause: Cause = "internal or external leak"
     size_deviation: float = conductance_scale_error()
     flow_factors: tuple[float, float] = (1.0, 1.0)
     ratio: Interval | None = None

@@ -76,10 +76,10 @@ class BalanceLeak:
 
         Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
         the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine. If only
-        the creep of a held load is known, it may also be a valve or a line: "leak inside or outside".
+        the creep of a held load is known, it may also be a valve or a line: "internal or external leak".
         """
         if self.balance.is_creep:
-            return "leak inside or outside"
+            return "internal or external leak"
         hold_rise = self._hold_rise
         in_holds = hold_rise is not None and (self.balance.shut or hold_rise.chance < INFERENCE.held_oil.rare)
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
