@@ -22,6 +22,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
 from sealscope.diagnosis.inference.terms import LEAK
@@ -161,6 +162,20 @@ def _check_levels(summary: Any) -> Any:
     return summary
 
 
+def _check_octaves(values: Any) -> Any:
+    """Return the spectra of the pressures in octaves if they are valid; raise ValueError otherwise.
+
+    They have a row for each field of `Octaves`, of which the last, a variance, is not negative. All must be below 750
+    in magnitude.
+    """
+    if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
+        shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
+        raise ValueError(f"octaves must be of the shape {shape}, got {values.shape}")
+    if not np.abs(values).max() < _MAX_LOGARITHM or (values[-1] < 0.0).any():
+        raise ValueError(f"octaves must be logarithms, phases and variances, of a size below {_MAX_LOGARITHM:g}")
+    return values
+
+
 _Array = Annotated[Any, AfterValidator(_check_array)]
 _Statistic = Annotated[Any, AfterValidator(_check_statistic)]
 _Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]
@@ -204,8 +219,7 @@ _SUMMARIES = {
             friction_error=(_Magnitude, None),
             drift_A=(_Number, None),
             drift_B=(_Number, None),
-            ratio=(_Number, None),
-            tilt=(_Number, None),
+            octaves=(Annotated[_Array, AfterValidator(_check_octaves)], None),
             low_A=(_Number, None),
             low_A_error=(_Magnitude, None),
             low_B=(_Number, None),

@@ -67,6 +67,7 @@ class OctavePriors(PriorTable):
     - `error`: standard error of the logarithm of the ratio in one recording.
     - `scatter`: standard deviation of this logarithm between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `neighbours`: number of octaves over which the correlation of the scatter falls by the factor e.
     """
 
     lowest: float
@@ -77,20 +78,34 @@ class OctavePriors(PriorTable):
     error: float
     scatter: float
     recordings: float
+    neighbours: float
+
+
+class PhasePriors(PriorTable):
+    """Phase between p_A and p_B in octaves, in the comparison with healthy recordings.
+
+    - `error` [rad]: standard error of the phase that a filter of known cut-off frequency causes in an octave.
+    - `scatter` [rad]: standard deviation of the phase between days.
+    - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `uniform`: fraction of the phases that say nothing.
+    """
+
+    error: float
+    scatter: float
+    recordings: float
+    uniform: float
 
 
 class FilteredPriors(PriorTable):
-    """Tilt of the spectrum of one pressure that a filter or a clogged line of its sensor causes.
+    """Low-pass filter of one pressure, such as a clogged line of its sensor.
 
-    The tilt is the change of the log ratio of p_A to p_B from low to high frequencies. Its size has a log-normal
-    prior.
-
-    - `size`: median size of the tilt.
-    - `spread`: standard deviation of the logarithm of the size.
+    - `lowest`, `highest` [Hz]: limits of the cut-off frequency.
+    - `noises`: possible fractions of the sensor's noise in the octave that has the least power per frequency.
     """
 
-    size: float
-    spread: float
+    lowest: float
+    highest: float
+    noises: tuple[float, ...]
 
 
 class ChargePriors(PriorTable):
@@ -119,6 +134,7 @@ class ChangePriors(PriorTable):
     levels: PressureLevelPriors
     healthy: HealthyLevelPriors
     octaves: OctavePriors
+    phases: PhasePriors
     filtered: FilteredPriors
     charge: ChargePriors
     accumulator: StepSize

@@ -40,6 +40,8 @@ from sealscope.recordings.recording import Recording, compute_once
 TINY = 1e-300
 #: Names of the observables: of the friction, and of the drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
+#: Key of the spectra in a summary: an array of the fields of `Octaves`, (4, k).
+OCTAVES = "octaves"
 
 
 class HealthyLevels:
@@ -50,7 +52,7 @@ class HealthyLevels:
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a recording by friction, drifts and spectra of p_A and p_B, for comparison with other recordings.
 
-        The summary maps the name of each number to its value, without those that the channels or too little motion do
+        The summary maps names to numbers, and `OCTAVES` to an array, without what the channels or too little motion do
         not allow. It is None if nothing can be estimated, and is computed only once for a recording.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
@@ -66,14 +68,15 @@ class HealthyLevels:
             return
         if (low_drifts := _low_drifts(judged)) is not None:
             yield from compare_low_drifts(low_drifts, [day for day in map(_low_drifts, summaries) if day is not None])
+        if (octaves := _octaves(judged)) is not None:
+            spectra = compare_spectra(octaves, [day for day in map(_octaves, summaries) if day is not None])
+            if spectra is not None:
+                yield spectra
         summaries = [summary for summary in summaries if "drift_A" in summary]
         if "drift_A" not in judged:
             return
-        changes = [_compare_friction(judged, summaries)]
-        if (octaves := _octaves(judged)) is not None:
-            healthy = [day for day in map(_octaves, summaries) if day is not None]
-            changes.append(compare_spectra(octaves, healthy))
-        yield from (change for change in changes if change is not None)
+        if (friction := _compare_friction(judged, summaries)) is not None:
+            yield friction
         prior, entries = CHANGES.healthy, [*summaries, judged]  # the judged one is the last
         drift_A, drift_B = (np.array([float(entry[name]) for entry in entries]) for name in ("drift_A", "drift_B"))
         drifts = [
@@ -85,10 +88,8 @@ class HealthyLevels:
 
 
 def _octaves(summary: Summary) -> Octaves | None:
-    """Read the comparison of the spectra of p_A and p_B from a recording's summary; None if it is not complete."""
-    if not set(Octaves._fields) <= set(summary):
-        return None
-    return Octaves(*(float(summary[name]) for name in Octaves._fields))
+    """Read the spectra of p_A and p_B from a recording's summary; None if it has none."""
+    return Octaves(*np.asarray(summary[OCTAVES], dtype=float)) if OCTAVES in summary else None
 
 
 def _low_drifts(summary: Summary) -> LowDrifts | None:
@@ -136,9 +137,9 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra of p_A and p_B in a recording, as numbers by their names.
+    """Estimate friction, drifts and spectra of p_A and p_B in a recording, as numbers or arrays by their names.
 
-    Numbers that the recording does not allow are left out; the result is None if none is left.
+    Values that the recording does not allow are left out; the result is None if none is left.
     """
     motion, fit = select_motion(recording), fit_difference(recording)
     levels = dict[str, float]()
@@ -152,10 +153,10 @@ def _estimate_levels(recording: Recording) -> Summary | None:
             "drift_A": drift_A,
             "drift_B": drift_B,
         }
-        if (octaves := compare_octaves(recording)) is not None:
-            levels |= octaves._asdict()
     if not np.isfinite(list(levels.values())).all():
         levels = {}
     if (low_drifts := estimate_low_drifts(recording)) is not None:
         levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
+    if (octaves := compare_octaves(recording)) is not None:
+        return {**levels, OCTAVES: np.stack(octaves)}
     return levels or None

@@ -1,52 +1,68 @@
-"""Spectra of both chamber pressures in octaves, which a filter of one sensor or its line makes unlike.
+"""Cross-spectrum of both chamber pressures in octaves, by which a filter of one sensor or its line is told.
 
-A low-pass filter takes more of one pressure the higher the frequency. With A_k, B_k the RMS of p_A and p_B in octave k,
-from periodograms of Hann windows (Welch) of which a busy one counts, two numbers are compared with healthy recordings:
+A low-pass filter of first order with the cut-off frequency f_c multiplies one pressure by
 
-    ratio = mean over the upper two octaves of log(A_k / B_k),    tilt = ratio - the same mean over the lower two.
+    H(f) = 1 / (1 + i f / f_c),    log abs(H) = -log(1 + (f / f_c)^2) / 2,    arg H = -arctan(f / f_c),
 
-A filter changes both alike. A load that one chamber carries changes the ratio at all frequencies, and what moves slowly
-changes the lower octaves; neither changes both numbers. So the larger of their two chances is stated. Called for
-recordings with both chamber pressures (`healthy_levels`).
+before the sensor's noise is added. With the spectra A and B of p_A and p_B (periodograms of Hann windows, Welch), the
+ratio log abs(A / B) and the phase of sum(A B*) in each octave are compared with those of healthy recordings. No change
+of the load, the friction or a leak turns the phase of one pressure by arctan(f / f_c) at all frequencies.
 
-Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70.
+The ratios of an octave vary between healthy recordings by an unknown variance with a prior, and neighbouring octaves
+vary together: a recording's ratios follow a multivariate t distribution. Its phases follow von Mises distributions,
+whose variance is learnt likewise and is larger where the pressures are hardly coherent; a fraction of the phases is
+uniform. The observable is the Bayes factor of a filter, averaged over both pressures, f_c and the noise; as its mean
+over healthy recordings is 1, that of a healthy one exceeds b with a probability of at most 1 / b (Markov).
+
+Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70; J. S. Bendat, A. G. Piersol, Random
+Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section
+3.5; A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), section 3.6.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
-#: `Observable.data` of the comparison of the chambers' spectra, and its name.
-SIDES, BESIDE = "sides", "p_A beside p_B"
-#: Minimum number of octaves, and number of those at either end that are averaged.
-MIN_OCTAVES, AVERAGED = 3, 2
+#: `Observable.data` of the comparison of the chambers' spectra, and its name by the filtered pressure.
+SIDES, FILTERED = "sides", {channel: f"filter of {channel}" for channel in CHAMBERS}
+#: Minimum number of octaves.
+MIN_OCTAVES = 3
 #: Number of samples of the median that removes single wrong ones.
 GLITCH = 3
-#: Minimum power whose logarithm is taken [Pa^2].
-MIN_POWER = 1e-6
+#: Minimum power [Pa^2], and minimum coherence, that are divided by.
+MIN_POWER, MIN_COHERENCE = 1e-6, 1e-3
+#: Number of cut-off frequencies, between the limits of the prior.
+CUTOFFS = 15
+#: Largest variance of a phase [rad^2]: beyond, it is nearly uniform.
+MAX_VARIANCE = 4.0
 
 
 class Octaves(NamedTuple):
-    """Log ratio of p_A to p_B in the upper octaves, and its `tilt` from the lower to the upper ones."""
+    """Spectra of both chamber pressures of a recording in k octaves, (k,) each.
 
-    ratio: float
-    tilt: float
+    `log_A`, `log_B`: logarithms of the RMS of p_A and p_B [Pa]; `phase`: that of the cross-spectrum [rad], positive if
+    p_A leads; `phase_variance`: variance of its error [rad^2].
+    """
+
+    log_A: Array
+    log_B: Array
+    phase: Array
+    phase_variance: Array
 
 
 def compare_octaves(recording: Recording) -> Octaves | None:
-    """Compare the spectra of p_A and p_B of a recording by two numbers, which a filter of one pressure changes.
+    """Compute the spectra of p_A and p_B of a recording in octaves, and their phase.
 
-    They are the log ratio of their RMS in the upper octaves, and its difference from that in the lower ones (tilt).
     Return None without both pressures, or if the recording is too short or has too few octaves.
     """
     priors = CHANGES.octaves
@@ -56,54 +72,148 @@ def compare_octaves(recording: Recording) -> Octaves | None:
     n_octaves = int(np.log2(max(min(priors.highest, priors.share * recording.rate) / priors.lowest, 1.0)))
     if n_octaves < MIN_OCTAVES or len(recording) < length:
         return None
-    edges = np.asarray(priors.lowest * 2.0 ** np.arange(n_octaves + 1))
-    log_A, log_B = (_log_octave_rms(recording[name], recording.rate, length, edges) for name in CHAMBERS)
-    ratios = log_A - log_B
-    ratio = float(ratios[-AVERAGED:].mean())
-    octaves = Octaves(ratio, ratio - float(ratios[:AVERAGED].mean()))
-    return octaves if np.isfinite(octaves).all() else None
+    frequencies = np.fft.rfftfreq(length, 1.0 / recording.rate)
+    octave_of_line = np.searchsorted(_octave_edges(n_octaves), frequencies, side="right") - 1
+    octaves = [octave_of_line == k for k in range(n_octaves)]
+    spectra_A, spectra_B = (_window_spectra(recording[name], length) for name in CHAMBERS)
+    powers_A, powers_B, cross_powers = (
+        np.stack([products[:, lines].sum(axis=1) for lines in octaves], axis=1)
+        for products in (np.abs(spectra_A) ** 2, np.abs(spectra_B) ** 2, spectra_A * spectra_B.conj())
+    )
+    log_A, log_B = (
+        0.5 * np.log(np.quantile(powers, priors.busy, axis=0) + MIN_POWER) for powers in (powers_A, powers_B)
+    )
+    cross_power, total_power = cross_powers.sum(axis=0), np.sqrt(powers_A.sum(axis=0) * powers_B.sum(axis=0))
+    coherence_squared = np.maximum(np.abs(cross_power) / (total_power + MIN_POWER), MIN_COHERENCE) ** 2
+    # windows overlap by half, so that every second one is independent
+    phase_variance = (1.0 - coherence_squared) / coherence_squared / len(spectra_A)
+    octaves_found = Octaves(log_A, log_B, np.angle(cross_power), np.minimum(phase_variance, MAX_VARIANCE))
+    return octaves_found if np.isfinite(octaves_found).all() else None
 
 
-def _log_octave_rms(values: Array, rate: float, length: int, edges: Array) -> Array:
-    """Compute the log RMS (k,) of a signal in the octaves between `edges` (k + 1,) [Hz], while the machine is busy.
+def _octave_edges(count: int) -> Array:
+    """Return the limits (`count` + 1,) of the octaves [Hz]."""
+    edges: Array = CHANGES.octaves.lowest * np.exp2(np.arange(count + 1.0))
+    return edges
 
-    `values` (n,): samples at `rate` [Hz]. The spectra are those of half-overlapping windows of `length` samples. A
-    high quantile over the windows is taken in each octave (`octaves.busy` in `priors.toml`), to which neither rests
-    nor a single shock contribute. Single wrong samples are removed by a median of three.
+
+def _window_spectra(values: Array, length: int) -> NDArray[np.complex128]:
+    """Compute the spectra of a signal in half-overlapping Hann windows of `length` samples, (windows, lines).
+
+    Single wrong samples are removed by a median of three.
     """
     from scipy.ndimage import median_filter
 
-    values = median_filter(values, GLITCH, mode="nearest")
-    frequencies, taper = np.fft.rfftfreq(length, 1.0 / rate), np.hanning(length)
-    octave = np.searchsorted(edges, frequencies, side="right") - 1
-    powers = []
-    for start in range(0, len(values) - length + 1, max(length // 2, 1)):
-        window = values[start : start + length]
-        power = np.abs(np.fft.rfft((window - window.mean()) * taper)) ** 2
-        powers.append([power[octave == k].sum() for k in range(len(edges) - 1)])
-    return np.asarray(0.5 * np.log(np.quantile(powers, CHANGES.octaves.busy, axis=0) + MIN_POWER))
+    smoothed = median_filter(values, GLITCH, mode="nearest")
+    windows = np.lib.stride_tricks.sliding_window_view(smoothed, length)[:: max(length // 2, 1)]
+    taper = np.hanning(length)
+    return np.stack([np.fft.rfft((window - window.mean()) * taper) for window in windows])
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    A filter changes ratio and tilt of the spectra in the same direction; otherwise the chance is 1. A tilt smaller
-    than filters usually cause lowers the observable's advantage. Return None for too few healthy recordings.
+    The observable is named after the pressure that is more probably filtered; its size is the most probable cut-off
+    frequency [Hz]. Healthy recordings with fewer octaves than the judged one are left out. Return None for too few
+    healthy recordings.
     """
-    prior, filtered = CHANGES.octaves, CHANGES.filtered
-
-    def compare(values: Sequence[float], value: float) -> Observable | None:
-        """Test if the judged ratio or tilt `value` differs from the healthy `values`; None if these are too few."""
-        estimates = [Estimate(healthy_value, prior.error) for healthy_value in values]
-        scatter = PriorScatter(prior.scatter, prior.recordings)
-        return compare_estimates(BESIDE, SIDES, Estimate(value, prior.error), estimates, scatter)
-
-    ratio = compare([octaves.ratio for octaves in healthy], judged.ratio)
-    tilt = compare([octaves.tilt for octaves in healthy], judged.tilt)
-    if ratio is None or tilt is None:
+    count = len(judged.log_A)
+    known = [Octaves(*(values[:count] for values in octaves)) for octaves in healthy if len(octaves.log_A) >= count]
+    if len(known) < MIN_HEALTHY:
         return None
-    weaker = max(ratio, tilt, key=lambda test: test.chance)
-    if ratio.size * tilt.size <= 0.0:
-        return replace(weaker, score=0.0, chance=1.0)
-    deviations = np.log(max(abs(tilt.size), prior.error) / filtered.size) / filtered.spread
-    return replace(weaker, size=tilt.size, advantage=-float(min(deviations, 0.0) ** 2))
+    from scipy.special import logsumexp
+
+    filters = _filter_effects(known)
+    log_ratios = _ratio_log_likelihoods(judged, known, filters) + _phase_log_likelihoods(judged, known, filters)
+    log_ratios = log_ratios[1:] - log_ratios[0]  # the first hypothesis is no filter
+    log_factor = float(logsumexp(log_ratios) - np.log(len(log_ratios)))
+    if not np.isfinite(log_factor):
+        return None
+    best = int(np.argmax(log_ratios)) + 1
+    return Observable(
+        name=FILTERED[CHAMBERS[filters.side[best]]],
+        data=SIDES,
+        score=max(2.0 * log_factor, 0.0),
+        chance=float(np.exp(-max(log_factor, 0.0))),
+        size=float(filters.cutoff[best]),
+    )
+
+
+class _Filters(NamedTuple):
+    """Effects of m filters on k octaves; the first "filter" is none.
+
+    `log_ratio`, `phase` (m, k): changes of log abs(A / B) and of the phase of A B* [rad]; `side` (m,): 0 for a filter
+    of p_A, 1 for p_B; `cutoff` (m,): cut-off frequency [Hz].
+    """
+
+    log_ratio: Array
+    phase: Array
+    side: Array
+    cutoff: Array
+
+
+def _filter_effects(healthy: Sequence[Octaves]) -> _Filters:
+    """Compute how filters change the spectra of healthy recordings, for all sides, cut-off frequencies and noises.
+
+    The sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of that of
+    the octave with the least power per frequency.
+    """
+    from itertools import product
+
+    priors, edges = CHANGES.filtered, _octave_edges(len(healthy[0].log_A))
+    frequencies, widths = np.sqrt(edges[:-1] * edges[1:]), np.diff(edges)
+    none = np.zeros_like(frequencies)
+    log_ratios, phases, sides, cutoffs = [none], [none], [0], [np.inf]
+    grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
+    for side, noise_fraction, cutoff in product(range(len(CHAMBERS)), priors.noises, grid):
+        power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)
+        noise = noise_fraction * float(np.min(power / widths)) * widths
+        filtered_power = (power - noise) / (1.0 + (frequencies / cutoff) ** 2) + noise
+        sign = 1.0 if side == 0 else -1.0
+        log_ratios.append(sign * 0.5 * np.log(filtered_power / power))
+        phases.append(-sign * np.arctan(frequencies / cutoff))
+        sides.append(side)
+        cutoffs.append(cutoff)
+    return _Filters(np.stack(log_ratios), np.stack(phases), np.array(sides), np.array(cutoffs))
+
+
+def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
+    """Compute the log likelihood (m,) of the judged log ratios of p_A to p_B for each filter, up to a constant.
+
+    The ratios follow a multivariate t distribution about the mean of the healthy recordings.
+    """
+    prior = CHANGES.octaves
+    ratios = np.array([octaves.log_A - octaves.log_B for octaves in healthy])
+    count, freedom, octave = len(ratios), prior.recordings + len(ratios) - 1.0, np.arange(ratios.shape[1])
+    mean = ratios.mean(axis=0)
+    squares = ((ratios - mean) ** 2).sum(axis=0)
+    deviations = np.sqrt((prior.recordings * prior.scatter**2 + squares) / freedom)
+    correlations = np.exp(-np.abs(np.subtract.outer(octave, octave)) / prior.neighbours)
+    scale = np.outer(deviations, deviations) * correlations * (1.0 + 1.0 / count) + prior.error**2 * np.eye(len(mean))
+    changes = judged.log_A - judged.log_B - mean - filters.log_ratio
+    whitened = np.linalg.solve(np.linalg.cholesky(scale), changes.T)
+    log_likelihoods: Array = -0.5 * (freedom + len(mean)) * np.log1p((whitened**2).sum(axis=0) / freedom)
+    return log_likelihoods
+
+
+def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
+    """Compute the log likelihood (m,) of the judged phases between p_A and p_B for each filter.
+
+    The phase of each octave follows a von Mises distribution about the mean direction of the healthy recordings, or
+    is uniform with a small probability.
+    """
+    from scipy.special import i0e
+
+    prior, count = CHANGES.phases, len(healthy)
+    directions = np.exp(1j * np.array([octaves.phase for octaves in healthy]))
+    precisions = 1.0 / (prior.scatter**2 + np.array([octaves.phase_variance for octaves in healthy]))
+    mean = np.angle((precisions * directions).sum(axis=0))
+    squares = (np.angle(directions * np.exp(-1j * mean)) ** 2).sum(axis=0)
+    variances = (prior.recordings * prior.scatter**2 + squares) / (prior.recordings + count - 1.0)
+    variances = variances * (1.0 + 1.0 / count) + judged.phase_variance
+    changes = judged.phase - mean - filters.phase
+    is_filtered = np.any(filters.phase != 0.0, axis=1)[:, None]
+    concentrations = 1.0 / (variances + np.where(is_filtered, prior.error**2, 0.0))
+    densities = np.exp(concentrations * (np.cos(changes) - 1.0)) / i0e(concentrations)
+    log_likelihoods: Array = np.log((1.0 - prior.uniform) * densities + prior.uniform).sum(axis=1)
+    return log_likelihoods
