@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.observable import Flow
-from sealscope.diagnosis.inference.onset import EDGE, PARTS, Information, StepTest, step_shapes, step_sizes
+from sealscope.diagnosis.inference.onset import EDGE, PARTS, Information, StepTest, step_shapes, step_sizes, step_test
 from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -70,6 +70,24 @@ def law_priors() -> Array:
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
     return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
+
+
+def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
+    """Test for a leak that begins within a recording, under each law of its flow.
+
+    The test of the law with the smallest chance is returned. Each law has the share of the false-alarm probability
+    that its prior gives it. The step's size is the mean change of the conductance. `columns`: roles of the columns
+    (leak, motion, left side) in each equation; `leak`: likelihood of the leak's coefficient in the blocks. Return
+    None if too few blocks have information.
+    """
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)
+    tests = []
+    for shape, prior in zip(law_shapes(blocks, columns).values(), law_priors(), strict=True):
+        mean = float(weights @ shape) / max(float(weights.sum()), _TINY)
+        test = step_test(leak, shape=shape / max(mean, _TINY))
+        if test is not None:
+            tests.append(test.share_alarms(float(prior)))
+    return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
 def _growth_priors() -> list[tuple[float, float]]:

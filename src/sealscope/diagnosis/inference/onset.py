@@ -43,7 +43,7 @@ D. D. Boos, J. Am. Statist. Assoc. 89 (1994) 1012 (supremum over a confidence se
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -160,6 +160,10 @@ class StepTest:
         """Compute the upper bound of the step's size: its quantile at `probability`, given that the size is > 0."""
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
+    def share_alarms(self, share: float) -> StepTest:
+        """Return the test as one of several whose best counts, with a `share` of the false-alarm probability."""
+        return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
+
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
         """Compute the size of a step that is detected with probability `power` at a false-alarm probability `chance`.
 
@@ -262,25 +266,27 @@ class NullLaw(NamedTuple):
     """Distribution of the score of a step test in a healthy machine, i.e. without a step.
 
     `dimensions`: degrees of freedom m; `length`: length L of the curve that the whitened steps over all onsets form
-    on the unit sphere (see the module).
+    on the unit sphere (see the module); `share`: fraction of the false-alarm probability that is this test's, if the
+    best of several tests counts.
     """
 
     dimensions: float
     length: float
+    share: float = 1.0
 
     def chance(self, score: float) -> float:
         """Compute the probability P that a coefficient without a step has a higher score.
 
         P is the fraction of the unit sphere in m dimensions that lies within a tube about a curve, with a radius that
         follows from the score. The curve consists of the whitened steps at all onsets (see the module for the
-        formula).
+        formula). If the test shares a false-alarm probability with others, P is divided by its share (Bonferroni).
         """
         from scipy.special import betainc
 
         m = self.dimensions
         sine_squared = float(np.exp(-max(score, 0.0) / m))  # 1 - c^2 of the module
         tube = self.length / (2.0 * np.pi) * float(sine_squared ** (0.5 * (m - 2)))
-        return min(1.0, 0.5 * float(betainc(0.5 * (m - 1), 0.5, sine_squared)) + tube)
+        return min(1.0, (0.5 * float(betainc(0.5 * (m - 1), 0.5, sine_squared)) + tube) / self.share)
 
 
 def step_test(information: Information, signs: Sequence[float] = (1.0,), shape: Array | None = None) -> StepTest | None:

@@ -29,6 +29,7 @@ from sealscope.diagnosis.inference.circuit.locked_holds import (
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.differences import Estimate
+from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
     MIN_BLOCKS,
@@ -138,7 +139,7 @@ class RecordedBalance:
     @cached_property
     def test(self) -> StepTest | None:
         """Test for a leak that begins within the recording; None if too few blocks have information."""
-        return step_test(self.leak)
+        return find_leak_step(self.running_blocks, self.columns, self.leak)
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
