@@ -51,7 +51,7 @@ def pytest_collection() -> Iterator[None]:
         return (yield)
     finally:
         gc.freeze()
-        gc.set_threshold(5_000)  # of the arrays and texts that a test makes hardly any is in a circle
+        gc.set_threshold(50_000)  # of the arrays and texts that a test makes hardly any is in a circle
         gc.enable()
 
 

@@ -42,13 +42,19 @@ count = 3
 
 @contextmanager
 def room(size: int) -> Iterator[None]:
-    """Let no file of this process become longer than `size` bytes: a write beyond fails as it does on a full disk."""
+    """Let no file of this process become longer than `size` bytes: a write beyond fails as it does on a full disk.
+
+    Python would cut the compiled code of a module that it imports meanwhile, and later processes would load it.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)
+        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # of processes that start meanwhile
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("size", [2000, 5000, 60_000])
@@ -63,7 +69,7 @@ def test_a_recording_is_whole_or_absent(size: int, suffix: str, shell, call, rec
     if suffix == "nc" and size == 5000:
         limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size}))"
         code = f"{limit}; import sys, sealscope.cli; sys.argv[0] = 'sealscope'; sealscope.cli.main()"
-        done = shell(sys.executable, "-c", code, *words)
+        done = shell(sys.executable, "-c", code, *words, PYTHONDONTWRITEBYTECODE="1")
     else:
         with room(size):
             done = call(*words)

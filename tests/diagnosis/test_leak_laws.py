@@ -17,8 +17,19 @@ ONSET = 36.3
 
 
 @pytest.mark.parametrize("command", ["3 sin(4t)", pytest.param("5 sin(2t)", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("lpm", [0.0042, pytest.param(0.015, marks=[pytest.mark.slow, pytest.mark.long]), 0.1])
-@pytest.mark.parametrize("law", ["laminar", "orifice"])
+@pytest.mark.parametrize(
+    ("law", "lpm"),
+    few(
+        [
+            ("laminar", 0.0042),
+            ("orifice", 0.1),
+            ("laminar", 0.1),
+            ("orifice", 0.0042),
+            ("laminar", 0.015),
+            ("orifice", 0.015),
+        ]
+    ),
+)
 def test_mean_flow_and_onset(law: str, lpm: float, command: str) -> None:
     """The interval holds the true mean flow, which is stated within 6 %, and the onset is within half a block.
 

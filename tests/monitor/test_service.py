@@ -171,9 +171,9 @@ def test_a_file_that_is_being_written_is_waited_for(tmp_path):
     assert settings.settle_s == 0.4
 
 
-def test_the_oil_s_temperature_stands_beside_the_estimates(tmp_path):
+def test_the_oil_s_temperature_stands_beside_the_estimates(taken):
     """The last one that was told, until the next; nothing where none is."""
-    service, _ = served(settings_in(tmp_path), LINES)
+    service, _ = served(taken)
     rows = list(service.store.estimates())
     oil = [row["oil_celsius"] for row in rows if row["actuator"] == "press 2"]
     assert {round(value, 9) for value in oil} == {40.0, 41.0, 42.0, 43.0, 44.0}
@@ -185,9 +185,8 @@ def test_the_oil_s_temperature_stands_beside_the_estimates(tmp_path):
     assert [row["oil_celsius"] for row in service.store.history("press 2")] == pytest.approx(oil)
 
 
-def test_marks_are_kept_and_act(tmp_path):
-    settings = settings_in(tmp_path)
-    service, _ = served(settings, LINES)
+def test_marks_are_kept_and_act(taken):
+    service, _ = served(taken)
     with refusal("acknowledged", "none"):
         service.actuators.apply_mark("press 2", "acknowledged")
     assert service.actuators.apply_mark("press 1", "acknowledged", by_whom="Ada").state == "acknowledged"
@@ -196,7 +195,7 @@ def test_marks_are_kept_and_act(tmp_path):
     service.actuators.apply_mark("press 1", "comment", text="<b>seal ordered</b>")
     assert service.actuators.apply_mark("press 1", "shelved", hours=2.0).shelved_until_s > 7200.0
     assert service.actuators.apply_mark("press 1", "repaired").state == "closed"
-    again = Service(settings, once=True)
+    again = Service(taken, once=True)
     again.close()
     assert again.actuators.summaries()["press 1"]["alarm"] is None
     kinds = [event["event"] for _, event in again.store.events_since(0)]
@@ -205,30 +204,27 @@ def test_marks_are_kept_and_act(tmp_path):
     assert after["watch"]["baseline_version"] == 2
 
 
-def test_a_state_of_another_version_begins_a_new_baseline(tmp_path, caplog):
+def test_a_state_of_another_version_begins_a_new_baseline(taken, caplog):
     """After an update estimates stay, their numbers go on, and the log says why the actuator learns anew."""
-    settings = settings_in(tmp_path)
-    service, _ = served(settings, LINES)
-    before = [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"]
+    service, _ = served(taken)
+    before = [row for row in rows_of(taken.database)["estimates"] if row[0] == "press 1"]
     learned_with, state, _ = service.store.checkpoint("press 1")
     state["watch"] = {"version": 1, "baseline_version": 3, "what it was": []}
     rows = StoredRows()
     rows.add_checkpoint("press 1", learned_with, state)
     with service.store.writing() as connection:
         service.store.write_rows(connection, rows)
-    again = Service(settings, once=True)
+    again = Service(taken, once=True)
     again.close()
     assert f"press 1: its state has version 1, not {STATE_VERSION}, begins anew" in caplog.text
     _, state, pending = again.store.checkpoint("press 1")
     assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (STATE_VERSION, 4, [])
     assert state["watch"]["blocks"] == max(row[1] for row in before)
-    assert [row for row in rows_of(settings.database)["estimates"] if row[0] == "press 1"] == before
+    assert [row for row in rows_of(taken.database)["estimates"] if row[0] == "press 1"] == before
 
 
 @pytest.mark.slow
-def test_other_settings_begin_a_new_baseline(tmp_path):
-    settings = settings_in(tmp_path)
-    served(settings, LINES)
+def test_other_settings_begin_a_new_baseline(taken, tmp_path):
     file = tmp_path / "monitor.toml"
     file.write_text(file.read_text().replace("0.02", "0.03"))
     service, _ = served(read_settings(file))

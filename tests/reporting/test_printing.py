@@ -175,9 +175,12 @@ def test_what_a_full_disk_cuts_off_replaces_nothing(kind: str, tmp_path: Path, m
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
 @pytest.mark.parametrize(("kind", "sizes"), [("pdf", (4_000, 12_000, 20_000)), ("png", (12_000,))])
-def test_a_browser_on_a_full_disk(kind: str, sizes: tuple[int, ...], tmp_path: Path, recording, make_diagnosis) -> None:
+def test_a_browser_on_a_full_disk(
+    kind: str, sizes: tuple[int, ...], tmp_path: Path, recording, make_diagnosis, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No file may become longer than `size` bytes, here or in the browser."""
     resource = pytest.importorskip("resource")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # compiled code of a module would be cut, and loaded later
     target, before = tmp_path / f"page.{kind}", resource.getrlimit(resource.RLIMIT_FSIZE)
     for size in sizes:
         target.write_text("what was there before")

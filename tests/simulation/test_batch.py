@@ -175,10 +175,11 @@ def test_oil_boils_side_by_side_as_it_does_by_itself(check_rig, rms_of):
     np.testing.assert_allclose(simulate_batch([one], bounds=bounds).rms[0], rms_of(alone.recording, bounds), rtol=1e-6)
 
 
-def test_neither_order_nor_number_nor_threads_change_a_run(check_rig):
+@pytest.mark.parametrize("volumes", ["fixed", pytest.param("position", marks=pytest.mark.slow)])  # of throttled rigs
+def test_neither_order_nor_number_nor_threads_change_a_run(check_rig, volumes):
     experiments = [
         Experiment.of(
-            rig=check_rig(k % 3 == 0, volumes="fixed" if k % 3 else "position"),  # as compiled for the runs above
+            rig=check_rig(k % 3 == 0, volumes="fixed" if k % 3 else volumes),
             command=f"{2 + k % 2} sin({3 + k % 2}t)",
             duration=6.0,
             seed=k,
