@@ -82,3 +82,15 @@ def test_a_vague_value_shows_less_than_a_precise_one() -> None:
     assert excess_error(0.5, (0.3, 0.3, 9.0)) == pytest.approx(0.4)
     assert excess_error(0.2, (0.3, 0.3)) == 0.0
     assert excess_error(0.2, ()) == 0.2
+
+
+def test_days_that_differ_by_more_than_their_errors_make_an_imprecise_day_unremarkable() -> None:
+    """Errors ten times too small: a day of few strokes, whose error is five times the others', differs by five."""
+    healthy = [Estimate(10.0 * value, 1.0) for value in HEALTHY]
+    judged, prior = Estimate(60.0, 5.0), PriorScatter(1.0, 1.0)
+    believed = compare_estimates("a", "b", judged, healthy, prior)
+    doubted = compare_estimates("a", "b", judged, healthy, prior._replace(inflation=30.0))
+    precise = compare_estimates("a", "b", Estimate(60.0, 1.0), healthy, prior._replace(inflation=30.0))
+    assert believed is not None and doubted is not None and precise is not None
+    assert doubted.chance > 30.0 * believed.chance
+    assert precise.chance < 0.01

@@ -9,12 +9,13 @@ Student's t with n - 1 degrees of freedom,
 Five values that agree to a thousandth thus show that a sixth differs by a few thousandths; two show next to nothing.
 
 *With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean
-mu by the scatter s, y_i ~ N(mu, s^2 + e_i^2). s^2 has a scaled inverse chi-square prior, with the weight of m
-recordings whose scatter is s_0. On a grid of s, with the weights w_i = 1/(s^2 + e_i^2) and W = sum w_i,
+mu by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
+recordings whose scatter is s_0. k >= 1, by which the errors are too small, is 1 or has a log-uniform prior: a day of
+few strokes then differs by more. On a grid of s and k, with the weights w_i = 1/(s^2 + (k e_i)^2) and W = sum w_i,
 
-    p(s | y) ~ p(s) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
+    p(s, k | y) ~ p(s) p(k) W^(-1/2) prod_i w_i^(1/2) exp(-w_i (y_i - mean)^2 / 2),    mean = sum w_i y_i / W,
 
-and the next value is a mixture of N(mean, s^2 + e^2 + 1/W).
+and the next value is a mixture of N(mean, s^2 + (k e)^2 + 1/W).
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 3.3 and 5.4.
 """
@@ -34,6 +35,8 @@ MIN_HEALTHY = 3
 #: Number of grid points of the scatter, and the largest factor between it and the prior's, up or down. The grid also
 #: reaches a multiple of the standard deviation of the healthy values.
 NODES, MAX_RATIO, MAX_RATIO_TO_VALUES = 64, 100.0, 10.0
+#: Number of grid points of the factor by which errors are too small.
+INFLATIONS = 9
 #: Smallest positive number that is divided by.
 TINY = float(np.finfo(float).tiny)
 
@@ -49,11 +52,13 @@ class PriorScatter(NamedTuple):
     """Prior on the scatter of a number between recordings of one machine.
 
     `deviation`: expected standard deviation of the number; `recordings`: number of recordings that would tell as much
-    about the scatter as this prior.
+    about the scatter as this prior; `inflation`: largest factor by which the standard errors may be too small, the
+    same for all recordings.
     """
 
     deviation: float
     recordings: float
+    inflation: float = 1.0
 
 
 def compare_with_healthy(
@@ -121,6 +126,7 @@ def compare_estimates(
     prior: PriorScatter,
     *,
     above: bool = False,
+    further_deviation: float = 0.0,
 ) -> Observable | None:
     """Test an estimate for a difference from those of healthy recordings, each with a known standard error.
 
@@ -136,6 +142,8 @@ def compare_estimates(
         Prior on the scatter between recordings.
     above : bool
         Count only an estimate above the healthy ones.
+    further_deviation : float
+        Standard deviation of the judged estimate from further causes, such as an unusual load.
 
     Returns
     -------
@@ -150,8 +158,10 @@ def compare_estimates(
     values, errors = np.array(healthy, dtype=float).T
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
+    inflations = np.geomspace(1.0, prior.inflation, INFLATIONS) if prior.inflation > 1.0 else np.ones(1)
+    ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios
-    weights = 1.0 / (scatter[:, None] ** 2 + errors**2)
+    weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)
     precision = weights.sum(axis=1)
     means = weights @ values / precision
     squares = (weights * (values - means[:, None]) ** 2).sum(axis=1)
@@ -160,7 +170,7 @@ def compare_estimates(
     log_posterior += 0.5 * (np.log(weights).sum(axis=1) - np.log(precision) - squares)
     posterior = np.exp(log_posterior - log_posterior.max())
     posterior /= posterior.sum()
-    variances = scatter**2 + judged.deviation**2 + 1.0 / precision
+    variances = scatter**2 + (inflations * judged.deviation) ** 2 + further_deviation**2 + 1.0 / precision
     z = (judged.value - means) / np.sqrt(variances)
     chance = float(posterior @ (ndtr(-z) if above else 2.0 * ndtr(-np.abs(z))))
     change = judged.value - float(posterior @ means)

@@ -150,14 +150,14 @@ class SizePriors(PriorTable):
 class RepeatPriors(PriorTable):
     """Differences of the flow that the same motion needs on another day, as relative standard deviations.
 
-    - `error`: error within a recording.
     - `scatter`: scatter between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
+    - `inflation`: largest factor by which the standard errors of the recordings may be too small.
     """
 
-    error: float
     scatter: float
     recordings: float
+    inflation: float
 
 
 class GrowthPriors(PriorTable):

@@ -318,14 +318,17 @@ def compare_motion(
 
     def estimate(sums: RecordingSums) -> Estimate:
         """Estimate the log ratio of the flow of motion in a recording to that in the healthy ones."""
-        change, error = motion_change(sums.sums[0], healthy_sums, roles)
-        return Estimate(change, float(np.hypot(prior.error, error)))
+        return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
-    judged = estimate(judged_sums)
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
-    judged = judged._replace(deviation=float(np.hypot(judged.deviation, INFERENCE.conditions.motion * excess)))
-    scatter = PriorScatter(prior.scatter, prior.recordings)
-    observable = compare_estimates("motion", "motion", judged, [estimate(sums) for sums in healthy], scatter)
+    observable = compare_estimates(
+        "motion",
+        "motion",
+        estimate(judged_sums),
+        [estimate(sums) for sums in healthy],
+        PriorScatter(prior.scatter, prior.recordings, prior.inflation),
+        further_deviation=INFERENCE.conditions.motion * excess,
+    )
     yield from () if observable is None else (observable,)
 
 
