@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from sealscope.diagnosis.inference.leak_law import find_leak_step
+from sealscope.diagnosis.inference.onset import Information, step_test
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
@@ -122,3 +128,29 @@ def test_pressures_that_hardly_vary_leave_the_size_as_it_is() -> None:
     evidence = judge(VolumeBalance(load_rig("single-rod-eha")), result.recording)
     assert evidence.verdict == "leak"
     assert evidence.leak_lpm == pytest.approx(0.1, rel=0.03)
+
+
+def test_an_orifice_shows_by_the_law_of_its_flow_where_a_constant_conductance_hides_it() -> None:
+    """Pressures that differ by a factor of a hundred: an orifice's conductance does so by ten from block to block."""
+    rng = np.random.default_rng(3)
+    time, pressure = 3.0 * np.arange(60.0), np.exp(rng.uniform(np.log(1e5), np.log(1e7), 60))
+    root = pressure**-0.5
+    blocks = SimpleNamespace(gram=np.array([[[[1.0, r], [r, r * r]]] for r in root]))
+    columns = [SimpleNamespace(leak=0, names=("leak", ORIFICE))]
+    precision = pressure**2 / 1e12  # the flow is equally well known in each block
+    leak = 1.2e4 * root * (time > 90.0) / np.sqrt(precision.mean())
+    noise = rng.standard_normal(60) / np.sqrt(precision)
+    information = Information(time, np.diag(precision), precision * (leak + noise), slope=1.0, walk=1.0)
+    constant, best = step_test(information), find_leak_step(blocks, columns, information)
+    assert constant is not None and best is not None
+    assert best.chance < 1e-3 * constant.chance
+    assert best.onset().low <= 90.0 <= best.onset().high
+
+
+def test_each_law_has_a_share_of_the_false_alarms() -> None:
+    test = step_test(Information(3.0 * np.arange(40.0), np.eye(40), np.linspace(0.0, 3.0, 40), slope=1.0, walk=1.0))
+    assert test is not None
+    shared = test.share_alarms(0.25)
+    assert shared.chance == pytest.approx(min(1.0, 4.0 * test.chance))
+    assert shared.threshold(0.01) == pytest.approx(test.threshold(0.0025), rel=1e-6)
+    assert shared.score == test.score
