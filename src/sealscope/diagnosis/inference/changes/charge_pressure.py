@@ -78,7 +78,7 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     if len(recording) < MIN_SAMPLES or source not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return None
     regressors = _regressors(recording, source)
-    pressures = [_average(recording[name], recording.rate) for name in ("p_A", "p_B")]
+    pressures = [average_over(CHANGES.charge.seconds, recording[name], recording.rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p, LOWEST)) for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
@@ -139,14 +139,14 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     )
 
 
-def _average(values: Array, rate: float) -> Array:
-    """Average the known values (n,) over a fixed time around each sample, which removes the ripple of the pump.
+def average_over(seconds: float, values: Array, rate: float) -> Array:
+    """Average the known values (n,) over a time [s] around each sample, which removes noise and the pump's ripple.
 
-    The result is NaN where no value within that time is known.
+    `rate`: sampling rate [Hz]. The result is NaN where no value within that time is known.
     """
     from scipy.ndimage import uniform_filter1d
 
-    size, is_known = max(1, round(CHANGES.charge.seconds * rate)), np.isfinite(values)
+    size, is_known = max(1, round(seconds * rate)), np.isfinite(values)
     if is_known.all():
         return np.asarray(uniform_filter1d(values, size))
     fraction = uniform_filter1d(is_known.astype(float), size)
@@ -160,12 +160,12 @@ def _regressors(recording: Recording, source: str) -> Array:
     The flow is relative to its largest magnitude, the position to its mean. `source`: channel of the pump, "theta" or
     "omega".
     """
-    drive = _average(recording[source], recording.rate)
+    drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive
     flow = flow / max(float(np.nanmax(np.abs(flow))), TINY)
     columns = [np.maximum(flow, 0.0), np.minimum(flow, 0.0)]
     if "x" in recording:
-        position = _average(recording["x"], recording.rate)
+        position = average_over(CHANGES.charge.seconds, recording["x"], recording.rate)
         columns.append(position - np.nanmean(position))
     return np.column_stack(columns)
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
+from sealscope.diagnosis.inference.changes.charge_pressure import average_over
 from sealscope.diagnosis.inference.leak_law import mixture_flow
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import Interval
@@ -277,7 +278,7 @@ class HeldChambers:
                 oil[:, 3] = -volume * P_ATM * hold.mean(1.0 / p)
                 columns.append(oil - oil.mean(axis=0))
                 increments = -area * np.diff(hold.x, prepend=hold.x[0])
-                displaced = hold.mean(np.cumsum(increments * self._is_closed(p) if is_refilled else increments))
+                displaced = hold.mean(np.cumsum(increments * self._is_closed(hold, p) if is_refilled else increments))
                 volumes.append(displaced - displaced.mean())
         oil, dead_deviation = np.vstack(columns), prior.compressibility * prior.dead_deviation / prior.dead
         compressed = oil @ [prior.compressibility, 0.0, 0.0, prior.air]
@@ -290,9 +291,14 @@ class HeldChambers:
             min_variance=max(min_variance, float(np.finfo(float).tiny)),
         )
 
-    def _is_closed(self, p: Array) -> NDArray[np.bool_]:
-        """Flag the samples (n,) with a pressure above the charge pressure, where no check valve feeds the chamber."""
-        return np.asarray(p > self.charge * (1.0 + INFERENCE.held_oil.charge))
+    def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
+        """Flag the samples (n,) with a pressure above the charge pressure, where no check valve feeds the chamber.
+
+        `p` (n,): pressure of the chamber in the `hold` [Pa], which is averaged over a time to remove the noise.
+        """
+        prior = INFERENCE.held_oil
+        steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
+        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge))
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
         """Compute the flow during holds of a leak past the piston with a coefficient of 1.
@@ -309,8 +315,8 @@ class HeldChambers:
         The chamber is A if `is_A` is True, else B. The flow is its gauge pressure, or 0 while a check valve refills
         it.
         """
-        pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
-        flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(p) for p in pressures]
+        pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
+        flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:

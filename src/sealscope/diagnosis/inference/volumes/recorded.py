@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.blocks import (
     offset_cost,
     solve,
 )
-from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
+from sealscope.diagnosis.inference.changes.charge_pressure import average_over, estimate_charge_trend
 from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.locked_holds import (
@@ -183,7 +183,9 @@ class RecordedBalance:
         pumped = balance.left(Signals(dict(recording.channels), recording.rate, {}))
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
-        charge = float(np.nanquantile(lower_pressure, END_QUANTILE))
+        # at rest: the flow of a moving piston drops pressure in the lines and check valves that feed a chamber
+        steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, recording.rate)
+        charge = float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, END_QUANTILE))
         # from gauge to absolute pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
