@@ -34,11 +34,13 @@ def held_press(
     zero: float = 0.0,
     gain: float = 1.0,
     loads: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0),
+    noise_level: float = 3e3,
 ) -> HeldChambers:
     """Record four cycles of a press whose frame gives and whose valves shut for twelve seconds of each.
 
     A_A dx + V_A kappa dp_A = -q - e p_A and -A_B dx + V_B kappa dp_B = q, x as the frame gives; check valves keep both
-    chambers at the charge pressure at least. `gain` is that of the sensor of p_B, `loads` the load of each cycle.
+    chambers at the charge pressure at least. `gain` is that of the sensor of p_B, `loads` the load of each cycle,
+    `noise_level` the standard deviation of the sensors' noise [Pa].
     """
     random, count = np.random.default_rng(seed), round(4 * CYCLE * RATE)
     t = np.arange(count) / RATE
@@ -68,7 +70,8 @@ def held_press(
         p_A[k], p_B[k] = a, b
         x[k] = middle + (a * AREA_A - b * AREA_B) / FRAME
     noise = random.standard_normal((3, count))
-    channels = (t, p_A + zero + P_ATM + 3e3 * noise[0], gain * p_B + P_ATM + 3e3 * noise[1], x + 2e-6 * noise[2])
+    pressures = p_A + zero + P_ATM + noise_level * noise[0], gain * p_B + P_ATM + noise_level * noise[1]
+    channels = (t, *pressures, x + 2e-6 * noise[2])
     holds = find_locked_holds(channels, rests[1:], RATE)
     sides = CylinderSides(AREA_A, AREA_B, 0.05 * STROKE, float(x.max()))
     return HeldChambers(holds, sides, float(t[0]), float(t[-1]), CHARGE + P_ATM)
@@ -93,9 +96,13 @@ def test_the_piston_takes_from_one_side_what_it_brings_to_the_other(size: float,
         assert chambers.piston_fit.offset == pytest.approx(zero, abs=6e4)
 
 
-def test_a_rod_seal_takes_from_one_side_alone() -> None:
-    """Side B stays at the charge pressure: a check valve feeds it as the piston gives way."""
-    leaks = held_press(outside=SEAL).leaks
+@pytest.mark.parametrize("noise_level", [3e3, 1e5])
+def test_a_rod_seal_takes_from_one_side_alone(noise_level: float) -> None:
+    """Side B stays at the charge pressure: a check valve feeds it as the piston gives way, whatever a sample's noise.
+
+    The leak passed for the piston's where the noise of a sample is as large as the margin above the charge pressure.
+    """
+    leaks = held_press(outside=SEAL, noise_level=noise_level).leaks
     assert leaks.outside_A == pytest.approx(SEAL, rel=0.35)
     assert max(leaks.piston, leaks.outside_B) < 0.05 * SEAL
 
