@@ -10,6 +10,7 @@ import pytest
 from sealscope.diagnosis.inference.circuit.locked_holds import (
     CylinderSides,
     HeldChambers,
+    find_charge_pressure,
     find_locked_holds,
 )
 from sealscope.recordings.recording import Array
@@ -74,7 +75,8 @@ def held_press(
     channels = (t, *pressures, x + 2e-6 * noise[2])
     holds = find_locked_holds(channels, rests[1:], RATE)
     sides = CylinderSides(AREA_A, AREA_B, 0.05 * STROKE, float(x.max()))
-    return HeldChambers(holds, sides, float(t[0]), float(t[-1]), CHARGE + P_ATM)
+    charge = find_charge_pressure(np.minimum(*pressures), rests[1:], RATE)
+    return HeldChambers(holds, sides, float(t[0]), float(t[-1]), charge)
 
 
 def test_a_hold_of_twelve_seconds_sees_no_leak_where_there_is_none() -> None:

@@ -49,6 +49,8 @@ N_ONSETS = 4
 UNKNOWN = 1e30
 #: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a matrix.
 MAX_ITERATIONS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
+#: Quantile of the lower chamber pressure that counts as charge pressure.
+LOWEST = 0.02
 #: Probability outside of the interval of an onset.
 TAIL = 0.05
 
@@ -108,6 +110,17 @@ class LockedHold(NamedTuple):
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.p_A - self.p_B
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
+
+
+def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
+    """Find the pressure that check valves maintain in a chamber without load: the lowest one while the pump rests.
+
+    A moving piston draws oil through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower of
+    the chamber pressures, averaged to remove noise; `rests` (n - 1,): flags of the sampling intervals in which the
+    pump rests, all of them if none does; `rate`: sampling rate [Hz].
+    """
+    steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
+    return float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, LOWEST))
 
 
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:

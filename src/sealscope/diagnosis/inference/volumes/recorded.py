@@ -19,13 +19,14 @@ from sealscope.diagnosis.inference.blocks import (
     offset_cost,
     solve,
 )
-from sealscope.diagnosis.inference.changes.charge_pressure import average_over, estimate_charge_trend
+from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
 from sealscope.diagnosis.inference.changes.viscous_drop import estimate_viscous_drop
 from sealscope.diagnosis.inference.changes.volumes import volume_observables
 from sealscope.diagnosis.inference.circuit.locked_holds import (
     CylinderSides,
     HeldChambers,
     LockedHold,
+    find_charge_pressure,
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.differences import Estimate
@@ -64,7 +65,7 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Quantile of the lower chamber pressure that counts as charge pressure, and of the position at an end of the stroke.
+#: Quantile of the position that counts as an end of the stroke, and of the load that counts as the largest.
 END_QUANTILE = 0.02
 
 
@@ -183,9 +184,7 @@ class RecordedBalance:
         pumped = balance.left(Signals(dict(recording.channels), recording.rate, {}))
         rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
-        # at rest: the flow of a moving piston drops pressure in the lines and check valves that feed a chamber
-        steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, recording.rate)
-        charge = float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, END_QUANTILE))
+        charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # from gauge to absolute pressure; larger if sensor offsets would make the least pressure too low
         to_absolute = max(P_ATM, MIN_ABSOLUTE_PRESSURE - float(np.nanmin(lower_pressure)))
         channels = (recording.t, *(values + to_absolute for values in pressures.values()), recording["x"])
