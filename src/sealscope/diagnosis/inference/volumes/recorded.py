@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -232,11 +232,12 @@ class RecordedBalance:
         """Compute the log odds that valves really shut off the chambers in holds; None without holds.
 
         The leaks in holds are compared with the total leakage: through open valves the resting pump would leak as
-        much as the turning one. The odds are limited by `rest.most` of `priors.toml`.
+        much as the turning one. Check valves that refill a chamber would hide what leaves it, so they are left out.
+        The odds are limited by `rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
-        leaks, total_leak = self.chambers.leaks, self.conductance
+        leaks, total_leak = replace(self.chambers, charge=0.0).leaks, self.conductance
         values = np.array([leaks.piston, leaks.outside_A, leaks.outside_B])
         deviations = np.array([leaks.deviation, leaks.deviation_A, leaks.deviation_B])
         variance = float((deviations[values > 0.0] ** 2).sum()) if values.any() else leaks.deviation**2
