@@ -72,7 +72,7 @@ class Diagnosis(Evidence):
     >>> import sealscope as ss
     >>> diagnosis = ss.diagnose(ss.simulate(leak="0.05 L/min from 30 s", duration="60 s", seed=1))
     >>> diagnosis
-    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05077, score=169.3, threshold=15.47)
+    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05077, score=177.1, threshold=18.86)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
     ('piston or pump leak', '80 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.abstains]

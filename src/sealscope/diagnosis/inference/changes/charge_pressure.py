@@ -30,6 +30,7 @@ from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
 #: `Observable.data` of all drifts, rival descriptions of one another; names of those of low pressures.
@@ -137,21 +138,6 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     return ChargeTrend(
         fall.value, fall.deviation, max(lowest, 0.0) + P_ATM, float(recording.t[0]), float(recording.t[-1])
     )
-
-
-def average_over(seconds: float, values: Array, rate: float) -> Array:
-    """Average the known values (n,) over a time [s] around each sample, which removes noise and the pump's ripple.
-
-    `rate`: sampling rate [Hz]. The result is NaN where no value within that time is known.
-    """
-    from scipy.ndimage import uniform_filter1d
-
-    size, is_known = max(1, round(seconds * rate)), np.isfinite(values)
-    if is_known.all():
-        return np.asarray(uniform_filter1d(values, size))
-    fraction = uniform_filter1d(is_known.astype(float), size)
-    average = uniform_filter1d(np.where(is_known, values, 0.0), size)
-    return np.where(fraction * size > 0.5, average / np.maximum(fraction, TINY), np.nan)
 
 
 def _regressors(recording: Recording, source: str) -> Array:

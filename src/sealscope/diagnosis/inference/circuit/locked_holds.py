@@ -27,13 +27,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.changes.charge_pressure import average_over
 from sealscope.diagnosis.inference.leak_law import mixture_flow
 from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
 #: Length of a hold's first reading [s], ratio of each length to the one before, minimum number of readings.
