@@ -94,15 +94,14 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        It is averaged over the laws, growths and onsets of the leak. Without a step test it is 0 with an infinite
-        standard error.
+        It is averaged over the laws, growths and onsets of the leak, and mixed with the flow that holds show. Without
+        a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
             return Flow(0.0, np.inf)
-        return self._add_law_uncertainty(
-            estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
-        )
+        flow = estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
+        return self._add_law_uncertainty(self._mix_with_holds(flow))
 
     @property
     def flow_per_conductance(self) -> float:
@@ -169,11 +168,18 @@ class BalanceLeak:
             self._rise_laws(),
             balance.blocks.moving_flow,
         )
+        return self._add_law_uncertainty(self._mix_with_holds(flow))
+
+    def _mix_with_holds(self, flow: Flow) -> Flow:
+        """Mix the flow of a leak over the whole recording with the one that holds of the load show, if they show any.
+
+        Where the two disagree, holds are right with the probability `held_oil.right` of `priors.toml`.
+        """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
-        if hold_rise is not None and hold_rise.chance < prior.rare:  # holds may be wrong: mix both estimates
-            flows = flow, self._hold_flow(hold_rise)
-            flow = mixture_flow(np.array([1.0 - prior.right, prior.right]), *np.array(flows).T)
-        return self._add_law_uncertainty(flow)
+        if hold_rise is None or not hold_rise.chance < prior.rare:
+            return flow
+        flows = flow, self._hold_flow(hold_rise)
+        return mixture_flow(np.array([1.0 - prior.right, prior.right]), *np.array(flows).T)
 
     @property
     def rise_onset(self) -> Interval | None:
