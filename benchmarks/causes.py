@@ -25,14 +25,14 @@ from sealscope.simulation.simulate import simulate_experiment
 
 PLANS = ("bench-detectors", "bench-closed-loop-development", "bench-single-rod-development", "bench-valve")
 VIEWS: dict[str, tuple[str, ...] | None] = {"all": None, "command": ("u", "p_A", "p_B")}
-LEAKS = ("piston leak", "piston or pump leak", "leak inside or outside")
+LEAKS = ("piston leak", "piston or pump leak", "internal or external leak")
 #: Fault -> causes that name it. The empty fault is a healthy machine.
 FAULTS: dict[str, tuple[str | None, ...]] = {
     "": (None,),
     "leak": LEAKS,
-    "pump leak x3": ("pump leak", "piston or pump leak", "leak inside or outside"),
-    "rod seal A 0.01 L/min": ("external leak", "leak inside or outside"),
-    "rod seal B 0.01 L/min": ("external leak", "leak inside or outside"),
+    "pump leak x3": ("pump leak", "piston or pump leak", "internal or external leak"),
+    "rod seal A 0.01 L/min": ("external leak", "internal or external leak"),
+    "rod seal B 0.01 L/min": ("external leak", "internal or external leak"),
     "friction +20 %": ("friction change",),
     "air 1 %": ("air in the oil",),
     "sensor p_A offset 5 psi": ("sensor fault",),

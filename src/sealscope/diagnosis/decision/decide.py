@@ -1,8 +1,9 @@
 """The decision on a recording: from the reports of detectors to a verdict.
 
-The verdict is `leak` if a test exceeds its threshold and leaks are the most probable explanation. The threshold
-follows from the false-alarm probability, and is calibrated by healthy recordings. Otherwise the verdict is `no leak`
-if the 95 % upper bound of a leak is small enough, and `cannot tell` if it is not, with the bound and the most
+The verdict is `leak` if the chance of a test is below its share of the false-alarm probability (`Case.alarms`), and
+leaks are more probable than all else that may explain the data of this test (`Case.leak_probability`). The chance is
+calibrated by healthy recordings; score and threshold are the same comparison, for display. Otherwise the verdict is
+`no leak` if the 95 % upper bound of a leak is small enough, and `cannot tell` if it is not, with the bound and the most
 probable other explanation. No other module states a verdict; `combination.combine` chooses among the decisions of
 several detectors.
 """

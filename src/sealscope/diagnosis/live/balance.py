@@ -395,7 +395,7 @@ def _split(blocks: Blocks) -> list[Blocks]:
 
 def _has_valve(rig: Rig) -> bool:
     """Test whether a servo valve feeds the cylinder."""
-    return bool(rig.valve.spool == "present")
+    return bool(rig.circuit.valve_controlled)
 
 
 def size_error(rig: Rig) -> float:

@@ -35,7 +35,7 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
     The volume balance reads the position. The pressure response needs no position, but works only for a cylinder with
     equal areas and without a servo valve.
     """
-    if rig.valve.spool == "present":
+    if rig.circuit.valve_controlled:
         return (("p_A", "p_B", "p_1", "p_2", "u", "x"),)
     balance_ways = tuple(("p_A", "p_B", "x", pump_channel) for pump_channel in ("theta", "omega"))
     return balance_ways if rig.cylinder.single_rod else (*balance_ways, ("p_A", "p_B", "u"))

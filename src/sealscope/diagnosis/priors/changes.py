@@ -44,15 +44,15 @@ class HealthyLevelPriors(PriorTable):
     """Friction of a recording and drift of its pressures, in the comparison with healthy recordings.
 
     - `slowest`: lowest speed that counts as motion, over the highest one.
-    - `friction`: standard error of the logarithm of a recording's friction.
-    - `scatter`: standard deviation of this logarithm between days.
+    - `friction_error`: standard error of the logarithm of a recording's friction.
+    - `friction_scatter`: standard deviation of this logarithm between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
     - `drift` [Pa]: standard deviation of the drift of a pressure sensor's zero within a recording.
     """
 
     slowest: float
-    friction: float
-    scatter: float
+    friction_error: float
+    friction_scatter: float
     recordings: float
     drift: float
 

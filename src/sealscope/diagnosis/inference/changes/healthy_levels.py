@@ -111,13 +111,13 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
 
     def log_friction(pressure: float, error: float) -> Estimate:
         """Compute the logarithm of a clearly positive friction [Pa], with its standard error."""
-        return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction, error / pressure)))
+        return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction_error, error / pressure)))
 
     clear = [log_friction(sign * pressure, error) for pressure, error in pressures if sign * pressure > error]
     pressure, error = sign * float(judged[keys[0]]), float(judged[keys[1]])
     if not pressure > error:
         return None
-    scatter = PriorScatter(prior.scatter, prior.recordings)
+    scatter = PriorScatter(prior.friction_scatter, prior.recordings)
     return compare_estimates(FRICTION, FRICTION, log_friction(pressure, error), clear, scatter, above=True)
 
 
