@@ -118,6 +118,17 @@ def test_spectra_need_three_octaves() -> None:
     assert compare_octaves(recording.only(["p_A", "x"])) is None
 
 
+def test_windows_with_missing_samples_say_nothing() -> None:
+    recording, holes = ring(seed=1), {name: values.copy() for name, values in ring(seed=1).channels.items()}
+    holes["p_A"][1000:1010] = np.nan
+    whole, holed = compare_octaves(recording), compare_octaves(replace(recording, channels=holes))
+    assert whole is not None and holed is not None
+    assert holed.log_A == pytest.approx(whole.log_A, abs=0.2)
+    assert np.cos(holed.phase - whole.phase)[:5] == pytest.approx(1.0, abs=0.01)
+    holes["p_A"][::100] = np.nan
+    assert compare_octaves(replace(recording, channels=holes)) is None
+
+
 @pytest.mark.parametrize("corner", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("channel", ["p_A", "p_B"])
 def test_a_filter_is_told_by_the_law_of_its_ratio_and_phase(channel: str, corner: float) -> None:

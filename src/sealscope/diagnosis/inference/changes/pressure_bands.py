@@ -72,21 +72,15 @@ def compare_octaves(recording: Recording) -> Octaves | None:
     n_octaves = int(np.log2(max(min(priors.highest, priors.share * recording.rate) / priors.lowest, 1.0)))
     if n_octaves < MIN_OCTAVES or len(recording) < length:
         return None
-    frequencies = np.fft.rfftfreq(length, 1.0 / recording.rate)
-    octave_of_line = np.searchsorted(_octave_edges(n_octaves), frequencies, side="right") - 1
-    octaves = [octave_of_line == k for k in range(n_octaves)]
-    spectra_A, spectra_B = (_window_spectra(recording[name], length) for name in CHAMBERS)
-    powers_A, powers_B, cross_powers = (
-        np.stack([products[:, lines].sum(axis=1) for lines in octaves], axis=1)
-        for products in (np.abs(spectra_A) ** 2, np.abs(spectra_B) ** 2, spectra_A * spectra_B.conj())
-    )
-    log_A, log_B = (
-        0.5 * np.log(np.quantile(powers, priors.busy, axis=0) + MIN_POWER) for powers in (powers_A, powers_B)
-    )
+    powers = _octave_powers(recording, length, _octave_edges(n_octaves))
+    if powers is None:
+        return None
+    powers_A, powers_B, cross_powers = powers
+    log_A, log_B = (0.5 * np.log(np.quantile(power, priors.busy, axis=0) + MIN_POWER) for power in (powers_A, powers_B))
     cross_power, total_power = cross_powers.sum(axis=0), np.sqrt(powers_A.sum(axis=0) * powers_B.sum(axis=0))
     coherence_squared = np.maximum(np.abs(cross_power) / (total_power + MIN_POWER), MIN_COHERENCE) ** 2
     # windows overlap by half, so that every second one is independent
-    phase_variance = (1.0 - coherence_squared) / coherence_squared / len(spectra_A)
+    phase_variance = (1.0 - coherence_squared) / coherence_squared / len(powers_A)
     octaves_found = Octaves(log_A, log_B, np.angle(cross_power), np.minimum(phase_variance, MAX_VARIANCE))
     return octaves_found if np.isfinite(octaves_found).all() else None
 
@@ -97,17 +91,31 @@ def _octave_edges(count: int) -> Array:
     return edges
 
 
-def _window_spectra(values: Array, length: int) -> NDArray[np.complex128]:
-    """Compute the spectra of a signal in half-overlapping Hann windows of `length` samples, (windows, lines).
+def _octave_powers(
+    recording: Recording, length: int, edges: Array
+) -> tuple[Array, Array, NDArray[np.complex128]] | None:
+    """Compute powers and cross-power of p_A and p_B in octaves, in half-overlapping Hann windows of `length` samples.
 
-    Single wrong samples are removed by a median of three.
+    `edges` (k + 1,): limits of the octaves [Hz]. Single wrong samples are removed by a median of three. The results
+    are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k) each. Windows with missing
+    samples are left out; None if all have some.
     """
     from scipy.ndimage import median_filter
 
-    smoothed = median_filter(values, GLITCH, mode="nearest")
-    windows = np.lib.stride_tricks.sliding_window_view(smoothed, length)[:: max(length // 2, 1)]
-    taper = np.hanning(length)
-    return np.stack([np.fft.rfft((window - window.mean()) * taper) for window in windows])
+    pressures = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in CHAMBERS])
+    first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
+    taper, powers = np.hanning(length), []
+    for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
+        window = pressures[:, start : start + length]
+        if not np.isfinite(window).all():
+            continue
+        spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * taper)
+        products = np.stack([np.abs(spectrum_A) ** 2, np.abs(spectrum_B) ** 2, spectrum_A * spectrum_B.conj()])
+        powers.append(np.add.reduceat(products[:, : first_lines[-1]], first_lines[:-1], axis=1))
+    if not powers:
+        return None
+    powers_A, powers_B, cross_powers = np.moveaxis(np.array(powers), 1, 0)
+    return powers_A.real, powers_B.real, cross_powers
 
 
 def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
