@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.evaluation.checks import Array
+from sealscope.signals.filters import Array
 
 #: Smallest number that is divided by.
 TINY = 1e-300
