@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfilt
 
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
-from sealscope.diagnosis.inference.changes.pressure_bands import compare_octaves, compare_spectra
+from sealscope.diagnosis.inference.changes.pressure_bands import compare_spectra, compute_octaves
 from sealscope.recordings.recording import Recording
 
 RATE, SECONDS = 100.0, 40.0
@@ -114,25 +114,25 @@ def ring(filter_A: float = np.inf, filter_B: float = np.inf, gain: float = 1.0, 
 def test_spectra_need_three_octaves() -> None:
     recording = record()
     slow = Recording(T[::50], {name: values[::50] for name, values in recording.channels.items()}, recording.units, 2.0)
-    assert compare_octaves(slow) is None
-    assert compare_octaves(recording.only(["p_A", "x"])) is None
+    assert compute_octaves(slow) is None
+    assert compute_octaves(recording.only(["p_A", "x"])) is None
 
 
 def test_windows_with_missing_samples_say_nothing() -> None:
     recording, holes = ring(seed=1), {name: values.copy() for name, values in ring(seed=1).channels.items()}
     holes["p_A"][1000:1010] = np.nan
-    whole, holed = compare_octaves(recording), compare_octaves(replace(recording, channels=holes))
+    whole, holed = compute_octaves(recording), compute_octaves(replace(recording, channels=holes))
     assert whole is not None and holed is not None
     assert holed.log_A == pytest.approx(whole.log_A, abs=0.2)
     assert np.cos(holed.phase - whole.phase)[:5] == pytest.approx(1.0, abs=0.01)
     holes["p_A"][::100] = np.nan
-    assert compare_octaves(replace(recording, channels=holes)) is None
+    assert compute_octaves(replace(recording, channels=holes)) is None
 
 
 @pytest.mark.parametrize("corner", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("channel", ["p_A", "p_B"])
 def test_a_filter_is_told_by_the_law_of_its_ratio_and_phase(channel: str, corner: float) -> None:
-    healthy, judged = compare_octaves(ring(seed=1)), compare_octaves(ring(**{f"filter_{channel[-1]}": corner}, seed=1))
+    healthy, judged = compute_octaves(ring(seed=1)), compute_octaves(ring(**{f"filter_{channel[-1]}": corner}, seed=1))
     assert healthy is not None and judged is not None
     sign = 1.0 if channel == "p_A" else -1.0
     frequencies = 0.2 * 2.0 ** (np.arange(len(healthy.phase)) + 0.5)
@@ -148,8 +148,8 @@ def test_a_filter_is_told_by_the_law_of_its_ratio_and_phase(channel: str, corner
     [({"filter_A": 1.0}, "filter of p_A", 1.0), ({"filter_B": 2.0}, "filter of p_B", 2.0), ({"gain": 3.0}, None, None)],
 )
 def test_a_filter_has_a_side_and_a_corner_and_a_larger_pressure_is_none(change, name, corner) -> None:
-    healthy = [compare_octaves(ring(seed=seed)) for seed in range(1, 6)]
-    judged = compare_octaves(ring(**change, seed=9))
+    healthy = [compute_octaves(ring(seed=seed)) for seed in range(1, 6)]
+    judged = compute_octaves(ring(**change, seed=9))
     assert judged is not None and None not in healthy
     found = compare_spectra(judged, healthy)
     assert found is not None
@@ -162,7 +162,7 @@ def test_a_filter_has_a_side_and_a_corner_and_a_larger_pressure_is_none(change, 
 
 def test_healthy_spectra_seldom_favour_a_filter() -> None:
     """The mean Bayes factor over healthy recordings is 1."""
-    octaves = [compare_octaves(ring(seed=seed)) for seed in range(24)]
+    octaves = [compute_octaves(ring(seed=seed)) for seed in range(24)]
     factors = []
     for k, judged in enumerate(octaves):
         test = compare_spectra(judged, octaves[:k] + octaves[k + 1 :])

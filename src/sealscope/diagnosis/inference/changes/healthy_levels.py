@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.changes.charge_pressure import (
     estimate_low_drifts,
 )
 from sealscope.diagnosis.inference.changes.motion_fit import TIME, fit_difference, fit_robustly, select_motion
-from sealscope.diagnosis.inference.changes.pressure_bands import Octaves, compare_octaves, compare_spectra
+from sealscope.diagnosis.inference.changes.pressure_bands import Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import (
     Estimate,
@@ -157,6 +157,6 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         levels = {}
     if (low_drifts := estimate_low_drifts(recording)) is not None:
         levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
-    if (octaves := compare_octaves(recording)) is not None:
+    if (octaves := compute_octaves(recording)) is not None:
         return {**levels, OCTAVES: np.stack(octaves)}
     return levels or None

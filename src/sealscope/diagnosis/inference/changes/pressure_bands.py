@@ -34,7 +34,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
 #: `Observable.data` of the comparison of the chambers' spectra, and its name by the filtered pressure.
-SIDES, FILTERED = "sides", {channel: f"filter of {channel}" for channel in CHAMBERS}
+SIDES, FILTER_NAMES = "sides", {channel: f"filter of {channel}" for channel in CHAMBERS}
 #: Minimum number of octaves.
 MIN_OCTAVES = 3
 #: Number of samples of the median that removes single wrong ones.
@@ -60,7 +60,7 @@ class Octaves(NamedTuple):
     phase_variance: Array
 
 
-def compare_octaves(recording: Recording) -> Octaves | None:
+def compute_octaves(recording: Recording) -> Octaves | None:
     """Compute the spectra of p_A and p_B of a recording in octaves, and their phase.
 
     Return None without both pressures, or if the recording is too short or has too few octaves.
@@ -81,8 +81,8 @@ def compare_octaves(recording: Recording) -> Octaves | None:
     coherence_squared = np.maximum(np.abs(cross_power) / (total_power + MIN_POWER), MIN_COHERENCE) ** 2
     # windows overlap by half, so that every second one is independent
     phase_variance = (1.0 - coherence_squared) / coherence_squared / len(powers_A)
-    octaves_found = Octaves(log_A, log_B, np.angle(cross_power), np.minimum(phase_variance, MAX_VARIANCE))
-    return octaves_found if np.isfinite(octaves_found).all() else None
+    octaves = Octaves(log_A, log_B, np.angle(cross_power), np.minimum(phase_variance, MAX_VARIANCE))
+    return octaves if np.isfinite(octaves).all() else None
 
 
 def _octave_edges(count: int) -> Array:
@@ -139,7 +139,7 @@ def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable |
         return None
     best = int(np.argmax(log_ratios)) + 1
     return Observable(
-        name=FILTERED[CHAMBERS[filters.side[best]]],
+        name=FILTER_NAMES[CHAMBERS[filters.side[best]]],
         data=SIDES,
         score=max(2.0 * log_factor, 0.0),
         chance=float(np.exp(-max(log_factor, 0.0))),
