@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.motion_fit import PARTS, cluster_errors
+from sealscope.diagnosis.inference.changes.motion_fit import PARTS, cluster_errors, solve_weighted, stack_equations
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -169,11 +169,11 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     time, values = t[rows] - t[rows].mean(), pressure[rows]
     varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]
     design = np.column_stack([time, np.ones(len(rows)), varying])
-    weight = np.zeros(len(rows))
+    equations, weight = stack_equations(design, values), np.zeros(len(rows))
     for part in np.array_split(np.arange(len(rows)), PARTS):  # each part begins with its lowest samples
         weight[part] = values[part] <= np.quantile(values[part], BEGIN)
     for _ in range(ITERATIONS):
-        coefficients = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
+        coefficients = solve_weighted(equations, weight)
         residual = values - design @ coefficients
         below = np.abs(residual[residual < 0.0])
         scale = WEIGHT_SCALE * float(np.median(below) if below.size else 0.0) + MIN_SCALE

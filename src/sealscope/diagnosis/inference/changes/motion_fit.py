@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr
 
 from sealscope.diagnosis.inference.changes.levels import motion_columns, motion_scales
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -78,18 +79,37 @@ def select_motion(recording: Recording) -> Motion | None:
     return Motion(rows, design, float(scales[0]))
 
 
+def stack_equations(design: Array, values: Array) -> Array:
+    """Stack the columns of a design matrix (n, m) and the values (n,) as rows (m + 1, n), for `solve_weighted`."""
+    return np.ascontiguousarray(np.vstack([design.T, values]))
+
+
+def solve_weighted(equations: Array, weight: Array) -> Array:
+    """Solve a weighted least-squares problem by a QR decomposition; returns the coefficients (m,).
+
+    The triangular factor has the singular values of the weighted design matrix. If that has not full rank, the solution
+    is the shortest, as that of `numpy.linalg.lstsq`, which decomposes all rows into singular values.
+
+    `equations` (m + 1, n): columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of
+    the rows.
+    """
+    factor = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)[1]
+    tolerance = len(weight) * np.finfo(float).eps
+    return np.asarray(np.linalg.lstsq(factor[:-1, :-1], factor[:-1, -1], rcond=tolerance)[0])
+
+
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients (m,) to values (n,) by reweighted least squares, with weights 1/sqrt(1 + (residual/scale)^2).
 
     Returns the coefficients and the weights (n,).
     """
-    weight = np.ones(len(values))
+    equations, weight = stack_equations(design, values), np.ones(len(values))
     for _ in range(ITERATIONS):
-        coefficients = np.linalg.lstsq(design * weight[:, None], values * weight, rcond=None)[0]
+        coefficients = solve_weighted(equations, weight)
         residual = np.abs(values - design @ coefficients)
         scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
         weight = 1.0 / np.hypot(1.0, residual / scale)
-    return np.asarray(coefficients), weight
+    return coefficients, weight
 
 
 def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Array:
