@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-#: Marks of a case that others of its family stand for in `.ci/run`, too.
+#: Marks of a case that others of its family stand for in `.ci/proofs`, too.
 OTHERS = (pytest.mark.slow, pytest.mark.long)
 
 
