@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,11 @@ from sealscope.simulation.integrate import Trajectory, integrate
 #: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
 CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
 HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
+#: Files and folders that come first and last, in this order. Two processes take file after file. The first file
+#: compiles the simulator for lanes, which takes half a minute; meanwhile the other process runs what needs none of it,
+#: and what is compiled later is loaded. At the end come folders of short files, so that neither process waits long.
+FIRST = ("campaigns/test_batches.py", "recordings", "reporting")
+LAST = ("parameters", "evaluation", "signals", "storage")
 
 
 # no deadline: the first example of a test may have to compile; tests/fuzz draws many more examples of what comes from
@@ -53,6 +59,19 @@ def pytest_collection() -> Iterator[None]:
         gc.freeze()
         gc.set_threshold(50_000)  # of the arrays and texts that a test makes hardly any is in a circle
         gc.enable()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort the files by `FIRST` and `LAST`; the others, and the tests of a file, keep their order."""
+    here = Path(__file__).parent
+
+    def place(item: pytest.Item) -> int:
+        path = item.path.relative_to(here).as_posix()
+        names = {path, path.partition("/")[0]}
+        places = {name: k - len(FIRST) for k, name in enumerate(FIRST)} | {name: k + 1 for k, name in enumerate(LAST)}
+        return min((places[name] for name in names & places.keys()), default=0)
+
+    items.sort(key=place)
 
 
 @pytest.fixture
