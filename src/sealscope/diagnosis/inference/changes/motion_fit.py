@@ -35,6 +35,8 @@ MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 200, 8
 WEIGHT_SCALE = 2.0
 #: Smallest length that is divided by, and smallest scale of residuals [Pa].
 TINY, MIN_RESIDUAL = 1e-300, 1.0
+#: Relative rounding error of a double; a singular value below it times the number of rows counts as zero.
+ROUNDING = float(np.finfo(float).eps)
 #: Number of parts of a recording whose residuals count as independent.
 PARTS = 20
 #: Indices of the columns sign(v), t/T and v.
@@ -94,8 +96,7 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
     the rows.
     """
     factor = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)[1]
-    tolerance = len(weight) * np.finfo(float).eps
-    return np.asarray(np.linalg.lstsq(factor[:-1, :-1], factor[:-1, -1], rcond=tolerance)[0])
+    return np.asarray(np.linalg.lstsq(factor[:-1, :-1], factor[:-1, -1], rcond=ROUNDING * len(weight))[0])
 
 
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
