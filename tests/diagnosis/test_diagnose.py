@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from sealscope.diagnosis.commissioned import machine
 from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
@@ -112,18 +114,34 @@ def test_what_stands_in_for_a_judge_is_not_asked(recording: Recording, monkeypat
         assert fused.detector == asked[0]
 
 
-def test_no_part_of_a_diagnosis_spreads_small_matrices_over_threads(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads = {}
-    for name in ("inspect_recording", "decide"):
-        whole = getattr(module, name)
+def count_threads(patch: pytest.MonkeyPatch, owner: object, *names: str) -> dict[str, set[int]]:
+    """Return, filled in by the calls, the numbers of threads of linear algebra when functions of `owner` are called."""
+    threads: dict[str, set[int]] = {}
+    for name in names:
+        whole = getattr(owner, name)
 
-        def count_threads(*inputs: object, name: str = name, whole: Callable[..., object] = whole) -> object:
+        def counted(*inputs: object, name: str = name, whole: Callable[..., object] = whole) -> object:
             threads[name] = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
             return whole(*inputs)
 
-        monkeypatch.setattr(module, name, count_threads)
+        patch.setattr(owner, name, counted)
+    return threads
+
+
+def test_no_part_of_a_diagnosis_spreads_small_matrices_over_threads(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = count_threads(monkeypatch, module, "inspect_recording", "decide")
     with threadpool_limits(limits=2):
         diagnose(recording)
     assert threads == {name: {1} for name in ("inspect_recording", "decide")}
+
+
+def test_no_part_of_a_summary_spreads_small_matrices_over_threads(
+    healthy: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = count_threads(monkeypatch, machine, "inspect_recording", "healthy_surprisals")
+    levels = count_threads(monkeypatch, HealthyLevels, "learn")
+    with threadpool_limits(limits=2):
+        machine.summarise_healthy(healthy, load_rig("thesis"), "run.nc")
+    assert threads | levels == {name: {1} for name in ("inspect_recording", "healthy_surprisals", "learn")}

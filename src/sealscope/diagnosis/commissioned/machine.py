@@ -301,6 +301,12 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
     `file` is the name of the recording and `checksum` the SHA-256 of its file. A detector that fails is left out, and
     its error is logged. Raises InputError if the recording cannot be trusted, or if no detector can use it.
     """
+    with limit_threads():
+        return _summarise(recording, rig, file, checksum)
+
+
+def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
+    """Compute the summaries of a healthy recording as `summarise_healthy` does, by any number of threads."""
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)
@@ -308,7 +314,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
     if inspection.defect is not None:
         raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
     summaries: dict[str, Summary] = {}
-    with np.errstate(all="ignore"), limit_threads():
+    with np.errstate(all="ignore"):
         for name, factory in detectors().items():
             try:
                 detector = factory(rig)
@@ -322,8 +328,6 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
         raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
     if (levels := HealthyLevels().learn(part)) is not None:
         summaries[HealthyLevels.name] = levels
-    with limit_threads():
-        surprisals = dict(healthy_surprisals(part, rig))
     return SummarisedRecording(
         file,
         digest=inspection.digest,
@@ -333,7 +337,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
         start_s=start_seconds(recording, file),
         summaries=summaries,
         about={"sha256": checksum, **describe_recording(recording, inspection)},
-        statistics=surprisals,
+        statistics=dict(healthy_surprisals(part, rig)),
     )
 
 
