@@ -38,6 +38,7 @@ def minute(rig: Rig) -> DetectableLeak:
     return detectable_leak(rig, DUTY, 60.0)
 
 
+@pytest.mark.slow
 def test_what_is_planned_is_found(rig: Rig, minute: DetectableLeak) -> None:
     """1.3 times the size is found in most recordings made afresh, and a third of it in none."""
     result = []

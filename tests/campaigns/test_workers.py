@@ -44,6 +44,7 @@ def test_a_process_that_dies_idle_loses_nothing():
     assert results | dict(ended) == {float(number): math.sqrt(number) for number in range(6)}
 
 
+@pytest.mark.slow
 def test_what_a_task_raises_is_raised():
     with pytest.raises(ValueError, match="math domain error"):
         list(iter_results(math.sqrt, [4.0, -1.0], 2))

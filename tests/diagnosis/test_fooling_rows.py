@@ -161,6 +161,7 @@ FIXTURES_STAY = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 
 @settings(max_examples=16, deadline=None, suppress_health_check=FIXTURES_STAY, derandomize=True, database=None)
 @given(data=st.data())
+@pytest.mark.slow
 def test_combined_changes_of_the_pressures(data, fooling, short, capfd) -> None:  # type: ignore[no-untyped-def]
     check_combination(fooling, data.draw, *short, [("p_A", "p_B")], capfd)
 

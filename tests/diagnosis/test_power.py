@@ -14,8 +14,6 @@ from sealscope.simulation.simulate import simulate_experiment
 FAST, SLOW = "3 sin(4t)", "8 sin(t)"
 SIZES = {FAST: (0.0005, 0.0042, 0.02, 0.1, 0.2, 0.4), SLOW: (0.0005, 0.0042, 0.02, 0.1, 0.4, 1.0)}
 DUTY = {"volume balance": SLOW, "pressure response": SLOW}
-#: Detectors that take seconds here.
-QUICK = ("volume balance",)
 #: A score may be below the highest of all smaller leaks by this share: noise, and the saturation of a likelihood ratio.
 TOLERANCE = 0.2
 THROTTLES = {"line.orifices": "present", "line.closed_A": "50[%]", "line.closed_B": "50[%]"}
@@ -27,8 +25,8 @@ def leaking(lpm: float, command: str) -> Recording:
     return simulate_experiment(experiment).recording
 
 
-#: How long a detector's turn takes, where it is not slow.
-MARKS = {"rms change": (), "pressure response": (pytest.mark.slow, pytest.mark.long)}
+#: Marks of a detector's turn, where it is not just slow.
+MARKS = {"pressure response": (pytest.mark.slow, pytest.mark.long)}
 
 
 @pytest.mark.parametrize(

@@ -127,6 +127,7 @@ def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:
 
 
 @pytest.mark.parametrize("every", [30, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
 def test_healthy_with_one_left_out(healthy: list[Recording], every: int) -> None:
     chosen = range(0, 30, every)
     verdicts = Counter(diagnose(healthy[k], healthy[:k] + healthy[k + 1 :]).verdict for k in chosen)

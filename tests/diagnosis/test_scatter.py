@@ -104,6 +104,7 @@ def fleet(random: np.random.Generator, days: Sequence[int], viscosity: float, wi
         *(pytest.param(days, marks=pytest.mark.slow) for days in ((1, 1, 2, 2, 3, 3, 3, 4), (1, 1, 2, 2, 2, 2))),
     ],
 )
+@pytest.mark.slow
 def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
     """Between two days the viscosity differs as far as it is believed to."""
     random = np.random.default_rng(len(days))
@@ -221,6 +222,7 @@ def machine(random: np.random.Generator, count: int, differs: float) -> Rise:
 
 
 @pytest.mark.parametrize("draws", [12, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
 def test_a_machine_that_repeats_itself_is_judged_closer_and_another_not_falsely(draws: int) -> None:
     random = np.random.default_rng(7)
     believed = COLUMNS.between_deviation[0]
@@ -351,6 +353,7 @@ def warm_days(random: np.random.Generator, slope: float, judged: float, logged: 
 
 @pytest.mark.parametrize("draws", [6, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.parametrize("logged", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_warm_oil_is_no_leak_and_its_interval_holds(logged: bool, draws: int) -> None:
     random = np.random.default_rng(9)
     for judged in (60.0, 70.0):

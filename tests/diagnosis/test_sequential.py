@@ -102,6 +102,7 @@ def run_length(values: np.ndarray, threshold: float, stated: float = 1.0) -> int
         1.0,
     ],
 )
+@pytest.mark.slow
 def test_false_alarms_are_as_rare_as_stated(q: float):
     """Whatever noise and walk are: at 1/alpha = 200 blocks under 1 in 200 of 12 x 250 blocks, by its own account."""
     random = np.random.default_rng(5)

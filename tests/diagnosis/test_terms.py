@@ -199,6 +199,7 @@ def single_rod() -> Recording:
     "bar",
     [-6.0, pytest.param(-1.0, marks=[pytest.mark.slow, pytest.mark.long]), pytest.param(6.0, marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: Recording, bar: float) -> None:
     """Which side carries, and the root of an orifice's law, are taken about the zero."""
     single, own = load_rig("single-rod-eha"), single_rod

@@ -58,6 +58,7 @@ def test_larger_leak_without_throttles(records) -> None:  # type: ignore[no-unty
 
 @few_and_all(3, 8)
 @pytest.mark.parametrize("throttled", [pytest.param(False, marks=[pytest.mark.slow, pytest.mark.long]), True])
+@pytest.mark.slow
 def test_without_a_leak_there_is_none(throttled: bool, count: int, records) -> None:  # type: ignore[no-untyped-def]
     result = [diagnose(records(seed, throttled=throttled)) for seed in range(count)]
     assert "leak" not in [one.verdict for one in result]

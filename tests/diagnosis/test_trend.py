@@ -144,6 +144,7 @@ def alarms(machines: int, days: int, years: float, *, seed: int, tails: float = 
 
 
 @pytest.mark.parametrize("machines", [30, pytest.param(120, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
 def test_the_rate_of_false_alarms_is_at_most_the_stated_one(machines: int) -> None:
     """With 1 in 0.1 years, 36.5 days, at most 20/36.5 of all machines alarm within 20 days, and some do."""
     days, years = 21, 0.1

@@ -81,7 +81,7 @@ SIGNS: dict[str, Callable[[Recording], Recording]] = {
 }
 
 
-@pytest.mark.parametrize("turned", few(SIGNS))
+@pytest.mark.parametrize("turned", few(SIGNS, 1))
 def test_no_sign_convention_is_assumed(detector: VolumeBalance, worn: Recording, turned: str) -> None:
     plain, other = judge(detector, worn), judge(detector, SIGNS[turned](worn))
     assert other.verdict == "leak"
@@ -181,7 +181,7 @@ MENDED: dict[str, Callable[[Recording], Recording]] = {
 }
 
 
-@pytest.mark.parametrize("trouble", few(MENDED))
+@pytest.mark.parametrize("trouble", few(MENDED, 1))
 def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, tight: Recording, trouble: str) -> None:
     result = judge(detector, MENDED[trouble](worn))
     assert result.verdict == "leak"

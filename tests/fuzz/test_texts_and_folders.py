@@ -21,6 +21,8 @@ FEW = {
     "kept files": 30,
 }
 FEW |= {"machines": 6, "monitor messages": 100, "CBOR messages": 700, "Sparkplug messages": 150}
+#: Kinds of which even a few take seconds.
+LONG = ("campaign folders", "machines")
 MANY = {
     "options": 6000,
     "rigs": 2000,
@@ -45,7 +47,10 @@ def some(kind: str, folder: Path, seeds: range, capfd: pytest.CaptureFixture[str
     assert output.out == output.err == ""
 
 
-@pytest.mark.parametrize("kind", [*TARGETS, *MESSAGES])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.slow] * (kind in LONG)) for kind in (*TARGETS, *MESSAGES)],
+)
 def test_hostile_inputs(
     kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,8 +39,7 @@ def watched(recording: Recording, size: int = 10**9) -> tuple[ss.Watch, list[obj
     "seed",
     [
         2,
-        3,
-        *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)),
+        *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1, 3)),
         *(pytest.param(k, marks=[pytest.mark.slow, pytest.mark.long]) for k in (4, 5, 6, 7)),
     ],
 )

@@ -77,6 +77,7 @@ def edit(copy: Path, file: str, old: str, new: str) -> None:
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_an_edited_law_in_another_file_is_seen_and_the_old_code_comes_back_with_the_old_law(copy, tmp_path):
     cache = tmp_path / "cache"
     law, doubled = "return c * dp / math.sqrt(", "return 2.0 * c * dp / math.sqrt("

@@ -32,6 +32,7 @@ def test_every_twelfth_stroke_reads_as_numpy_reads_it() -> None:
         assert np.array_equal(recording["p_B"], expected[:, 1])
 
 
+@pytest.mark.slow
 def test_ports_are_clean_but_for_the_strokes_that_fall_below_zero() -> None:
     result = Counter()
     for path in FILES[::6]:

@@ -99,6 +99,14 @@ def test_lost_samples_are_missing_at_their_rate():
     assert not np.isnan(reading["p_B"]).any()
 
 
+def test_a_reading_sticks_at_its_rate_and_not_otherwise():
+    """Once in two seconds for one second on average: some of the time."""
+    stuck, free = (read(20_000, {"sensors.p_A.stuck_rate": rate, "bits": 32})["p_A"] for rate in (0.5, 0.0))
+    assert 0.1 < np.mean(np.diff(stuck) == 0.0) < 0.8
+    assert np.count_nonzero(np.diff(free) == 0.0) < 3
+
+
+@pytest.mark.slow
 def test_a_stuck_reading_repeats_for_a_second_on_average():
     reading = read(500_000, {"sensors.p_A.stuck_rate": 0.02, "bits": 32})["p_A"]
     same = np.diff(reading) == 0.0

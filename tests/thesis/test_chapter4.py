@@ -257,12 +257,14 @@ def test_ringing_is_what_follows_a_reversal() -> None:
     assert ringing(calm) < 200.0
 
 
+@pytest.mark.slow
 def test_every_claim_is_there_once_and_says_something(kept: Kept, claims: dict[str, Claim]) -> None:
     assert list(claims) == [f"claim-4.{n}" for n in range(1, 24)]
     assert all(len(getattr(one, field)) > 5 for one in claims.values() for field in ("where", "claim", "simulation"))
     assert {name for item in ALL.values() for name in item.claims} <= claims.keys()
 
 
+@pytest.mark.slow
 def test_verdicts_on_the_thesis_s_rig(claims: dict[str, Claim]) -> None:
     verdicts = {name.removeprefix("claim-4."): claim.verdict for name, claim in claims.items()}
     assert [n for n, verdict in verdicts.items() if verdict == "cannot be tested"] == ["4", "7", "17", "22"]
@@ -277,6 +279,7 @@ def test_verdicts_on_the_thesis_s_rig(claims: dict[str, Claim]) -> None:
     assert "-775" in claims["claim-4.12"].simulation or "-663" in claims["claim-4.12"].simulation
 
 
+@pytest.mark.slow
 def test_the_table_of_readings_marks_what_the_step_made(kept: Kept) -> None:
     table = next(one for one in make(kept, ALL["chapter-4-claims"]) if isinstance(one, ThesisTable))
     tested = {(row[2], row[-1]) for row in table.rows}
@@ -287,6 +290,7 @@ def test_the_table_of_readings_marks_what_the_step_made(kept: Kept) -> None:
     assert ours[-1][3] == pytest.approx(steady_range(run, "p_1") * 1e-6)
 
 
+@pytest.mark.slow
 def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str, Claim]) -> None:
     """With converged runs whose pressures behave as the thesis says, its claims hold."""
     factor = {25.0: 1.5, 50.0: 2.5, 75.0: 4.0}

@@ -83,6 +83,7 @@ def residuals(measured_sheet: DataSheet) -> np.ndarray:
 
 
 @needs_sheet
+@pytest.mark.slow
 def test_the_identified_rig_meets_the_leak_free_columns_within_a_quarter(
     measured_sheet: DataSheet, residuals: np.ndarray
 ) -> None:
