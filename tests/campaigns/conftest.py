@@ -43,7 +43,7 @@ count = 5
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def text():
     """The plan's text."""
     return TINY

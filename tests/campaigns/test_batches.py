@@ -49,6 +49,14 @@ def plan_with(text):
     return made
 
 
+@pytest.fixture(scope="module")
+def finished_in_batches(text, tmp_path_factory):
+    """A folder with all rows of the tiny plan, made in batches."""
+    folder = tmp_path_factory.mktemp("in batches")
+    assert campaign.run(read_plan(tomllib.loads(text), "tiny.toml"), folder, batch=True).complete
+    return folder
+
+
 def rows_of(plan, cases):
     """The rows by case id, without their processor time."""
     return {row.id: replace(row, seconds=0.0) for row in batches.iter_batch_rows(plan, cases, 2)}
@@ -113,12 +121,11 @@ def test_a_row_is_the_same_in_any_batch(plan_with, monkeypatch, machines):
     assert rows_of(plan, cases[3:4]) == {cases[3].id: whole[cases[3].id]}
 
 
-def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_path):
+def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, finished_in_batches, monkeypatch, tmp_path):
     plan = plan_with()
-    assert campaign.run(plan, tmp_path / "once", batch=True).complete
     expected = {
         path.name: path.read_bytes()
-        for path in write_result(judge_simulated_campaign(plan, tmp_path / "once"), tmp_path)
+        for path in write_result(judge_simulated_campaign(plan, finished_in_batches), tmp_path)
     }
     monkeypatch.setattr(batches, "BATCH_SIZE", 8)
     reported = []
@@ -142,13 +149,12 @@ def test_interrupted_it_goes_on_to_the_same_bytes(plan_with, monkeypatch, tmp_pa
     assert len(ids) == len(set(ids)) == plan.size
 
 
-def test_rows_of_both_ways_are_not_mixed(plan_with, finished_tiny, tmp_path):
+def test_rows_of_both_ways_are_not_mixed(plan_with, finished_tiny, finished_in_batches):
     plan = plan_with()
-    campaign.run(plan, tmp_path / "batch", batch=True)
-    for folder, batch in ((tmp_path / "batch", False), (finished_tiny, True)):
+    for folder, batch in ((finished_in_batches, False), (finished_tiny, True)):
         with refusal("mode"):
             campaign.run(plan, folder, jobs=1, batch=batch)
-    ways = [judge_simulated_campaign(plan, folder).mode for folder in (tmp_path / "batch", finished_tiny)]
+    ways = [judge_simulated_campaign(plan, folder).mode for folder in (finished_in_batches, finished_tiny)]
     assert ways == ["in batches", "run by run"]
 
 
