@@ -47,7 +47,8 @@ def within(stroke: Recording, baseline: list[Recording]) -> str:
     return next(own.verdict for own in diagnose(stroke, baseline).parts if own.detector == "rms change")
 
 
-@pytest.mark.parametrize("every", [30, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [30, pytest.param(1, marks=pytest.mark.long)])
 def test_defective_against_healthy(healthy: list[Recording], defective: list[Recording], every: int) -> None:
     """One specimen with a defect, recorded on another day: a change of the ringing or its bound is stated, no L/min."""
     for stroke in defective[::every]:
@@ -126,8 +127,8 @@ def test_healthy_against_its_own_other_half(healthy: list[Recording]) -> None:
     assert verdicts["no leak"] == 30
 
 
-@pytest.mark.parametrize("every", [30, pytest.param(1, marks=[pytest.mark.slow, pytest.mark.long])])
 @pytest.mark.slow
+@pytest.mark.parametrize("every", [30, pytest.param(1, marks=pytest.mark.long)])
 def test_healthy_with_one_left_out(healthy: list[Recording], every: int) -> None:
     chosen = range(0, 30, every)
     verdicts = Counter(diagnose(healthy[k], healthy[:k] + healthy[k + 1 :]).verdict for k in chosen)
