@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfilt
 
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
-from sealscope.diagnosis.inference.changes.pressure_bands import compare_spectra, compute_octaves
+from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.recordings.recording import Recording
 
 RATE, SECONDS = 100.0, 40.0
@@ -116,6 +116,7 @@ def test_spectra_need_three_octaves() -> None:
     slow = Recording(T[::50], {name: values[::50] for name, values in recording.channels.items()}, recording.units, 2.0)
     assert compute_octaves(slow) is None
     assert compute_octaves(recording.only(["p_A", "x"])) is None
+    assert compute_octaves(recording.only(["p_A", "x"]), ("p_A", "x")) is not None
 
 
 def test_windows_with_missing_samples_say_nothing() -> None:
@@ -151,7 +152,7 @@ def test_a_filter_has_a_side_and_a_corner_and_a_larger_pressure_is_none(change, 
     healthy = [compute_octaves(ring(seed=seed)) for seed in range(1, 6)]
     judged = compute_octaves(ring(**change, seed=9))
     assert judged is not None and None not in healthy
-    found = compare_spectra(judged, healthy)
+    found = compare_spectra({"octaves": judged}, [{"octaves": day} for day in healthy])
     assert found is not None
     if name is None:
         assert found.chance > 0.1
@@ -160,9 +161,41 @@ def test_a_filter_has_a_side_and_a_corner_and_a_larger_pressure_is_none(change, 
         assert found.chance < 1e-6
 
 
+def press(filter_A: float = np.inf, seed: int = 0) -> Recording:
+    """Record a load that swings on p_A, each day at other frequencies, in a machine whose p_B is the charge pressure.
+
+    `filter_A`: corner of a low-pass filter of p_A [Hz].
+    """
+    rng = np.random.default_rng(seed)
+    swing = np.fft.rfft(rng.standard_normal(len(T))) / np.sqrt(np.maximum(np.fft.rfftfreq(len(T), 1.0 / RATE), 0.1))
+    tilt = np.maximum(np.fft.rfftfreq(len(T), 1.0 / RATE), 0.1) ** rng.uniform(-0.3, 0.3)
+    load = np.fft.irfft(swing * tilt, len(T))
+    p_A = 50e5 + 2e5 * load
+    if np.isfinite(filter_A):
+        p_A = sosfilt(butter(1, filter_A, fs=RATE, output="sos"), p_A - p_A[0]) + p_A[0]
+    noise = rng.standard_normal((3, len(T)))
+    channels = {"p_A": p_A + 1e3 * noise[0], "p_B": 6e5 + 1e3 * noise[1], "x": 2e-4 * load + 1e-6 * noise[2]}
+    return Recording(T, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE)
+
+
+def test_a_filter_is_told_by_the_position_where_the_other_chamber_rests() -> None:
+    def spectra(recording: Recording, names: list[str]) -> dict[str, Octaves]:
+        return {name: octaves for name in names if (octaves := compute_octaves(recording, PAIRS[name])) is not None}
+
+    def chance(recording: Recording, names: list[str]) -> tuple[str, float]:
+        healthy = [spectra(press(seed=seed), names) for seed in range(1, 6)]
+        found = compare_spectra(spectra(recording, names), healthy)
+        assert found is not None
+        return found.name, found.chance
+
+    assert chance(press(filter_A=2.0, seed=9), ["octaves"])[1] > 1e-3
+    assert chance(press(filter_A=2.0, seed=9), list(PAIRS)) == ("filter of p_A", pytest.approx(0.0, abs=1e-6))
+    assert chance(press(seed=9), list(PAIRS))[1] > 0.03
+
+
 def test_healthy_spectra_seldom_favour_a_filter() -> None:
     """The mean Bayes factor over healthy recordings is 1."""
-    octaves = [compute_octaves(ring(seed=seed)) for seed in range(24)]
+    octaves = [{"octaves": compute_octaves(ring(seed=seed))} for seed in range(24)]
     factors = []
     for k, judged in enumerate(octaves):
         test = compare_spectra(judged, octaves[:k] + octaves[k + 1 :])
@@ -183,7 +216,7 @@ def test_healthy_days_without_spectra_leave_the_other_comparisons(known: int) ->
             RATE,
             SECONDS,
             None,
-            {"signals": {key: learnt[key] for key in learnt if key != "octaves" or k < known}},
+            {"signals": {key: learnt[key] for key in learnt if key not in PAIRS or k < known}},
         )
         for k, learnt in enumerate(HealthyLevels().learn(day) or {} for day in HEALTHY)
     ]

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
-from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, Octaves
+from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.locked_holds import HeldLeaks
 from sealscope.diagnosis.inference.terms import LEAK
@@ -163,7 +163,7 @@ def _check_levels(summary: Any) -> Any:
 
 
 def _check_octaves(values: Any) -> Any:
-    """Return the spectra of the pressures in octaves if they are valid; raise ValueError otherwise.
+    """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
     They have a row for each field of `Octaves`, of which the last, a variance, is not negative. All must be below 750
     in magnitude.
@@ -219,11 +219,11 @@ _SUMMARIES = {
             friction_error=(_Magnitude, None),
             drift_A=(_Number, None),
             drift_B=(_Number, None),
-            octaves=(Annotated[_Array, AfterValidator(_check_octaves)], None),
             low_A=(_Number, None),
             low_A_error=(_Magnitude, None),
             low_B=(_Number, None),
             low_B_error=(_Magnitude, None),
+            **{name: (Annotated[_Array, AfterValidator(_check_octaves)], None) for name in PAIRS},
         ),
         None,
     ),

@@ -23,7 +23,7 @@ from sealscope.diagnosis.inference.changes.charge_pressure import (
     estimate_low_drifts,
 )
 from sealscope.diagnosis.inference.changes.motion_fit import TIME, fit_difference, fit_robustly, select_motion
-from sealscope.diagnosis.inference.changes.pressure_bands import Octaves, compare_spectra, compute_octaves
+from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import (
     Estimate,
@@ -40,8 +40,6 @@ from sealscope.recordings.recording import Recording, compute_once
 TINY = 1e-300
 #: Names of the observables: of the friction, and of the drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
-#: Key of the spectra in a summary: an array of the fields of `Octaves`, (4, k).
-OCTAVES = "octaves"
 
 
 class HealthyLevels:
@@ -50,10 +48,11 @@ class HealthyLevels:
     name = SIGNALS
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a recording by friction, drifts and spectra of p_A and p_B, for comparison with other recordings.
+        """Summarise a recording by friction, drifts and spectra, for comparison with other recordings.
 
-        The summary maps names to numbers, and `OCTAVES` to an array, without what the channels or too little motion do
-        not allow. It is None if nothing can be estimated, and is computed only once for a recording.
+        The summary maps names to numbers, and those of `PAIRS` to arrays of the fields of `Octaves`, (4, k), without
+        what the channels or too little motion do not allow. It is None if nothing can be estimated, and is computed
+        only once for a recording.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
@@ -68,10 +67,8 @@ class HealthyLevels:
             return
         if (low_drifts := _low_drifts(judged)) is not None:
             yield from compare_low_drifts(low_drifts, [day for day in map(_low_drifts, summaries) if day is not None])
-        if (octaves := _octaves(judged)) is not None:
-            spectra = compare_spectra(octaves, [day for day in map(_octaves, summaries) if day is not None])
-            if spectra is not None:
-                yield spectra
+        if (spectra := compare_spectra(_octaves(judged), [_octaves(day) for day in summaries])) is not None:
+            yield spectra
         summaries = [summary for summary in summaries if "drift_A" in summary]
         if "drift_A" not in judged:
             return
@@ -87,9 +84,9 @@ class HealthyLevels:
             yield from _describe_drifts(*drifts)  # type: ignore[arg-type]
 
 
-def _octaves(summary: Summary) -> Octaves | None:
-    """Read the spectra of p_A and p_B from a recording's summary; None if it has none."""
-    return Octaves(*np.asarray(summary[OCTAVES], dtype=float)) if OCTAVES in summary else None
+def _octaves(summary: Summary) -> dict[str, Octaves]:
+    """Read the spectra of pairs of channels from a recording's summary, by the names of the pairs that it has."""
+    return {name: Octaves(*np.asarray(summary[name], dtype=float)) for name in PAIRS if name in summary}
 
 
 def _low_drifts(summary: Summary) -> LowDrifts | None:
@@ -137,7 +134,7 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra of p_A and p_B in a recording, as numbers or arrays by their names.
+    """Estimate friction, drifts and spectra in a recording, as numbers or arrays by their names.
 
     Values that the recording does not allow are left out; the result is None if none is left.
     """
@@ -157,6 +154,9 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         levels = {}
     if (low_drifts := estimate_low_drifts(recording)) is not None:
         levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
-    if (octaves := compute_octaves(recording)) is not None:
-        return {**levels, OCTAVES: np.stack(octaves)}
-    return levels or None
+    spectra = {
+        name: np.stack(octaves)
+        for name, pair in PAIRS.items()
+        if (octaves := compute_octaves(recording, pair)) is not None
+    }
+    return {**levels, **spectra} or None

@@ -1,18 +1,21 @@
-"""Cross-spectrum of both chamber pressures in octaves, by which a filter of one sensor or its line is told.
+"""Cross-spectra of the pressures with other channels in octaves, by which a filter of one pressure is told.
 
 A low-pass filter of first order with the cut-off frequency f_c multiplies one pressure by
 
     H(f) = 1 / (1 + i f / f_c),    log abs(H) = -log(1 + (f / f_c)^2) / 2,    arg H = -arctan(f / f_c),
 
-before the sensor's noise is added. With the spectra A and B of p_A and p_B (periodograms of Hann windows, Welch), the
-ratio log abs(A / B) and the phase of sum(A B*) in each octave are compared with those of healthy recordings. No change
-of the load, the friction or a leak turns the phase of one pressure by arctan(f / f_c) at all frequencies.
+before the sensor's noise is added. The pressure is compared with another channel that is coherent with it: p_A with
+p_B, and each with the position x and the pump's speed, since in many machines one chamber rests at the charge
+pressure. With the spectra A and B of such a pair (periodograms of Hann windows, Welch), the ratio log abs(A / B) and
+the phase of sum(A B*) in each octave are compared with those of healthy recordings. No change of the load, the friction
+or a leak turns the phase of one pressure by arctan(f / f_c) at all frequencies.
 
 The ratios of an octave vary between healthy recordings by an unknown variance with a prior, and neighbouring octaves
 vary together: a recording's ratios follow a multivariate t distribution. Its phases follow von Mises distributions,
 whose variance is learnt likewise and is larger where the pressures are hardly coherent; a fraction of the phases is
-uniform. The observable is the Bayes factor of a filter, averaged over both pressures, f_c and the noise; as its mean
-over healthy recordings is 1, that of a healthy one exceeds b with a probability of at most 1 / b (Markov).
+uniform. The observable is the Bayes factor of a filter, averaged over the pairs, the filtered pressure, f_c and the
+noise; as its mean over healthy recordings is 1, that of a healthy one exceeds b with a probability of at most 1 / b
+(Markov).
 
 Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70; J. S. Bendat, A. G. Piersol, Random
 Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section
@@ -21,7 +24,7 @@ Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,14 +36,23 @@ from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
-#: `Observable.data` of the comparison of the chambers' spectra, and its name by the filtered pressure.
+#: `Observable.data` of the comparison of spectra, and its name by the filtered pressure.
 SIDES, FILTER_NAMES = "sides", {channel: f"filter of {channel}" for channel in CHAMBERS}
+#: Pairs of channels whose spectra are compared, by their names in a recording's summary.
+PAIRS = {
+    "octaves": CHAMBERS,
+    "octaves_A_x": ("p_A", "x"),
+    "octaves_B_x": ("p_B", "x"),
+    "octaves_A_omega": ("p_A", "omega"),
+    "octaves_B_omega": ("p_B", "omega"),
+}
 #: Minimum number of octaves.
 MIN_OCTAVES = 3
 #: Number of samples of the median that removes single wrong ones.
 GLITCH = 3
-#: Minimum power [Pa^2], and minimum coherence, that are divided by.
-MIN_POWER, MIN_COHERENCE = 1e-6, 1e-3
+#: Minimum power that is divided by, of pressures [Pa^2], the position [m^2] and the pump's speed [rad^2/s^2], and
+#: minimum coherence.
+MIN_POWER, MIN_COHERENCE = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}, 1e-3
 #: Number of cut-off frequencies, between the limits of the prior.
 CUTOFFS = 15
 #: Largest variance of a phase [rad^2]: beyond, it is nearly uniform.
@@ -48,10 +60,10 @@ MAX_VARIANCE = 4.0
 
 
 class Octaves(NamedTuple):
-    """Spectra of both chamber pressures of a recording in k octaves, (k,) each.
+    """Spectra of two channels A and B of a recording in k octaves, (k,) each.
 
-    `log_A`, `log_B`: logarithms of the RMS of p_A and p_B [Pa]; `phase`: that of the cross-spectrum [rad], positive if
-    p_A leads; `phase_variance`: variance of its error [rad^2].
+    `log_A`, `log_B`: logarithms of the RMS of A and B, in their units; `phase`: that of the cross-spectrum [rad],
+    positive if A leads; `phase_variance`: variance of its error [rad^2].
     """
 
     log_A: Array
@@ -60,28 +72,32 @@ class Octaves(NamedTuple):
     phase_variance: Array
 
 
-def compute_octaves(recording: Recording) -> Octaves | None:
-    """Compute the spectra of p_A and p_B of a recording in octaves, and their phase.
+def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
+    """Compute the spectra of a `pair` of channels of a recording in octaves, and their phase.
 
-    Return None without both pressures, or if the recording is too short or has too few octaves.
+    Return None without both channels, or if the recording is too short or has too few octaves.
     """
     priors = CHANGES.octaves
-    if not set(CHAMBERS) <= set(recording.channels):
+    if not set(pair) <= set(recording.channels):
         return None
     length = round(priors.seconds * recording.rate)
     n_octaves = int(np.log2(max(min(priors.highest, priors.share * recording.rate) / priors.lowest, 1.0)))
     if n_octaves < MIN_OCTAVES or len(recording) < length:
         return None
-    powers = _octave_powers(recording, length, _octave_edges(n_octaves))
+    powers = _octave_powers(recording, pair, length, _octave_edges(n_octaves))
     if powers is None:
         return None
     powers_A, powers_B, cross_powers = powers
-    log_A, log_B = (0.5 * np.log(np.quantile(power, priors.busy, axis=0) + MIN_POWER) for power in (powers_A, powers_B))
-    cross_power, total_power = cross_powers.sum(axis=0), np.sqrt(powers_A.sum(axis=0) * powers_B.sum(axis=0))
-    coherence_squared = np.maximum(np.abs(cross_power) / (total_power + MIN_POWER), MIN_COHERENCE) ** 2
+    min_A, min_B = (MIN_POWER[channel] for channel in pair)
+    log_A = 0.5 * np.log(np.quantile(powers_A, priors.busy, axis=0) + min_A)
+    log_B = 0.5 * np.log(np.quantile(powers_B, priors.busy, axis=0) + min_B)
+    cross_power = np.abs(cross_powers.sum(axis=0))
+    total_power = np.sqrt((powers_A.sum(axis=0) + min_A) * (powers_B.sum(axis=0) + min_B))
+    coherence_squared = np.clip(cross_power / total_power, MIN_COHERENCE, 1.0) ** 2
     # windows overlap by half, so that every second one is independent
     phase_variance = (1.0 - coherence_squared) / coherence_squared / len(powers_A)
-    octaves = Octaves(log_A, log_B, np.angle(cross_power), np.minimum(phase_variance, MAX_VARIANCE))
+    phase = np.angle(cross_powers.sum(axis=0))
+    octaves = Octaves(log_A, log_B, phase, np.minimum(phase_variance, MAX_VARIANCE))
     return octaves if np.isfinite(octaves).all() else None
 
 
@@ -92,21 +108,21 @@ def _octave_edges(count: int) -> Array:
 
 
 def _octave_powers(
-    recording: Recording, length: int, edges: Array
+    recording: Recording, pair: tuple[str, str], length: int, edges: Array
 ) -> tuple[Array, Array, NDArray[np.complex128]] | None:
-    """Compute powers and cross-power of p_A and p_B in octaves, in half-overlapping Hann windows of `length` samples.
+    """Compute powers and cross-power of a pair of channels A and B in half-overlapping Hann windows, in octaves.
 
-    `edges` (k + 1,): limits of the octaves [Hz]. Single wrong samples are removed by a median of three. The results
-    are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k) each. Windows with missing
-    samples are left out; None if all have some.
+    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. Single wrong samples are removed by a
+    median of three. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k)
+    each. Windows with missing samples are left out; None if all have some.
     """
     from scipy.ndimage import median_filter
 
-    pressures = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in CHAMBERS])
+    values = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
     taper, powers = np.hanning(length), []
     for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
-        window = pressures[:, start : start + length]
+        window = values[:, start : start + length]
         if not np.isfinite(window).all():
             continue
         spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * taper)
@@ -118,40 +134,71 @@ def _octave_powers(
     return powers_A.real, powers_B.real, cross_powers
 
 
-def compare_spectra(judged: Octaves, healthy: Sequence[Octaves]) -> Observable | None:
+def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str, Octaves]]) -> Observable | None:
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
-    The observable is named after the pressure that is more probably filtered; its size is the most probable cut-off
-    frequency [Hz]. Healthy recordings with fewer octaves than the judged one are left out. Return None for too few
-    healthy recordings.
+    `judged`, `healthy`: spectra of each recording's pairs of channels, by their names in `PAIRS`. The observable is
+    named after the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. For
+    each pair, healthy recordings with fewer octaves than the judged one are left out. Return None if no pair has
+    enough healthy recordings.
     """
+    from scipy.special import logsumexp
+
+    factors = list[_FilterFactor]()
+    for name, octaves in judged.items():
+        known = [day[name] for day in healthy if name in day]
+        factor = _compare_pair(octaves, known, PAIRS[name])
+        if factor is not None:
+            factors.append(factor)
+    if not factors:
+        return None
+    log_factor = float(logsumexp([factor.log_factor for factor in factors]) - np.log(len(factors)))
+    best = max(factors, key=lambda factor: factor.log_factor)
+    return Observable(
+        name=FILTER_NAMES[best.channel],
+        data=SIDES,
+        score=max(2.0 * log_factor, 0.0),
+        chance=float(np.exp(-max(log_factor, 0.0))),
+        size=best.cutoff,
+    )
+
+
+class _FilterFactor(NamedTuple):
+    """Log Bayes factor of a filter of one pressure, by the spectra of a pair of channels.
+
+    `channel`, `cutoff`: the pressure that is more probably filtered, and its most probable cut-off frequency [Hz].
+    """
+
+    log_factor: float
+    channel: str
+    cutoff: float
+
+
+def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
+    """Compute the Bayes factor of a filter of the pressures of a `pair` of channels.
+
+    Return None for too few healthy recordings with as many octaves, or if the factor is not finite.
+    """
+    from scipy.special import logsumexp
+
     count = len(judged.log_A)
     known = [Octaves(*(values[:count] for values in octaves)) for octaves in healthy if len(octaves.log_A) >= count]
     if len(known) < MIN_HEALTHY:
         return None
-    from scipy.special import logsumexp
-
-    filters = _filter_effects(known)
+    filters = _filter_effects(known, sides=[side for side, channel in enumerate(pair) if channel in CHAMBERS])
     log_ratios = _ratio_log_likelihoods(judged, known, filters) + _phase_log_likelihoods(judged, known, filters)
     log_ratios = log_ratios[1:] - log_ratios[0]  # the first hypothesis is no filter
     log_factor = float(logsumexp(log_ratios) - np.log(len(log_ratios)))
-    if not np.isfinite(log_factor):
-        return None
     best = int(np.argmax(log_ratios)) + 1
-    return Observable(
-        name=FILTER_NAMES[CHAMBERS[filters.side[best]]],
-        data=SIDES,
-        score=max(2.0 * log_factor, 0.0),
-        chance=float(np.exp(-max(log_factor, 0.0))),
-        size=float(filters.cutoff[best]),
-    )
+    channel, cutoff = pair[filters.side[best]], float(filters.cutoff[best])
+    return _FilterFactor(log_factor, channel, cutoff) if np.isfinite(log_factor) else None
 
 
 class _Filters(NamedTuple):
     """Effects of m filters on k octaves; the first "filter" is none.
 
     `log_ratio`, `phase` (m, k): changes of log abs(A / B) and of the phase of A B* [rad]; `side` (m,): 0 for a filter
-    of p_A, 1 for p_B; `cutoff` (m,): cut-off frequency [Hz].
+    of channel A, 1 for channel B; `cutoff` (m,): cut-off frequency [Hz].
     """
 
     log_ratio: Array
@@ -160,8 +207,8 @@ class _Filters(NamedTuple):
     cutoff: Array
 
 
-def _filter_effects(healthy: Sequence[Octaves]) -> _Filters:
-    """Compute how filters change the spectra of healthy recordings, for all sides, cut-off frequencies and noises.
+def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filters:
+    """Compute how filters of the given `sides` change the spectra of healthy recordings, for all f_c and noises.
 
     The sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of that of
     the octave with the least power per frequency.
@@ -171,22 +218,22 @@ def _filter_effects(healthy: Sequence[Octaves]) -> _Filters:
     priors, edges = CHANGES.filtered, _octave_edges(len(healthy[0].log_A))
     frequencies, widths = np.sqrt(edges[:-1] * edges[1:]), np.diff(edges)
     none = np.zeros_like(frequencies)
-    log_ratios, phases, sides, cutoffs = [none], [none], [0], [np.inf]
+    log_ratios, phases, filtered_sides, cutoffs = [none], [none], [0], [np.inf]
     grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
-    for side, noise_fraction, cutoff in product(range(len(CHAMBERS)), priors.noises, grid):
+    for side, noise_fraction, cutoff in product(sides, priors.noises, grid):
         power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)
         noise = noise_fraction * float(np.min(power / widths)) * widths
         filtered_power = (power - noise) / (1.0 + (frequencies / cutoff) ** 2) + noise
         sign = 1.0 if side == 0 else -1.0
         log_ratios.append(sign * 0.5 * np.log(filtered_power / power))
         phases.append(-sign * np.arctan(frequencies / cutoff))
-        sides.append(side)
+        filtered_sides.append(side)
         cutoffs.append(cutoff)
-    return _Filters(np.stack(log_ratios), np.stack(phases), np.array(sides), np.array(cutoffs))
+    return _Filters(np.stack(log_ratios), np.stack(phases), np.array(filtered_sides), np.array(cutoffs))
 
 
 def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged log ratios of p_A to p_B for each filter, up to a constant.
+    """Compute the log likelihood (m,) of the judged log ratios of A to B for each filter, up to a constant.
 
     The ratios follow a multivariate t distribution about the mean of the healthy recordings.
     """
@@ -205,7 +252,7 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
 
 
 def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:
-    """Compute the log likelihood (m,) of the judged phases between p_A and p_B for each filter.
+    """Compute the log likelihood (m,) of the judged phases between A and B for each filter.
 
     The phase of each octave follows a von Mises distribution about the mean direction of the healthy recordings, or
     is uniform with a small probability.

@@ -386,14 +386,15 @@ class HeldChambers:
         """Estimate the leaks past the piston and to the outside from the holds, with standard deviations, shape (6,).
 
         The conductances [m^3/(s Pa)] are in the order of `HeldLeaks`. The leak past the piston is that since `onset`
-        [s]; the leaks to the outside are means over the whole recording. Return None if no hold shows a flow past the
-        piston after the onset.
+        [s], times the probability that holds give it beside the leaks to the outside. Those are means over the whole
+        recording. Return None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
             return None
         leak = _average_fits(fits)
-        return np.array(self.leaks._replace(piston=leak.value, deviation=leak.deviation))
+        probable = self.piston_leak.probability * leak.value
+        return np.array(self.leaks._replace(piston=probable, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
         """Fit a leak past the piston since `onset` [s] for each sensor offset of a grid; omit fits without any flow.
