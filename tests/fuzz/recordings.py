@@ -3,46 +3,60 @@
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from sealscope.errors import UnreadableFile
+from sealscope.errors import MissingExtra, UnreadableFile
 from sealscope.recordings import Recording, inspect, read, write
 
-from ..recordings.dialects import DIALECTS, P_A, P_B, RATE, T, pack
+from ..recordings.dialects import DIALECTS, FILES, P_A, P_B, RATE, T, pack
 from ..recordings.exports import EXPORTS
 from .mutations import changed_bytes
 from .targets import Use
 
 RECORDING = Recording(T, {"p_A": 1e5 * P_A, "p_B": 1e5 * P_B}, {"p_A": "Pa", "p_B": "Pa"}, RATE)
-#: Kind -> the dialect that is mutated, and the library that it needs.
+#: Kind -> the dialect that is mutated.
 _DIALECTS = {
-    "text": ("text, preamble", "numpy"),
-    "TDMS": ("TDMS, waveform", "nptdms"),
-    "MATLAB 4": ("MATLAB 4", "matio"),
-    "MATLAB 5": ("MATLAB 5, struct", "matio"),
-    "MATLAB 7.3": ("MATLAB v7.3, struct", "matio"),
-    "MDF 3": ("MDF 3.30", "asammdf"),
-    "MDF 4": ("MDF 4.10", "asammdf"),
-    "LabVIEW": ("LabVIEW, packets", "numpy"),
-    "spreadsheet": ("Excel", "python_calamine"),
-    "JSON lines": ("JSON lines, value and unit", "numpy"),
-    "JSON document": ("JSON, array of signals", "numpy"),
-    "long table": ("long, historian with units", "numpy"),
-    "scope": ("a clock each, TwinCAT Scope", "numpy"),
-    "quantity": ("units in cells, quoted decimal commas", "numpy"),
-    "channel table": ("Graphtec GL", "numpy"),
-    "split time": ("time, date and hours, minutes, seconds", "numpy"),
+    "text": "text, preamble",
+    "TDMS": "TDMS, waveform",
+    "MATLAB 4": "MATLAB 4",
+    "MATLAB 5": "MATLAB 5, struct",
+    "MATLAB 7.3": "MATLAB v7.3, struct",
+    "MDF 3": "MDF 3.30",
+    "MDF 4": "MDF 4.10",
+    "LabVIEW": "LabVIEW, packets",
+    "spreadsheet": "Excel",
+    "JSON lines": "JSON lines, value and unit",
+    "JSON document": "JSON, array of signals",
+    "long table": "long, historian with units",
+    "scope": "a clock each, TwinCAT Scope",
+    "quantity": "units in cells, quoted decimal commas",
+    "channel table": "Graphtec GL",
+    "split time": "time, date and hours, minutes, seconds",
 }
 
 
+def first_word(name: str) -> str:
+    return re.split(r"\W", name)[0]
+
+
+# of each other format the first file in `FILES`
+for name in FILES:
+    if first_word(name) not in map(first_word, _DIALECTS.values()):
+        _DIALECTS[first_word(name)] = name
+
+
 def dialect(kind: str, folder: Path) -> Path:
-    name, library = _DIALECTS[kind]
-    pytest.importorskip(library)
-    return {**DIALECTS, **EXPORTS}[name].write(folder)
+    try:
+        path = {**DIALECTS, **EXPORTS}[_DIALECTS[kind]].write(folder)
+        read(path, **{**DIALECTS, **EXPORTS}[_DIALECTS[kind]].options)
+    except (ImportError, MissingExtra) as error:
+        pytest.skip(str(error))
+    return path
 
 
 def own(name: str, folder: Path) -> Path:

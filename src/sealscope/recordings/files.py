@@ -16,10 +16,7 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, Request
-from sealscope.recordings.formats.matlab import is_matlab_4
 from sealscope.recordings.formats.structured.archives import is_workbook, unpack
-from sealscope.recordings.formats.structured.json_log import is_json
-from sealscope.recordings.formats.structured.lvm import is_lvm
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
@@ -37,12 +34,12 @@ _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["arch
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
 #: Suffix -> format, of all files and of files to write.
 _SUFFIXES = {suffix: kind for kind, entry in _FORMATS.items() for suffix in entry["suffixes"]}
-SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if kind in ("netcdf", "text", "parquet")}
-#: Formats read in this process; damaged files of the others can crash their libraries or fill the memory.
-_SAFE_FORMATS = ("text", "lvm")
+SUFFIXES = {suffix: kind for suffix, kind in _SUFFIXES.items() if _FORMATS[kind].get("written")}
+#: Formats read in this process.
+_SAFE_FORMATS = tuple(kind for kind, entry in _FORMATS.items() if entry.get("safe"))
 #: Limits for reading a file of another format: time _BASE_TIME [s] + size / _MIN_SPEED [bytes/s], memory
 #: _BASE_MEMORY [bytes] + _MEMORY_RATIO * size.
-_BASE_TIME, _MIN_SPEED, _MIN_SPEED_SHEETS = 10.0, 20e6, 5e5
+_BASE_TIME, _MIN_SPEED, _MIN_SPEED_SLOW = 10.0, 20e6, 5e5
 _BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
 #: Deepest nesting of archives that is unpacked.
 _MAX_NESTING = 3
@@ -70,36 +67,45 @@ def _detect_format(path: Path) -> str:
     if any(_BEGINS["netcdf"].match(head, offset) for offset in (512, 1024, 2048, 4096)):  # after a user block of HDF5
         return "netcdf"
     foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
-    if foreign is None and is_matlab_4(head):
-        return "matlab"
+    if foreign is None and (binary := _find_format(head, is_text=False)):
+        return binary
     if foreign is None and detect_encoding(head) is None:
         foreign = _PROPRIETARY.get(path.suffix.lower())
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")
-    return "lvm" if is_lvm(head) else "json" if is_json(head) else "text"
+    return _find_format(head, is_text=True) or "text"
 
 
-def _format_function(kind: str, verb: str) -> Callable[..., Any]:
-    """Import the function that reads or writes files of a format.
+def _find_format(head: bytes, *, is_text: bool) -> str | None:
+    """Find the format whose function `recognise` (`formats.toml`) returns True for the first bytes `head` of a file.
 
-    Its name is ``read_KIND`` or ``write_KIND``, by `kind`, the format, and `verb`, "read" or "write".
+    `is_text`: true to ask the formats that are text, false to ask the others. None if no function returns True.
     """
+    candidates = {kind: entry["recognise"] for kind, entry in _FORMATS.items() if "recognise" in entry}
+    for kind, function in candidates.items():
+        if bool(_FORMATS[kind].get("text")) == is_text and _format_function(kind, function)(head):
+            return kind
+    return None
+
+
+def _format_function(kind: str, name: str) -> Callable[..., Any]:
+    """Import the function `name` of the module that reads files of the format `kind`."""
     module = import_module(f"sealscope.recordings.formats.{_FORMATS[kind]['module']}")
-    return getattr(module, f"{verb}_{kind}")  # type: ignore[no-any-return]
+    return getattr(module, name)  # type: ignore[no-any-return]
 
 
 def _read_by_format(file: Path, kind: str, request: Request) -> RecordingFields:
     """Read a file of the format `kind` to the fields of a recording; `request` chooses the columns."""
-    return _format_function(kind, "read")(file, request)  # type: ignore[no-any-return]
+    return _format_function(kind, f"read_{kind}")(file, request)  # type: ignore[no-any-return]
 
 
 @checked_call
 def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: float | None = None) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
-    Formats: text, NetCDF-4, HDF5, Parquet, TDMS, MATLAB (v4 to v7.3), MDF 3 and 4, LabVIEW's .lvm, JSON (lines,
-    records, columns) and spreadsheets (.xlsx, .xlsb, .xls, .ods), each also inside .gz, .bz2, .xz, .zst, .zip or
-    .tar. Channels of different rates are brought to the clock of the chamber pressures; the history says how.
+    Formats: MATLAB, TDMS, HDF5, Parquet, JSON, spreadsheets and others (`docs/reference/formats.md`), also inside
+    .gz, .bz2, .xz, .zst, .zip or .tar. Channels of different rates are brought to the clock of the chamber pressures;
+    the history says how.
 
     Parameters
     ----------
@@ -243,7 +249,7 @@ def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
             fields = _read_by_format(file, kind, request)
         else:
             size = file.stat().st_size
-            limit = _BASE_TIME + size / (_MIN_SPEED_SHEETS if kind in ("spreadsheet", "json") else _MIN_SPEED)
+            limit = _BASE_TIME + size / (_MIN_SPEED_SLOW if _FORMATS[kind].get("slow") else _MIN_SPEED)
             memory = _BASE_MEMORY + _MEMORY_RATIO * size
             fields = run_on_file(
                 _read_by_format, file, kind, request, limit=limit, memory=memory, disk=max_unpacked_size(file)
@@ -299,4 +305,4 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     delimiter = {"delimiter": "," if file.suffix.lower() == ".csv" else "\t"} if kind == "text" else {}
     values, units, description = recording.series()
     with atomic_write(file) as temporary:
-        _format_function(kind, "write")(temporary, values, units, description, **delimiter)
+        _format_function(kind, f"write_{kind}")(temporary, values, units, description, **delimiter)
