@@ -12,6 +12,7 @@ import numpy as np
 
 from sealscope.compiled import kernel, law, make_record, record_dtype
 from sealscope.errors import InputError
+from sealscope.parameters.circuit import check_circuit
 from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
@@ -118,11 +119,7 @@ class Drive(_Invertible):
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's pump and drive; raise InputError for a valve-controlled rig."""
-        if not rig.circuit.pump_feeds_chambers:
-            raise InputError(
-                f"a pump's drive must have a pump-controlled rig (valve.spool = absent), got {rig.name}; ValveDrive is "
-                "for a servo valve"
-            )
+        check_circuit("a pump's drive (of a servo valve: ValveDrive)", rig.name, rig.circuit, "pump_feeds_chambers")
         motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)  # for the class's equation
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
@@ -132,6 +129,11 @@ class Drive(_Invertible):
     def lag(self) -> float:
         """Time constant [s] of the motor's speed loop; infinite if the loop has no integral term."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
+
+    @staticmethod
+    def mean_pressure(rig: Rig) -> float:
+        """Return the mean pressure [Pa] of a rig's chambers at standstill: the charge pressure."""
+        return rig.fluid.p_charge
 
     def flow(self, u: Array, dp: Array, rate: float, settling: int = 0) -> Array:
         """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
@@ -193,10 +195,13 @@ class ValveDrive(_Invertible):
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's servo valve; raise InputError for a pump-controlled rig."""
         valve, supply = rig.valve, rig.supply
-        if not rig.circuit.valve_controlled:
-            raise InputError(f"a valve's drive must have a servo valve (valve.spool = present), got rig {rig.name}")
+        check_circuit("a servo valve's drive", rig.name, rig.circuit, "valve_controlled")
         pump_flow = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P  # all of it through the relief valve
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
+
+    def mean_pressure(self, rig: Rig) -> float:
+        """Compute the mean pressure [Pa] of a rig's chambers at standstill: halfway from supply to return."""
+        return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
         """Make the parameters of the servo valve, as `drive_voltage` takes them; `rate` is ignored.

@@ -14,7 +14,7 @@ from sealscope.control.controller import CompiledLaw, Controller, Measured, Star
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
 from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, make_observer, update_observer
 from sealscope.control.position import PositionPI
-from sealscope.errors import InputError
+from sealscope.parameters.circuit import check_circuit
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -112,11 +112,8 @@ class FaultTolerant:
         from sealscope.physics.cylinder import mid_stroke_volumes
 
         cylinder, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
-        if not rig.circuit.pump_is_measured:
-            raise InputError(
-                "a fault-tolerant controller must have a pump whose angle it reads (valve.spool = absent), got rig "
-                f"{rig.name}"
-            )
+        subject = "a fault-tolerant controller, which reads the pump's angle,"
+        check_circuit(subject, rig.name, rig.circuit, "pump_is_measured")
         V_A, V_B = mid_stroke_volumes(cylinder)
         balance = Balance(
             D=rig.pump.q_b / (2.0 * math.pi),

@@ -90,15 +90,11 @@ class Flatness:
         """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
-        # mean pressure of a chamber at standstill: behind a valve halfway from supply to return
-        mean_pressure = (
-            0.5 * (drive.p_s + 2.0 * rig.supply.p_return) if isinstance(drive, ValveDrive) else rig.fluid.p_charge
-        )
         return cls(
             feedback=PositionPI.from_rig(rig),
             drive=drive,
             M=cylinder.M_eq,
-            F_C=friction.F_pr + 2.0 * friction.F_cfr * mean_pressure,
+            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),
             F_v=friction.F_v,
             v_th=friction.v_th,
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,

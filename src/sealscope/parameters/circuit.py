@@ -1,42 +1,104 @@
-"""The two hydraulic circuits: how a machine's pump or servo valve is connected with the chambers of its cylinder."""
+"""The hydraulic circuits: how a machine's pump or servo valve is connected with the chambers of its cylinder."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+from sealscope.errors import InputError
 
 
 class HydraulicCircuit(NamedTuple):
-    """Connection of pump and cylinder chambers, either `PUMP_CIRCUIT` or `VALVE_CIRCUIT`; `Rig.circuit` chooses one.
+    """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
-    A third circuit is a third value of this type, with a flag for each property that its users ask for; no user
-    compares the name.
+    A further circuit is a further value of this type. Other modules ask for the properties below and do not compare
+    circuits. `valve_controlled` alone chooses laws: of `physics/rig.py`, `physics/standstill.py`, `control/drive.py`
+    and the balances of `diagnosis/inference/terms.py`.
 
     Attributes
     ----------
     name : str
         Name in messages.
+    parameter, value : str
+        Parameter that chooses the circuit, and its value.
+    required : mapping of str to str
+        Further parameters that must have a value in a rig with this circuit.
     valve_controlled : bool
         A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
     pump_feeds_chambers : bool
-        The pump delivers into chamber A and draws from B, or the reverse: one balance of volumes holds for both.
+        The pump delivers into chamber A and draws from B, or the reverse: one balance of volumes holds for both, the
+        pump's leakage cannot be told from that past the piston, and equal areas need no position.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
         Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
+    flow_size : {"area", "displacement"}
+        Size of the machine by which the balance of volumes gives L/min; its uncertainty is that key of the table
+        ``[size]`` in ``diagnosis/inference/priors.toml``.
+    watched_by : tuple of tuple of str
+        Sets of channels from which the balance of volumes watches a running machine, the best set first.
+    needed_channels : str
+        Channels that the balance of volumes of a recording needs, in words for a message.
     """
 
     name: str
+    parameter: str
+    value: str
+    required: Mapping[str, str]
     valve_controlled: bool
     pump_feeds_chambers: bool
     pump_is_measured: bool
     holds_load: bool
+    flow_size: Literal["area", "displacement"]
+    watched_by: tuple[tuple[str, ...], ...]
+    needed_channels: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.parameter} = {self.value})"
+
+    @property
+    def size_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that state `flow_size`."""
+        return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
 
 
 #: A pump whose speed is commanded, in a closed circuit with the cylinder.
 PUMP_CIRCUIT = HydraulicCircuit(
-    "pump-controlled", valve_controlled=False, pump_feeds_chambers=True, pump_is_measured=True, holds_load=False
+    name="pump-controlled",
+    parameter="valve.spool",
+    value="absent",
+    required={"supply.drive": "absent"},
+    valve_controlled=False,
+    pump_feeds_chambers=True,
+    pump_is_measured=True,
+    holds_load=False,
+    flow_size="displacement",
+    watched_by=(("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "x", "omega")),
+    needed_channels="p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u",
 )
 #: A servo valve between a supply and the cylinder.
 VALVE_CIRCUIT = HydraulicCircuit(
-    "valve-controlled", valve_controlled=True, pump_feeds_chambers=False, pump_is_measured=False, holds_load=True
+    name="valve-controlled",
+    parameter="valve.spool",
+    value="present",
+    required={"supply.drive": "constant-speed", "line.orifices": "absent", "makeup.check_valves": "absent"},
+    valve_controlled=True,
+    pump_feeds_chambers=False,
+    pump_is_measured=False,
+    holds_load=True,
+    flow_size="area",
+    watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
+    needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion",
 )
+#: All circuits.
+CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
+
+
+def check_circuit(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
+    """Check that a circuit has a property, which is an attribute `flag` of type bool.
+
+    `subject`: thing that needs it, such as "a unit"; `rig`: name of the rig. Raises InputError otherwise.
+    """
+    if not getattr(circuit, flag):
+        suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))
+        raise InputError(f"{subject} must have a rig that is {suitable}, got {rig}, which is {circuit}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from functools import cache
+from operator import attrgetter
 from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from pydantic.fields import FieldInfo
 from sealscope.calls import suggestion
 from sealscope.errors import InputError
 from sealscope.parameters.actuator import Cylinder, Friction
-from sealscope.parameters.circuit import PUMP_CIRCUIT, VALVE_CIRCUIT, HydraulicCircuit
+from sealscope.parameters.circuit import CIRCUITS, HydraulicCircuit
 from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
@@ -141,7 +142,7 @@ class Rig(Part):
                 f"makeup.G_relief = {makeup.G_relief:g} m^3/(s Pa): relief valves must have an accumulator to open "
                 "into (makeup.check_valves = present or pilot-operated), got check_valves = absent"
             )
-        self._check_valve()
+        self._check_circuit()
         self._check_lines()
         displaced_volume = abs(cylinder.A_A - cylinder.A_B) * cylinder.L
         if makeup.check_valves == "pilot-operated" and makeup.V_gas <= displaced_volume:
@@ -156,23 +157,18 @@ class Rig(Part):
             )
         return self
 
-    def _check_valve(self) -> None:
-        """Check that valve and supply are both present or both absent, and that the rest of the rig suits them.
+    def _check_circuit(self) -> None:
+        """Check the parameters that the circuit requires, and those by which a supply, if any, holds its pressure.
 
-        A valve-controlled rig has neither throttles nor make-up valves, and its motor's speed loop has an integral
-        gain. Its accumulator, if any, has a precharge below the supply's pressure. Raises ValueError otherwise.
+        The speed loop of a supply's motor has an integral gain, and its accumulator a precharge below the supply's
+        pressure. Raises ValueError otherwise.
         """
-        valve, supply = self.valve, self.supply
-        if self.circuit.valve_controlled != (supply.drive != "absent"):
-            raise ValueError(
-                "a servo valve must have a supply, and a supply a valve (valve.spool = present and supply.drive = "
-                f"constant-speed), got valve.spool = {valve.spool} and supply.drive = {supply.drive}"
-            )
-        if not self.circuit.valve_controlled:
+        supply, circuit = self.supply, self.circuit
+        for name, required in circuit.required.items():
+            if (value := attrgetter(name)(self)) != required:
+                raise ValueError(f"a rig that is {circuit} must have {name} = {required}, got {value}")
+        if supply.drive == "absent":
             return
-        for name, value in (("line.orifices", self.line.orifices), ("makeup.check_valves", self.makeup.check_valves)):
-            if value != "absent":
-                raise ValueError(f"a servo valve (valve.spool = present) must have {name} = absent, got {value}")
         if self.motor.K_i <= 0:
             raise ValueError(
                 f"motor.K_i must be > 0 V/rad where the motor holds the speed of a supply, got {self.motor.K_i:g}"
@@ -236,8 +232,8 @@ class Rig(Part):
 
     @property
     def circuit(self) -> HydraulicCircuit:
-        """Hydraulic circuit of the rig, valve-controlled if it has a servo valve and pump-controlled otherwise."""
-        return VALVE_CIRCUIT if self.valve.spool == "present" else PUMP_CIRCUIT
+        """Hydraulic circuit of the rig, which one of its parameters chooses."""
+        return next(circuit for circuit in CIRCUITS if attrgetter(circuit.parameter)(self) == circuit.value)
 
     @property
     def channel_map(self) -> dict[str, str]:

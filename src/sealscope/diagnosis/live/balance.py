@@ -32,7 +32,7 @@ from sealscope.diagnosis.live.coefficients import (
     load_block,
     relative_motion,
 )
-from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.joining import SampleRun, format_ways
 from sealscope.diagnosis.live.signals import MIN_BLOCKS, WINDOW, SignalWindow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
@@ -175,14 +175,14 @@ class LiveBalance:
         """
         self._balances = live_equations(rig, names, with_tested_terms=True)
         if not self._balances:
-            needed = "x, u, p_A, p_B, p_1 and p_2" if _has_valve(rig) else "x, p_A, p_B and theta or omega"
+            needed = format_ways(rig.circuit.watched_by)
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
         # of the pump's angle and speed the one that is recorded, behind a valve neither
         needed_names = {"x", "p_A", "p_B", next((name for name in ("theta", "omega") if name in names), "x")}
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)
         self.size_error = size_error(rig)
-        self.cause: Cause = "piston leak" if _has_valve(rig) else "piston or pump leak"
+        self.cause: Cause = "piston or pump leak" if rig.circuit.pump_feeds_chambers else "piston leak"
         self.litres = self.states_flow(rig) if litres is None else litres
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1
@@ -206,7 +206,7 @@ class LiveBalance:
     @staticmethod
     def states_flow(rig: Rig) -> bool:
         """Test whether a rig states the sizes that are needed to give a leak in L/min."""
-        return rig.states(*(("cylinder.A_A", "cylinder.A_B") if _has_valve(rig) else ("pump.q_b",)))
+        return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the balance that they complete.
@@ -393,14 +393,9 @@ def _split(blocks: Blocks) -> list[Blocks]:
     return [blocks[k : k + 1] for k in range(len(blocks))]
 
 
-def _has_valve(rig: Rig) -> bool:
-    """Test whether a servo valve feeds the cylinder."""
-    return bool(rig.circuit.valve_controlled)
-
-
 def size_error(rig: Rig) -> float:
     """Return the relative standard error of flows that is due to the uncertain sizes of the machine."""
-    return float(INFERENCE.size.area if _has_valve(rig) else INFERENCE.size.displacement)
+    return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:

@@ -33,12 +33,10 @@ def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
     """Return the sets of channels from which an actuator can be watched, the best set first.
 
     The volume balance reads the position. The pressure response needs no position, but works only for a cylinder with
-    equal areas and without a servo valve.
+    equal areas that the pump feeds.
     """
-    if rig.circuit.valve_controlled:
-        return (("p_A", "p_B", "p_1", "p_2", "u", "x"),)
-    balance_ways = tuple(("p_A", "p_B", "x", pump_channel) for pump_channel in ("theta", "omega"))
-    return balance_ways if rig.cylinder.single_rod else (*balance_ways, ("p_A", "p_B", "u"))
+    has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
+    return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:

@@ -83,7 +83,7 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     if isinstance(command, Position):
         return float(np.clip(command.value_at(np.zeros(())), -half_stroke, half_stroke))
     area, volts = 0.5 * (cylinder.A_A + cylinder.A_B), command.volts(np.arange(0.0, duration + dt, dt))
-    if rig.circuit.valve_controlled:
+    if not rig.circuit.pump_feeds_chambers:
         flow_per_volt = drive_of(rig).unloaded_flow(1.0)
         positions = dt * np.cumsum(volts) * flow_per_volt / area
         centre = 0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0))

@@ -25,7 +25,7 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
     """
     blocks = PRESSURE.blocks
     if not rig.circuit.pump_feeds_chambers:
-        return "behind a servo valve a position is needed"
+        return f"a machine that is {rig.circuit.name} needs a position"
     if rig.cylinder.single_rod:
         return "needs a cylinder of two like areas: on a single rod a position is needed"
     for name, unit in {"u": "V", "p_A": "Pa", "p_B": "Pa"}.items():

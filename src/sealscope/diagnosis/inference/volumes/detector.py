@@ -57,9 +57,8 @@ _NO_BALANCE = {
     False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
     "that what leaks moves it: record its position x",
 }
-#: Reason for having no balance for lack of a channel; the same of a held load, which may still creep.
-_NO_FLOW = "needs p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u"
-_NO_CREEP = f"{_NO_FLOW}; without them it judges a held load that creeps in the healthy recordings"
+#: Reason for having no balance for lack of a channel, where a held load may still creep.
+_NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
@@ -95,9 +94,7 @@ class VolumeBalance:
         """Return the reason why a recording cannot be used for a volume balance; None if it can."""
         channels = frozenset(recording.channels)
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
-            if self.rig.circuit.valve_controlled:
-                return "needs x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion"
-            return _NO_FLOW
+            return f"needs {self.rig.circuit.needed_channels}"
         if stride_samples(recording.rate) < MIN_STRIDE:
             return (
                 f"needs {MIN_STRIDE / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
@@ -257,7 +254,7 @@ class VolumeBalance:
         if balance is None and (has_flow or "x" not in recording):
             return Observed(self.name, lack=_NO_BALANCE["x" in recording].format(recording.duration))
         if balance is None or not self._is_held_by_valves(balance, summaries):
-            return Observed(self.name, lack=_NO_CREEP)
+            return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
         names = [name for name in balance.columns[0].names if name != TURNING]
         return self._report(
