@@ -8,6 +8,9 @@ import logging
 import re
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib import import_module
+from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -15,12 +18,21 @@ from sealscope.monitor.database.export import ESTIMATE_COLUMNS, export_labels
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.outputs.grafana import dashboard
 from sealscope.monitor.outputs.prometheus import format_metrics
+from sealscope.monitor.settings import MonitorSettings, OutputSettings, template
 from sealscope.monitor.supervisor import PartAway
 
 from ..refusals import refusal
 from .plant import WORN, lines_of, served, settings_in
 
 LINES = lines_of({"press 1": WORN}, 150)
+ROOT = Path(__file__).resolve().parents[2]
+#: Table of the settings -> its class, of each output.
+OUTPUTS = {
+    name: kind
+    for name, field in MonitorSettings.model_fields.items()
+    for kind in get_args(field.annotation)
+    if isinstance(kind, type) and issubclass(kind, OutputSettings)
+}
 
 
 class Receiver:
@@ -93,6 +105,16 @@ def test_the_service_posts_what_is_left_when_it_ends(tmp_path):
     served(settings_in(tmp_path, hook), LINES)
     assert [body["event"] for _, body in receiver.got] == ["raised"]
     assert receiver.got[0][0]["Authorization"] == "Bearer hook"
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_an_output_has_a_table_a_class_and_a_line_on_the_page(name):
+    module, _, sender = OUTPUTS[name].sender.partition(":")
+    output = getattr(import_module(f"sealscope.monitor.outputs.{module}"), sender)
+    assert output.part
+    assert all(callable(getattr(output, function)) for function in ("from_settings", "deliver", "end"))
+    assert f"# [{name}]" in template()
+    assert re.search(rf"^\|.*`\[{name}\]`", (ROOT / "docs" / "monitor.md").read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_the_dashboard_asks_for_metrics_that_there_are(watched):

@@ -19,17 +19,17 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import DROPPED, WatchedActuators
 from sealscope.monitor.bounded_queue import BoundedQueue, QueueLoad
 from sealscope.monitor.database.store import MonitorStore, outage_reason
-from sealscope.monitor.outputs.events import EventLines, Webhook
-from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
+from sealscope.monitor.outputs.events import EventLines
+from sealscope.monitor.outputs.output import open_outputs
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
-from sealscope.monitor.settings import MonitorSettings, read_secret
+from sealscope.monitor.settings import MonitorSettings
 from sealscope.monitor.sources.broker import broker_source
 from sealscope.monitor.sources.folder import watch_folders
 from sealscope.monitor.sources.lines import line_source
 from sealscope.monitor.sources.opcua import opcua_source
 from sealscope.monitor.sources.source_block import UNREADABLE_FILE, BlockReceiver, RefusedMessage, SourceBlock
-from sealscope.monitor.supervisor import DATABASE, WEBHOOK
+from sealscope.monitor.supervisor import DATABASE
 from sealscope.storage.folders import lock_file
 
 _log = logging.getLogger(__name__)
@@ -173,14 +173,8 @@ class Service:
         """Start the threads that send events and states to the outputs in the settings, and return them."""
         repeat = self.supervisor.repeat
         threads = [repeat("standard output", self._write_events, _LOOK_S, last=self._write_events)]
-        if (settings := self.settings.sparkplug) is not None and (broker := self.settings.mqtt) is not None:
-            password = read_secret(broker.password_file, "mqtt.password_file")
-            node = SparkplugNode(self.store, self.summaries, self.count, broker, settings, password)
-            threads.append(repeat("Sparkplug node", node.deliver, _LOOK_S, last=node.end))
-        if (hook := self.settings.webhook) is not None:
-            token = read_secret(hook.token_file, "webhook.token_file")
-            webhook = Webhook(self.store, hook.url, token, hook.timeout_s)
-            threads.append(repeat(WEBHOOK, webhook.deliver, _LOOK_S, last=webhook.deliver))
+        outputs = open_outputs(self.actuators, self.settings)
+        threads.extend(repeat(output.part, output.deliver, _LOOK_S, last=output.end) for output in outputs)
         return threads
 
     def _store_queued(self) -> None:

@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
@@ -181,23 +181,34 @@ class OpcUaSettings(_Part):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
-class SparkplugSettings(_Part):
+class OutputSettings(_Part):
+    """The settings of an output of alarms, which is switched on by its table in the settings (`MonitorSettings`).
+
+    `sender`: "module:class" of the `Output` in `monitor/outputs/` that they are for.
+    """
+
+    sender: ClassVar[str]
+
+
+class SparkplugSettings(OutputSettings):
     """The settings of the Sparkplug B edge node by which the monitor publishes alarms and values.
 
     `every_s` [s]: interval at which changed values are published; alarms are published at once.
     """
 
+    sender: ClassVar[str] = "sparkplug_node:SparkplugNode"
     group: _Level = "Sealscope"
     node: _Level = "monitor"
     every_s: float = Field(default=10.0, ge=0.1, le=86_400)
 
 
-class WebhookSettings(_Part):
+class WebhookSettings(OutputSettings):
     """The settings of a web address that receives the events of alarms by POST requests.
 
     `token_file`: file with the token that is sent, None for none; `timeout_s` [s]: longest time of a request.
     """
 
+    sender: ClassVar[str] = "events:Webhook"
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
     token_file: _File | None = None
     timeout_s: float = Field(default=10.0, gt=0, le=300)

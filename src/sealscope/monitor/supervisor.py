@@ -20,7 +20,7 @@ from sealscope.errors import printable
 
 _log = logging.getLogger(__name__)
 #: Parts that stand for external services.
-DATABASE, BROKER, WEBHOOK, OPCUA = "database", "broker", "webhook", "OPC UA server"
+DATABASE, BROKER, OPCUA = "database", "broker", "OPC UA server"
 #: Pauses after errors [s]: the first one, the longest one, and the longest one in an outage of the database.
 FIRST_PAUSE_S, MAX_PAUSE_S, DATABASE_PAUSE_S = 0.2, 60.0, 5.0
 #: A restarted part counts as reached after running for this long [s].

@@ -10,12 +10,16 @@ import asyncio
 import json
 import logging
 import os
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import httpx
 
 from sealscope.monitor.database.store import MonitorStore
+from sealscope.monitor.settings import MonitorSettings, WebhookSettings, read_secret
 from sealscope.monitor.supervisor import PartAway
+
+if TYPE_CHECKING:
+    from sealscope.monitor.actuators import WatchedActuators
 
 logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
 #: Events that the detector causes; they are not announced while an alarm is shelved.
@@ -75,11 +79,23 @@ class Webhook:
     longest time of a request with its answer.
     """
 
+    part = "webhook"
+
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
         self._store, self._url, self._timeout = store, url, timeout
         self._headers = {"Content-Type": "application/json", "User-Agent": "sealscope"}
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
+
+    @classmethod
+    def from_settings(cls, actuators: WatchedActuators, table: WebhookSettings, settings: MonitorSettings) -> Self:
+        """Build the output from its `table` of the settings; raise InputError if the token cannot be read."""
+        token = read_secret(table.token_file, "webhook.token_file")
+        return cls(actuators.store, table.url, token, table.timeout_s)
+
+    def end(self) -> None:
+        """Post the remaining alarm events; raise PartAway if one is not confirmed."""
+        self.deliver()
 
     def deliver(self) -> None:
         """Post the new alarm events to the web address; raise PartAway if one is not confirmed."""

@@ -15,13 +15,16 @@ import tomllib
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 from sealscope.monitor import sparkplug as spb
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.mqtt_client import MqttLink
-from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, topic_level
+from sealscope.monitor.settings import BrokerSettings, MonitorSettings, SparkplugSettings, read_secret, topic_level
 from sealscope.recordings.formats.timebase import counts_from_1970
+
+if TYPE_CHECKING:
+    from sealscope.monitor.actuators import WatchedActuators
 
 _log = logging.getLogger(__name__)
 _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
@@ -33,6 +36,8 @@ class SparkplugNode:
     `store`: database with the events; `summaries`: function that returns the summary of each actuator; `count`:
     function called with the reason for each received message that is dropped; `password`: password for the broker.
     """
+
+    part = "Sparkplug node"
 
     def __init__(
         self,
@@ -56,6 +61,14 @@ class SparkplugNode:
         self._birth_due = threading.Event()
         self._sent_values: dict[str, dict[str, Any]] = {}
         self._next_update = 0.0
+
+    @classmethod
+    def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
+        """Build the node from its `table` of the settings; raise InputError if the password cannot be read."""
+        broker = settings.mqtt
+        assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker
+        password = read_secret(broker.password_file, "mqtt.password_file")
+        return cls(actuators.store, actuators.summaries, actuators.count, broker, table, password)
 
     def deliver(self) -> None:
         """Send new events of alarms and, every few seconds, changed values to the Sparkplug host.
