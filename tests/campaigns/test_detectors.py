@@ -21,6 +21,7 @@ from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, pa
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import judge_simulated_campaign, write_result
 from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import diagnose
@@ -353,7 +354,10 @@ def test_a_fault_has_the_cause_that_a_detector_should_name():
         ("what nobody simulates", "what nobody simulates"),
     ):
         assert expected_cause(words) == cause
-    assert {row.cause for row in FAULTS.values()} - {""} <= set(get_args(Cause))
+    assert {row.cause for row in FAULTS.values()} - {""} <= {
+        *get_args(Cause),
+        *(event.cause for event in load_events()),
+    }
 
 
 def test_the_documented_plan_is_sound_where_the_example_is_installed(monkeypatch):

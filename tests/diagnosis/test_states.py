@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
+from importlib.resources import files
 from typing import get_args
 
 import pytest
 
+from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -55,7 +58,9 @@ def test_a_worse_state_has_a_higher_severity_and_a_leak_beyond_the_limit_the_hig
 
 
 def test_every_cause_says_what_to_do():
-    actions = {cause: state_of("cannot tell", cause).action for cause in get_args(Cause)}
+    causes = tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))["causes"]
+    assert {*get_args(Cause), *(event.cause for event in load_events() if event.cause)} == causes.keys()
+    actions = {cause: state_of("cannot tell", cause).action for cause in causes}
     assert len({*actions.values()}) == len(actions)
     assert state_of("cannot tell").action not in actions.values()
 

@@ -9,7 +9,6 @@ from fnmatch import fnmatchcase
 from functools import cache
 from importlib.resources import files
 from itertools import product
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -26,12 +25,12 @@ from sealscope.diagnosis.inference.terms import AIR, BIAS, TURNING, circulation,
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.rms_change.blocks import JUDGED
-from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.parameters import load_rig
 from sealscope.parameters.load import rig_names
 from sealscope.signals.details import QUANTITIES
 
 ROWS = tomllib.loads((files("sealscope.diagnosis.decision") / "events.toml").read_text("utf-8"))
+CAUSES = tomllib.loads((files("sealscope.diagnosis.verdict") / "states.toml").read_text("utf-8"))["causes"]
 KEYS = {"cause", "probability", "moves", "words"}
 #: Events that look as any term does.
 CATCH_ALL = ("regime", "unsteady motion")
@@ -84,7 +83,7 @@ def known_names() -> frozenset[str]:
 def test_every_row_is_complete(name: str) -> None:
     row = ROWS[name]
     assert KEYS <= set(row) <= KEYS | {"disturbs"}
-    assert row["cause"] in (*get_args(Cause), "")
+    assert row["cause"] in (*CAUSES, "")
     assert row["moves"] and row["words"]
     assert set(row["probability"]) == {"value", "unit", "source"}
     assert 0.0 < row["probability"]["value"] < 1.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from sealscope.campaigns.cases.case import CampaignCase, CaseInputs
 from sealscope.campaigns.plans.duty import COMMAND
-from sealscope.diagnosis.verdict.evidence import LEAKS, Cause, Evidence, Verdict
+from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence, Verdict
 from sealscope.errors import InputError, SealscopeError
 from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.simulation.faults import parse_fault
@@ -44,7 +44,7 @@ class Statement:
     onset_interval_s: tuple[float, float] | None = None
     leak_lpm: float | None = None
     leak_interval_lpm: tuple[float, float] | None = None
-    cause: Cause | None = None
+    cause: str | None = None
 
     @classmethod
     def from_evidence(cls, evidence: Evidence | Statement) -> Statement:

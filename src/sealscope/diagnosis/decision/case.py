@@ -21,7 +21,7 @@ from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
-from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Cause
+from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 
 #: Name of the third test, besides WITHIN and AGAINST: whether the leakage exceeds the limit in the rig's file.
 LEVEL = "against the rig's file"
@@ -50,7 +50,7 @@ class OtherEvent(NamedTuple):
     recording.
     """
 
-    cause: Cause
+    cause: str
     description: str
     probability: float
     observable: Observable

@@ -10,7 +10,6 @@ from functools import cache, lru_cache
 from importlib.resources import files
 
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.verdict.evidence import Cause
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Event:
     """
 
     name: str
-    cause: Cause | None
+    cause: str | None
     probability: float
     affected: tuple[str, ...]
     disturbed: tuple[str, ...]

@@ -27,7 +27,6 @@ from sealscope.diagnosis.inference.changes.volumes import VOLUMES
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.inference.scatter import RISE
 from sealscope.diagnosis.priors.decision import DECISION
-from sealscope.diagnosis.verdict.evidence import Cause
 
 #: Largest number of events in an explanation.
 MAX_EVENTS = 3
@@ -242,7 +241,7 @@ def _coincide(observable: Observable, anchor: Observable) -> bool:
 
 
 def probability_of(
-    explanations: Sequence[Explanation], *names: str, cause: Cause | None = None, data_kind: str | None = None
+    explanations: Sequence[Explanation], *names: str, cause: str | None = None, data_kind: str | None = None
 ) -> float:
     """Compute the probability that one of the named events, or any event with the given cause, happened.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from sealscope.diagnosis.decision.case import Case, LeakTest, OtherEvent
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS
-from sealscope.diagnosis.decision.texts import has_text, text_of
+from sealscope.diagnosis.decision.texts import text_of
 from sealscope.diagnosis.inference.observable import Observable, Ringing
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (
@@ -18,6 +18,7 @@ from sealscope.diagnosis.verdict.evidence import (
     WITHIN,
     Evidence,
 )
+from sealscope.diagnosis.verdict.states import find_separation
 from sealscope.paragraphs import join_names
 
 #: Minimum sampling rate at which the ringing can be judged [Hz].
@@ -145,7 +146,7 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
         key=lambda observable: observable.score,
         default=None,
     )
-    separates = text_of("separates", event.cause if has_text("separates", event.cause) else "default")
+    separates = find_separation(event.cause) or text_of("separates", "default")
     onset_text = "" if clearest is None else _onset_text(clearest)
     return text_of(
         "doubt",

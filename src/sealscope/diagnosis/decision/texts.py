@@ -18,8 +18,3 @@ def _texts() -> Mapping[str, Mapping[str, str]]:
 def text_of(table: str, key: str, **values: Any) -> str:
     """Return the text with a given `key` in a `table` of `texts.toml`, with `values` filled in for its fields."""
     return _texts()[table][key].format(**values)
-
-
-def has_text(table: str, key: str) -> bool:
-    """Return True if a `table` of `texts.toml` has a text with the given `key`."""
-    return key in _texts()[table]

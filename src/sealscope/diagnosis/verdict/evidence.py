@@ -11,7 +11,7 @@ from sealscope.recordings.recording import Array
 Verdict = Literal["leak", "no leak", "cannot tell"]
 #: The three verdicts; `decision.decide` alone gives one.
 LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
-#: Possible causes of a change.
+#: Causes of a change that the code names; those of events and their actions: `[causes]` in `states.toml`.
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
@@ -171,7 +171,7 @@ class Evidence:
     leak_lpm: float | None = None
     leak_interval_lpm: tuple[float, float] | None = None
     parts: tuple[Evidence, ...] = ()
-    cause: Cause | None = None
+    cause: str | None = None
     course: LeakCourse | None = field(default=None, compare=False, repr=False)
     refuses: frozenset[Figure] = frozenset()
     total_leakage: TotalLeakage | None = None

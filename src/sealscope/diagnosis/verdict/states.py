@@ -83,6 +83,12 @@ def state_of(
     )
 
 
+def find_separation(cause: str) -> str | None:
+    """Find the words for what separates a cause from a leak in `states.toml`; None if it has none."""
+    words: str | None = _tables()["causes"].get(cause, {}).get("separates")
+    return words
+
+
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action for a condition of `states.toml`, or for the cause of a change if the table has one.
 
