@@ -17,6 +17,7 @@ import numpy as np
 from sealscope.calls import checked_call, suggestion
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.fmu.variables import INPUTS
+from sealscope.parameters.instruments import Sensors
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
@@ -32,7 +33,7 @@ MAX_COMMUNICATION_STEP = 5e-4
 _INPUT_NAMES = ("u", "G", "C", "F")
 _MEASURED_NAMES = tuple(name for name in CHANNEL_UNITS if name not in ("u", "omega"))  # omega is read off the encoder
 #: Channels without an instrument in a rig: the FMU's outputs are recorded without noise or quantisation.
-_WITHOUT_INSTRUMENT = ("q_comp", "q_pump", "T_oil")
+_WITHOUT_INSTRUMENT = tuple(name for name in _MEASURED_NAMES if name not in Sensors.model_fields)
 
 
 @checked_call

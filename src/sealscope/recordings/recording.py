@@ -75,9 +75,8 @@ class Recording:
     t : array_like of float, shape (n,)
         Time [s].
     channels : mapping of str to array_like of float, shape (n,)
-        Values of each channel, NaN where a sample is missing. The names are those of `CHANNEL_UNITS`: ``u``, ``omega``,
-        ``theta``, ``x``, ``p_1``, ``p_2``, ``p_A``, ``p_B``, ``q_leak``, ``q_comp``, ``q_pump``,
-        ``T_oil``.
+        Values of each channel, NaN where a sample is missing. The names are those of `CHANNEL_UNITS`, such as ``x``,
+        ``p_A`` and ``p_B``.
     units : mapping of str to str
         Unit of each channel: the SI unit of `CHANNEL_UNITS`, or ``count`` for raw counts of a converter.
     rate : float

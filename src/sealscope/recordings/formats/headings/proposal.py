@@ -19,12 +19,9 @@ _KIND = {name: frozenset(words) for name, words in WORDS["kind"].items()}
 _UNSPACED = frozenset(
     word for words in (*_MEASURED.values(), *_SIDE.values()) for word in words if ord(word[0]) > 0x2E7F
 )
-#: Measured quantity -> unit, and -> channel; a pressure's channel depends on its side.
-_UNITS = {"oil": "K", "position": "m", "command": "V", "speed": "rad/s", "angle": "rad", "leak": "m^3/s", "time": "s"}
-_CHANNELS = {
-    "oil": "T_oil", "position": "x", "command": "u", "spool": "u", "speed": "omega", "angle": "theta", "leak": "q_leak",
-    "time": "t"
-}  # fmt: skip
+#: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool's unit is any.
+_CHANNELS: dict[str, str] = WORDS["channel"]
+_UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANNELS.items() if kind != "spool"}
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")

@@ -15,5 +15,5 @@ def _split_lists(tree: Any) -> Any:
 
 
 _tree = tomllib.loads(files(__package__).joinpath("words.toml").read_text(encoding="utf-8"))
-#: Meaning, or table of meanings -> words; the entries of `time` and `stated` stay texts.
-WORDS: dict[str, Any] = {**_split_lists(_tree), "time": _tree["time"], "stated": _tree["stated"]}
+#: Meaning, or table of meanings -> words; the entries of `time`, `channel` and `stated` stay texts.
+WORDS: dict[str, Any] = {**_split_lists(_tree), **{name: _tree[name] for name in ("time", "channel", "stated")}}
