@@ -256,24 +256,20 @@ class StatedMachine:
         parts = [recording for _, recording in recordings if recording is not None]
         yield files[0], join(parts, names=[file.name for file in files]) if len(parts) == len(files) else None
 
-    def diagnose(
-        self, recording: Recording, baseline: Sequence[Recording], file: Path, false_alarm: float
-    ) -> Diagnosis:
+    def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
         """Diagnose a recording of this machine.
 
         `baseline`: healthy recordings, or empty; a commissioned machine has its own instead. `file`: name of the
-        recording in the diagnosis; `false_alarm`: probability of the verdict `leak` on a leak-free recording.
+        recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`.
         """
         from dataclasses import replace
 
         from sealscope.diagnosis.diagnose import diagnose
 
         if self.commissioned is not None:
-            diagnosis = self.commissioned.diagnose(recording, false_alarm_probability=false_alarm)
+            diagnosis = self.commissioned.diagnose(recording, **settings)
             return replace(diagnosis, file=str(file))
-        return diagnose(
-            recording, baseline, false_alarm_probability=false_alarm, rig=self.rig, limit=self.limit, file=file
-        )  # fmt: skip
+        return diagnose(recording, baseline, rig=self.rig, limit=self.limit, file=file, **settings)
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

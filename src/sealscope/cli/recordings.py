@@ -74,7 +74,7 @@ def diagnose(
 
         files = recordings_in(files)
         form = form if form == "jsonl" else "table"
-    work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm=false_alarm)
+    work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm_probability=false_alarm)
     is_piped = _reads_standard_input([*files, *stated.baseline])
     # a baseline is read once per process, and only this process has standard input
     is_serial = join or is_piped or stated.baseline or stated.commissioned or len(files) < _MIN_PARALLEL_FILES
@@ -166,13 +166,13 @@ def _reads_standard_input(files: Iterable[Path]) -> bool:
 
 
 def _iter_diagnoses(
-    files: Sequence[Path], machine: opt.StatedMachine, *, joined: bool, false_alarm: float
+    files: Sequence[Path], machine: opt.StatedMachine, *, joined: bool, **settings: Any
 ) -> Iterator[DiagnosedRecording | None]:
     """Yield each recording with its diagnosis, or None for an unreadable file or baseline.
 
-    A file never serves as its own baseline. `joined`: the files are parts of a single recording; `false_alarm`:
-    probability of the verdict `leak` on a leak-free recording. Raises InputError if a file is its only baseline, and
-    UnreadableFile if no baseline can be read.
+    A file never serves as its own baseline. `joined`: the files are parts of a single recording; `settings`:
+    further arguments of `sealscope.diagnose`. Raises InputError if a file is its only baseline, and UnreadableFile if
+    no baseline can be read.
     """
     baseline = machine.baseline
     for file in files if baseline else ():
@@ -191,7 +191,7 @@ def _iter_diagnoses(
             opt.complain(f"no other baseline than the file itself could be read, so it is not diagnosed ({file})")
             yield None
         else:
-            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, healthy, file, false_alarm))
+            diagnosis = opt.attempt(file, partial(machine.diagnose, recording, healthy, file, **settings))
             yield None if diagnosis is None else DiagnosedRecording(recording, diagnosis)
 
 
@@ -272,7 +272,7 @@ def report(
         opt.check_folder(parse_page_path(output))
     n_results, name = 0, None if stated.commissioned is None else stated.commissioned.name
     written_pages: list[tuple[Path, Diagnosis]] = []
-    for result in _iter_diagnoses(files, stated, joined=join, false_alarm=false_alarm):
+    for result in _iter_diagnoses(files, stated, joined=join, false_alarm_probability=false_alarm):
         n_results += 1
         if result is None:
             continue
@@ -302,7 +302,7 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     paths = recordings_in(files)
     if output.resolve() in {path.resolve() for path in paths}:
         raise InputError(f"a page must not replace a recording, got {output}")
-    results = list(_iter_diagnoses(paths, machine, joined=False, false_alarm=false_alarm))
+    results = list(_iter_diagnoses(paths, machine, joined=False, false_alarm_probability=false_alarm))
     entries = [
         Judged(result.diagnosis, _start_seconds(result), partial(machine.read, Path(result.diagnosis.file)))
         for result in results
