@@ -8,6 +8,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class ClockPriors(PriorTable):
     """Assumptions on the clock of a data logger.
 
+    - `regular` [sampling steps]: intervals between these numbers are regular; a longer one is a gap.
     - `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular.
     - `rate`: largest relative error of the stated rate.
     - `near` [usual intervals]: longest interval in which no sample is missing.
@@ -15,6 +16,7 @@ class ClockPriors(PriorTable):
     - `late`: largest fraction of samples with a time before an earlier one.
     """
 
+    regular: tuple[float, float]
     scatter: float
     rate: float
     near: float
@@ -93,6 +95,7 @@ class HumPriors(PriorTable):
     - `around` [Hz]: the spectrum up to this distance from a line of hum is its background.
     - `over_rest`, `over_median`: smallest ratios of the line to the largest and to the median amplitude of the
       background.
+    - `shortest` [s]: shortest channel that is searched for hum.
     """
 
     loud: float
@@ -101,6 +104,7 @@ class HumPriors(PriorTable):
     around: float
     over_rest: float
     over_median: float
+    shortest: float
 
 
 class CreepPriors(PriorTable):
@@ -108,10 +112,30 @@ class CreepPriors(PriorTable):
 
     - `rate` [Pa/s]: smallest drift that is reported.
     - `seconds` [s]: shortest recording in which it is searched for.
+    - `parts`: number of parts of the recording whose mean pressures are compared.
+    - `even`: smallest and largest step from part to part, over the median step.
     """
 
     rate: float
     seconds: float
+    parts: int
+    even: tuple[float, float]
+
+
+class RailPriors(PriorTable):
+    """Marks of a rail, i.e. an end of its range at which a pressure is clipped.
+
+    - `samples` [samples]: fewest samples there.
+    - `crowd`: smallest ratio of these samples to those at any of the values next to it.
+    - `jump` [quantisation steps]: smallest jump to or from it.
+    - `run` [samples], `long_jump` [quantisation steps]: length of a run from which a smaller jump suffices; this jump.
+    """
+
+    samples: int
+    crowd: float
+    jump: float
+    run: int
+    long_jump: float
 
 
 class HoldPriors(PriorTable):
@@ -192,6 +216,7 @@ class RecordingPriors(PriorTable):
     unsigned: UnsignedPriors
     hum: HumPriors
     creep: CreepPriors
+    rail: RailPriors
     hold: HoldPriors
     readings: ReadingPriors
     oil: OilRange

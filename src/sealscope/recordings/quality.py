@@ -25,20 +25,11 @@ Severity = Literal["note", "warning", "fatal"]
 
 #: Fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1.
 SHORTEST = 226
+_CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS = (
+    RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible
+)  # fmt: skip
 #: Intervals between these numbers of sampling steps are regular; a longer one is a gap.
-_MIN_STEP, _MAX_STEP = 0.5, 1.5
-#: Number of parts of a recording whose mean pressures are compared; the steps from part to part must be within these
-#: factors of the median step.
-_CREEP_PARTS, _MIN_CREEP, _MAX_CREEP = 8, 0.5, 2.0
-#: Fewest samples at the value of a rail (a clipped end of the range), and length of a run there [samples] from which
-#: a smaller jump suffices.
-_MIN_AT_RAIL, _LONG_RUN = 5, 20
-#: Smallest jump to or from a rail [quantisation steps], and that for a long run; smallest ratio of the samples at a
-#: rail to those at any of the values next to it.
-_MIN_JUMP, _MIN_LONG_JUMP, _MIN_CROWD = 3.5, 1.5, 5
-#: Shortest channel that is searched for hum [s], so that a line is narrow.
-_MIN_HUM_TIME = 1.5
-_CLOCK, _HUM, _CREEP, _SENSOR_LIMITS = RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.possible
+_MIN_STEP, _MAX_STEP = _CLOCK.regular
 
 
 @dataclass(frozen=True)
@@ -172,11 +163,11 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
         return []
     mean = 0.5 * (recording["p_A"] + recording["p_B"])
-    parts = np.array_split(mean, _CREEP_PARTS)
+    parts = np.array_split(mean, _CREEP.parts)
     means = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
     steps = np.diff(means)
-    creep_rate = float(np.median(steps)) * _CREEP_PARTS / duration
-    is_even = np.all((steps / np.median(steps) > _MIN_CREEP) & (steps / np.median(steps) < _MAX_CREEP))
+    creep_rate = float(np.median(steps)) * _CREEP.parts / duration
+    is_even = np.all((steps / np.median(steps) > _CREEP.even[0]) & (steps / np.median(steps) < _CREEP.even[1]))
     if not (is_even and abs(creep_rate) >= _CREEP.rate):
         return []
     text = (
@@ -359,7 +350,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     stuck_values = np.empty(0) if stuck is None else values[stuck[:, 0]]
     ends = values.min(), values.max()
     at_ends = max(np.count_nonzero(values == end) for end in ends)
-    if at_ends < _MIN_AT_RAIL and not np.isin(stuck_values, ends).any():
+    if at_ends < _RAIL.samples and not np.isin(stuck_values, ends).any():
         return []
     distinct, counts = np.unique(values, return_counts=True)
     if distinct.size < 3:
@@ -373,8 +364,8 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
         first, length = runs[np.argmax(runs[:, 1])]  # the longest
         before, after = values[max(first - 1, 0)], values[min(first + length, values.size - 1)]
         jump = max(abs(before - distinct[index]), abs(after - distinct[index]))
-        is_crowded = counts[index] >= _MIN_AT_RAIL and counts[index] > _MIN_CROWD * counts[nearest].max()
-        is_entered_by_jump = length >= 3 and jump > (_MIN_LONG_JUMP if length >= _LONG_RUN else _MIN_JUMP) * quantum
+        is_crowded = counts[index] >= _RAIL.samples and counts[index] > _RAIL.crowd * counts[nearest].max()
+        is_entered_by_jump = length >= 3 and jump > (_RAIL.long_jump if length >= _RAIL.run else _RAIL.jump) * quantum
         if (is_crowded and is_entered_by_jump) or (stuck_values == distinct[index]).any():
             rails.append(Rail(side, float(distinct[index]), int(counts[index]), int(runs[0, 0])))
     return rails
@@ -407,7 +398,7 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
     list is empty for less than 1.5 s.
     """
     n = values.size
-    if n / rate < _MIN_HUM_TIME:
+    if n / rate < _HUM.shortest:
         return []
     x = np.arange(n) - (n - 1) / 2
     detrended = values - values.mean()

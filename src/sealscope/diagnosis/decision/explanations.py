@@ -30,9 +30,8 @@ from sealscope.diagnosis.priors.decision import DECISION
 
 #: Largest number of events in an explanation.
 MAX_EVENTS = 3
-#: Minimum log Bayes factor (ten to one) for an event to be combined with others. Duty, noise and friction change
-#: together so often that sets of events with less evidence would crowd out a leak.
-MIN_LOG_FACTOR = 2.3
+#: Minimum log Bayes factor for an event to be combined with others.
+MIN_LOG_FACTOR: float = DECISION.explanation.combined
 #: Events that are a leak past the piston or in the pump, which lie in parallel.
 LEAK_EVENTS = ("piston leak", "pump leak")
 

@@ -36,6 +36,7 @@ class ExplanationPriors(PriorTable):
     - `leak`: probability from which a change is called a leak.
     - `named`: probability from which a cause other than a leak is named.
     - `sure`: a leak is excluded if its probability is below 1 - `sure`.
+    - `combined`: smallest logarithm of the Bayes factor with which an event is combined with others.
     - `misfit`: smallest relative error with which a term of the model is assumed to describe the data.
     """
 
@@ -43,6 +44,7 @@ class ExplanationPriors(PriorTable):
     leak: float
     named: float
     sure: float
+    combined: float
     misfit: float
 
 

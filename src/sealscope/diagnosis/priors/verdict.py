@@ -7,9 +7,11 @@ class RepairPriors(PriorTable):
     """Default repair limit.
 
     - `creep` [mm/min]: creep speed of the piston with its lines shut.
+    - `watch`: fraction of the limit under which a leak only has the level "monitor".
     """
 
     creep: float
+    watch: float
 
 
 class FalseAlarmPriors(PriorTable):

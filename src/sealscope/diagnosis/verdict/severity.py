@@ -115,7 +115,7 @@ class Severity:
         if self.of_limit is None:
             return None
         _, low, high = self.of_limit
-        return "repair" if low > 1.0 else "monitor" if high < 0.5 else "plan"
+        return "repair" if low > 1.0 else "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the severity as plain values for JSON: the level, and each figure with its `_interval`."""
