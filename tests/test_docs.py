@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -97,3 +98,36 @@ def test_the_changelog_has_the_version_of_the_package():
     newest = re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[1]
     cited = re.search(r"^version: ([\d.]+)", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1]
     assert newest == version == cited
+
+
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def test_files_that_the_guide_names_exist():
+    """A file that stands beside another one is named without the beginning of its path."""
+    named = {name for name in re.findall(r"`([\w/.-]+\.(?:py|toml|md))`", GUIDE) if "NAME" not in name}
+    paths = [f"/{path.relative_to(ROOT).as_posix()}" for path in ROOT.rglob("*.*") if ".git" not in path.parts]
+    assert len(named) > 30
+    assert sorted(name for name in named if not any(path.endswith(f"/{name}") for path in paths)) == []
+
+
+def test_symbols_that_the_guide_names_are_in_their_files():
+    pairs = re.findall(r"`([\w/]+/\w+\.py)`: `(\w[\w.]*)`", GUIDE)
+    source = ROOT / "src" / "sealscope"
+    files = {name: path.read_text(encoding="utf-8") for name, _ in pairs if (path := source / name).exists()}
+    words = [(name, word) for name, symbol in pairs for word in symbol.split(".") if name in files]
+    assert len(words) > 15
+    assert [(name, word) for name, word in words if not re.search(rf"\b{word}\b", files[name])] == []
+
+
+def test_keys_that_the_guide_names_have_value_unit_and_source():
+    """After a file of priors stand keys in the form `[table] key`, and further keys of the same table alone."""
+    cells = re.findall(r"`([\w/]+/priors\.toml)` ((?:(?:, )?`\[\w+\] \w+`|, `\w+`)+)", GUIDE)
+    keys, table = [], ""
+    for name, text in cells:
+        tables = tomllib.loads((ROOT / "src" / "sealscope" / name).read_text(encoding="utf-8"))
+        for heading, key in re.findall(r"`(?:\[(\w+)\] )?(\w+)`", text):
+            table = heading or table
+            keys.append((name, table, key, set(tables.get(table, {}).get(key, ()))))
+    assert len(keys) > 20
+    assert [key for key in keys if key[-1] != {"value", "unit", "source"}] == []
