@@ -11,7 +11,7 @@ import pytest
 import sealscope
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig, rig_names
-from sealscope.parameters.circuit import CIRCUITS, PUMP_CIRCUIT, VALVE_CIRCUIT, check_circuit
+from sealscope.parameters.circuit import CIRCUITS, PUMP_CIRCUIT, VALVE_CIRCUIT, check_circuit_property
 from sealscope.parameters.rig import declared_names
 from sealscope.recordings.channels import CHANNEL_UNITS
 
@@ -56,9 +56,9 @@ def test_the_monitor_s_page_lists_the_channels_of_every_circuit() -> None:
 
 
 def test_a_circuit_without_a_property_is_refused_with_those_that_have_it() -> None:
-    check_circuit("a unit", "rig", PUMP_CIRCUIT, "pump_feeds_chambers")
+    check_circuit_property("a unit", "rig", PUMP_CIRCUIT, "pump_feeds_chambers")
     with refusal("a unit", "valve.spool = absent", "worn", "valve.spool = present"):
-        check_circuit("a unit", "worn", VALVE_CIRCUIT, "pump_feeds_chambers")
+        check_circuit_property("a unit", "worn", VALVE_CIRCUIT, "pump_feeds_chambers")
 
 
 def test_laws_alone_ask_which_valve_a_circuit_has() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.compiled import kernel, law, make_record, record_dtype
 from sealscope.errors import InputError
-from sealscope.parameters.circuit import check_circuit
+from sealscope.parameters.circuit import check_circuit_property
 from sealscope.recordings.recording import Array
 
 if TYPE_CHECKING:
@@ -119,7 +119,9 @@ class Drive(_Invertible):
     @classmethod
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's pump and drive; raise InputError for a valve-controlled rig."""
-        check_circuit("a pump's drive (of a servo valve: ValveDrive)", rig.name, rig.circuit, "pump_feeds_chambers")
+        check_circuit_property(
+            "a pump's drive (of a servo valve: ValveDrive)", rig.name, rig.circuit, "pump_feeds_chambers"
+        )
         motor, displacement = rig.motor, rig.pump.q_b / (2.0 * math.pi)  # for the class's equation
         shortfall, corner = (motor.C_e / motor.k_p, motor.K_i / motor.k_p) if motor.k_p > 0 else (0.0, 0.0)
         droop = motor.R_c * displacement / (motor.C_m * motor.C_e)
@@ -195,7 +197,7 @@ class ValveDrive(_Invertible):
     def from_rig(cls, rig: Rig) -> Self:
         """Build the model of a rig's servo valve; raise InputError for a pump-controlled rig."""
         valve, supply = rig.valve, rig.supply
-        check_circuit("a servo valve's drive", rig.name, rig.circuit, "valve_controlled")
+        check_circuit_property("a servo valve's drive", rig.name, rig.circuit, "valve_controlled")
         pump_flow = rig.pump.q_b / (2.0 * math.pi) * supply.omega_P  # all of it through the relief valve
         return cls(valve.Q_N, valve.dp_N, valve.u_N, supply.p_set + pump_flow / supply.G_set)
 

@@ -14,7 +14,7 @@ from sealscope.control.controller import CompiledLaw, Controller, Measured, Star
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
 from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, make_observer, update_observer
 from sealscope.control.position import PositionPI
-from sealscope.parameters.circuit import check_circuit
+from sealscope.parameters.circuit import check_circuit_property
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -113,7 +113,7 @@ class FaultTolerant:
 
         cylinder, sensors, makeup = rig.cylinder, rig.sensors, rig.makeup
         subject = "a fault-tolerant controller, which reads the pump's angle,"
-        check_circuit(subject, rig.name, rig.circuit, "pump_is_measured")
+        check_circuit_property(subject, rig.name, rig.circuit, "pump_is_measured")
         V_A, V_B = mid_stroke_volumes(cylinder)
         balance = Balance(
             D=rig.pump.q_b / (2.0 * math.pi),

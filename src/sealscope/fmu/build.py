@@ -24,7 +24,7 @@ from sealscope.fmu.description import format_description, templates
 from sealscope.fmu.machine import FAILURES, RigChoice, object_code, rig_code
 from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, Variable, variables
 from sealscope.parameters import Rig, load_rig
-from sealscope.parameters.circuit import check_circuit
+from sealscope.parameters.circuit import check_circuit_property
 from sealscope.physics.rig import parameter_values
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write
@@ -353,7 +353,7 @@ def write_sensor_fmu(
 def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
     """Load the rig for an FMU; raise InputError if it is not pump-controlled."""
     machine = load_rig(rig)
-    check_circuit("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
+    check_circuit_property("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
     return machine
 
 

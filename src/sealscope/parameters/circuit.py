@@ -94,7 +94,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
 CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
-def check_circuit(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
+def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
     """Check that a circuit has a property, which is an attribute `flag` of type bool.
 
     `subject`: thing that needs it, such as "a unit"; `rig`: name of the rig. Raises InputError otherwise.
