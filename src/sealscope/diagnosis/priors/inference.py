@@ -215,6 +215,7 @@ class HeldOilPriors(PriorTable):
     - `from_start`: fraction of the leaks that exist from the start of a recording.
     - `gain`: relative difference between the gains of two pressure sensors.
     - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
+    - `resolved` [Pa]: margin in addition, below which a sensor does not tell a pressure from the charge pressure.
     - `steady` [s]: time over which a pressure is averaged before it is compared with the charge pressure.
     - `air`: volume fraction of free air in the oil.
     """
@@ -236,6 +237,7 @@ class HeldOilPriors(PriorTable):
     from_start: float
     gain: float
     charge: float
+    resolved: float
     steady: float
     air: float
 

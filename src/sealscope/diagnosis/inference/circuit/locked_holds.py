@@ -311,7 +311,7 @@ class HeldChambers:
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
-        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge))
+        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved)
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
         """Compute the flow during holds of a leak past the piston with a coefficient of 1.
