@@ -201,17 +201,19 @@ class BlockStream:
 
         The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy,
         so p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with
-        the flow into A. The last one counts only if it is positive, since x itself may be reversed. Each symptom has
-        a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in which something
-        else causes it.
+        the flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load
+        does work in strokes that do not return; therefore the mean of p_A - p_B over the flow is subtracted first.
+        Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
+        which something else causes it.
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             pressure, left = values[:, columns.leak], balance.flow_sign * values[:, columns.left]
             motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
             odds = _sign_log_odds(_leak_z_score(values.T @ values, columns, len(values)), INFERENCE.sense.leak)
-            if len(values):
-                odds += _sign_log_odds(_z_score((pressure - pressure.mean()) * left), INFERENCE.sense.work)
+            if (flow := np.abs(left)).any():
+                constant_load = np.average(pressure, weights=flow)
+                odds += _sign_log_odds(_z_score((pressure - constant_load) * left), INFERENCE.sense.work)
             if (agreement := _z_score(motion * left)) > 0.0:  # else either x or the flow may be reversed
                 odds += _sign_log_odds(agreement, INFERENCE.sense.sides)
             signs.append(-1.0 if odds < 0.0 else 1.0)
