@@ -16,10 +16,11 @@ from sealscope.diagnosis.inference.balance import BlockStream, recorded_blocks
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_offset, information
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
-from .balance_machine import irregular, machine, step
+from .balance_machine import DISPLACEMENT, irregular, machine, step
 
 RIG = load_rig("thesis")
 READ = ("theta", "x", "p_A", "p_B", "p_1", "p_2")
@@ -106,6 +107,35 @@ def test_swapped_sides_and_reversed_encoders_change_nothing(load: float) -> None
     backwards = {name: (lambda c, name=name: -c[name]) for name in ("theta", "x")}
     for changes in ({**swapped, **backwards}, {"theta": backwards["theta"]}, {"x": backwards["x"]}, backwards, swapped):
         same(test, judged(changed(recording, **changes))[0], rel=2e-3)
+
+
+def test_a_press_whose_pump_moves_more_oil_outward_than_back_is_wired_as_it_is() -> None:
+    """The rod takes no oil back, and the press presses only at the end: its strokes do no work against the mean load.
+
+    Speed and leakage passed for reversed on such days, and the healthy leakage of a press varied from -1 to 1.
+    """
+    seal, pressed, cycle, working = 2e-14, 60e5, 10.0, 200.0
+
+    def speed(t: np.ndarray) -> np.ndarray:
+        phase = t % cycle  # out, pressing against what leaks, back, a rest
+        stroke = 10.0 * np.sin(0.5 * np.pi * phase)
+        cycles = np.select(
+            [phase < 2.0, phase < 6.0, phase < 8.0], [stroke, seal * pressed / DISPLACEMENT, stroke], 0.0
+        )
+        return np.where(t < working, cycles, 0.0)
+
+    def load(t: np.ndarray) -> np.ndarray:
+        phase = np.where(t < working, t % cycle, 0.0)
+        return pressed * np.clip((phase - 2.0) / 0.3, 0.0, 1.0) * np.clip((6.0 - phase) / 0.3, 0.0, 1.0)
+
+    def without_rod(c: Mapping[str, np.ndarray]) -> np.ndarray:
+        turned = np.diff(c["theta"], prepend=c["theta"][0])
+        return np.cumsum(np.where(turned < 0.0, 0.5 * turned, turned))
+
+    press = changed(machine(1, speed=speed, load=load, duration=working + 12.0, G_pump=seal), theta=without_rod)
+    balance = VolumeBalance(RIG).balance(press)
+    assert balance is not None
+    assert balance.conductance.value / seal == pytest.approx(1.0, rel=0.05)
 
 
 def test_units_of_a_file_change_nothing(tmp_path: Path) -> None:
