@@ -181,8 +181,8 @@ class _OilRegression(NamedTuple):
     `left` (r,): volume displaced by the piston, minus the compression expected from the priors; `oil` (r, 4): columns
     of compressibility, dead volumes of A and B, and free air, whose coefficients are deviations from the priors;
     `deviations` (4,): standard deviations of the priors; `inflation`: number of readings over the number of
-    independent ones; `min_variance`: minimum variance of a reading, since the model describes the compressed volume
-    only to within a fraction.
+    independent ones; `min_variance`: variance of a reading in addition to that of the noise, since the model describes
+    the compressed volume only to within a fraction.
     """
 
     left: Array
@@ -354,7 +354,7 @@ class HeldChambers:
             solution = inverse @ moments
             residual = left - design @ solution
             cost = float(residual @ residual) + float(prior @ solution**2)
-            previous, variance = variance, max(cost / len(left) * self.n_readings / degrees_of_freedom, min_variance)
+            previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + min_variance
             if abs(variance - previous) <= TOLERANCE * previous:
                 break
         covariance = variance * inflation * inverse
@@ -478,7 +478,7 @@ class HeldChambers:
         total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
         is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
         gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-        residual_squares = np.maximum(total - gain, min_variance * len(left))
+        residual_squares = np.maximum(total - gain, 0.0) + min_variance * len(left)
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(residual_squares))
 
     @cached_property
