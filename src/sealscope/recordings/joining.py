@@ -55,7 +55,7 @@ def file_seconds(recording: Recording, path: Path) -> float:
 
 
 def _parse_file_name(name: str) -> float | None:
-    """Parse the date and time in a file's name to seconds since 1970; None if it contains no date."""
+    """Parse the date and time in a file's name to seconds since 1970, as if in UTC; None if it contains no date."""
     match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None

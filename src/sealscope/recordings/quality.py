@@ -331,7 +331,10 @@ class Rail(NamedTuple):
 
 
 def is_mostly_clipped(values: Array) -> bool:
-    """Test whether more than half of the finite values (n,) are clipped, as in a chamber that drains to the tank."""
+    """Test whether more than half of the finite values (n,) are clipped at the ends of the channel's range.
+
+    This is so in a chamber that drains to the tank.
+    """
     finite = values[np.isfinite(values)]
     return sum(rail.samples for rail in find_rails(finite)) > len(finite) / 2
 

@@ -305,7 +305,7 @@ def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None
 
 
 def _refuse_for_now(wait: float) -> Response:
-    """Build the answer to an address that must wait `wait` seconds before its next token (status 429)."""
+    """Build the answer, with status 429, to a client who after wrong tokens must wait `wait` seconds."""
     return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 

@@ -282,7 +282,8 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
     """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
 
     `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it, over which changing parameters
-    are taken as linear; `readings`: changes of the instruments. The rows are p_A and p_B.
+    are taken as linear; `readings`: changes of the instruments. The first axis is p_A and p_B; the second has the
+    quantities whose indices are constants of `signals` (`GAIN` to `MAX_CODE`).
     """
     from sealscope.simulation.batch import signals
 
@@ -384,10 +385,10 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Compute the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
+        """Set `taps` to the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        Coefficient k multiplies the output that is k - `taps_before` outputs after the sample. `rate` [Hz]: rate of
-        the outputs.
+        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many.
+        Coefficient k multiplies the output k - `taps_before` steps after the sample. `rate` [Hz]: rate of the outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -514,10 +515,11 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command's shape [V] and the load [N] at all times that the solver's steps in a chunk need.
+        """Compute the command [V] and the load [N] at all times that the solver's steps in a chunk need.
 
-        The chunk has the outputs start <= output < stop; each step needs the inputs at `nodes` times within it.
-        Returns (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
+        The command is the one that all runs share, before the gain and offset of each. The chunk has the outputs
+        start <= output < stop; `nodes` are the times within a step at which its inputs are needed. Returns
+        (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load

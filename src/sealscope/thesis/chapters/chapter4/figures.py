@@ -76,9 +76,9 @@ def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
 
 
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
-    """Format the notes on a figure of a case: reading of the equations, and runs that failed or are not resolved.
+    """Format the notes on a figure of a case: variant of the equations, and runs that failed or need a smaller step.
 
-    `reading`: None for a case without orifices.
+    `reading`: one way to understand the thesis's inconsistent equations (`Reading`); None for a case without orifices.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:
