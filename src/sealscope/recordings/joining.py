@@ -33,7 +33,8 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
     It follows from the start in the provenance, else from the date in the name of the file, and from the first time
-    `t`. The name is that in the provenance, else `file`. A date without a time of day means midnight.
+    `t`. The name is that in the provenance, else `file`. Dates and times count as UTC; a date without a time of day
+    means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:

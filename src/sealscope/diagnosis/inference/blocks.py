@@ -13,8 +13,7 @@ level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its s
 
 d is the column of g (the tested column), o are the other columns with their drifts, y is the left side and s^2 the
 residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
-o o' over all rows, plus the precision of the priors, and m that of o y. The likelihood is exp(eta' g - g' Lambda g /
-2).
+o o' over all rows, plus the precision of the priors, and m that of o y. The likelihood is exp(eta'g - g'Lambda g/2).
 """
 
 from __future__ import annotations

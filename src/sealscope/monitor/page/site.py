@@ -99,7 +99,7 @@ def site(
 
 
 class _Pages:
-    """The request handlers of the page; each method serves one address of `_ROUTES`."""
+    """The request handlers of the page; each method serves one URL path of `_ROUTES`."""
 
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
@@ -113,7 +113,7 @@ class _Pages:
         self._admission = None if token is None else Admission(token)
 
     def file(self, request: Request) -> Response:
-        """Answer with the static file of the request's address."""
+        """Answer with the static file of the request's URL path."""
         name, kind = _FILES[request.url.path]
         text = str(read_package_file(name)) if name.startswith("vendor/") else _read_packaged(name)
         return Response(text, media_type=kind)

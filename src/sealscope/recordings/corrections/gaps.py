@@ -111,9 +111,9 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
     """Interpolate short gaps linearly in the channels that are not `needed`, except at the ends.
 
-    A gap is short up to `SPLINE` samples in a pressure, and up to the prior `motion` [s] in other channels, because a
-    moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the same
-    recording if these channels have no missing values.
+    A gap is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml` in other channels,
+    because a moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the
+    same recording if these channels have no missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -146,7 +146,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 def flag_holes(recording: Recording) -> Flags:
     """Flag the rows (n,) of long gaps, whose missing values have been filled (`Recording.bridged`).
 
-    A gap is long if it is longer than the prior `hole` [s] and longer than `MAX_INTERVAL` sampling steps.
+    A gap is long if it is longer than `gaps.hole` [s] of `priors.toml` and longer than `MAX_INTERVAL` sampling steps.
     """
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:

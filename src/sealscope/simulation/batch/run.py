@@ -37,7 +37,7 @@ class Member:
     """One experiment of a set of experiments that are integrated together.
 
     `row`: its index in the batch; `numbers`: the model's parameters; `effects`: changes of them within the run. Its
-    command is `gain` times the command shape that the set shares, plus `offset` [V].
+    command is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset` [V].
     """
 
     row: int
@@ -66,7 +66,7 @@ class Member:
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: their laws, command shape, load and solver settings are equal."""
+    """Experiments that are integrated together: their laws, command waveform (`shape`), load and solver are equal."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -108,7 +108,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 class _ScaledCommand(NamedTuple):
-    """A command as gain times shape plus offset [V]; `key` is a text that is equal for equal shapes."""
+    """A command as gain times waveform (`shape`) plus offset [V]; `key` is a text that is equal for equal shapes."""
 
     key: str
     shape: Command
@@ -117,9 +117,9 @@ class _ScaledCommand(NamedTuple):
 
 
 def _split_command(command: Command) -> _ScaledCommand:
-    """Split a command into gain, shape and offset, so that commands of equal shape can be simulated together.
+    """Split a command into gain, waveform and offset, so that commands of equal waveform can be simulated together.
 
-    The shape of a sine is the sine of amplitude 1. Any other command is its own shape, with gain 1 and offset 0.
+    The waveform of a sine is the sine of amplitude 1. Any other command is its own waveform, with gain 1 and offset 0.
     """
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
@@ -128,7 +128,7 @@ def _split_command(command: Command) -> _ScaledCommand:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets that can be integrated together: equal laws, command shape, load, solver settings.
+    """Group experiments into sets that can be integrated together: equal laws, waveform, load, solver settings.
 
     Raises InputError if one of them cannot be in a batch, or if they differ in duration or sampling rate.
     """
@@ -206,9 +206,9 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 class Cells:
     """Model parameters of the runs of a set over time, constant within cells.
 
-    A cell is a span of outputs, the same for all runs. `bounds` (cells + 1,): outputs at which the cells begin, and
-    the end; `base` (runs, parameters): parameters without changes; `changing`: indices of the parameters that change,
-    with their `values` (runs, changing, cells).
+    A cell is a span of outputs, i.e. of times at which the solver writes its results, the same for all runs. `bounds`
+    (cells + 1,): outputs at which the cells begin, and the end; `base` (runs, parameters): parameters without changes;
+    `changing`: indices of the parameters that change, with their `values` (runs, changing, cells).
     """
 
     bounds: np.ndarray
