@@ -217,7 +217,7 @@ def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> li
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Simulate some cases, (command, closing [%]) each, under both interpretations of the equations and with both solvers.
+    """Simulate some cases, (command, closing [%]) each, under both interpretations and with both solvers.
 
     Returns, by solver and interpretation, a list with the summary of each case's run (`summarise_run`).
     """
