@@ -343,8 +343,8 @@ def _chamber_terms(side: str) -> tuple[Term, ...]:
 def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    w is the weight of chamber A in the balance, computed by `weight_A`; V_A and V_B are the volumes of the chambers
-    at the current position, from the rig's file.
+    w is the weight of chamber A in the volume balance, computed by `weight_A`; V_A and V_B are the volumes of the
+    chambers at the current position, from the rig's file.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
