@@ -227,7 +227,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the sensor's memory `y` to 0 at the start of a run.
 
-        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0.
+        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0. The arguments are those of an FMU's
+        rig; `x_0` is ignored.
         """
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT

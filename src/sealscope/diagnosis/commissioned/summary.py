@@ -156,7 +156,8 @@ def _describe_rig(rig: Rig | None) -> str:
 def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) -> str:
     """Return the unit in which to display the channel `name`.
 
-    This is its unit in the log or, if that is not known, bar for Pa, mm for m and otherwise its SI `unit`.
+    This is its unit in the log of the first healthy recording or, if that is not known, bar for Pa, mm for m and
+    otherwise its SI `unit`.
     """
     log_unit = healthy[0].about.get("log_units", {}).get(name)
     return str(log_unit or {"Pa": "bar", "m": "mm"}.get(unit, unit))

@@ -448,7 +448,7 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        """Make a term of the edge's flow, with a coefficient in `unit`, from a function for its increments."""
+        """Make a term of the flow over the edge: an unknown coefficient, in `unit`, times `increments`."""
         return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
 
     return (

@@ -31,7 +31,7 @@ def observe_signals(recording: Recording) -> Observed:
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and pressure levels of a recording for steps; the report is empty if it is too short."""
+    """Test commanded motion, sensors and pressure levels for steps; the report is empty for too short a recording."""
     shortest = CHANGES.features.shortest
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return Observed(SIGNALS, lack="too short for changes of its signals")

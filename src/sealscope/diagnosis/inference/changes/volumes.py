@@ -117,7 +117,8 @@ def _step_hypotheses(
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
     `centred`: sums of the volume balance without the sensor offset of p_A - p_B, for leaks; `recorded`: sums with the
-    pressures as recorded; `has_accumulator`: True if the accumulator's volume shows external leaks.
+    pressures as recorded; `terms`, `columns`: the balance's terms, and the roles of its columns (leak, motion, left
+    side); `has_accumulator`: True if the accumulator's volume shows external leaks.
     """
     first = columns[0]
     for index, term in enumerate(terms):

@@ -188,6 +188,6 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
 
 
 def _mean_flow(increments: Array, rate: float) -> float:
-    """Compute the mean magnitude of a flow [m^3/s] from increments of a volume [m^3]; 0 if all are missing (NaN)."""
+    """Compute a flow's mean magnitude [m^3/s] from volume increments [m^3] at `rate` [Hz]; 0 if all are missing."""
     known = increments[np.isfinite(increments)]
     return float(np.abs(known).mean()) * rate if known.size else 0.0

@@ -223,7 +223,7 @@ def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> d
     """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
-        """Simulate one case with one solver under one interpretation of the equations, and summarise its run."""
+        """Simulate one case under one interpretation, orifices closed by `closed` [%], and summarise its run."""
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
 
     return {
@@ -302,7 +302,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     """Judge claims 4.18 and 4.19 on the drift of the piston with orifices."""
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
-        """Compute the drift [m] of the piston in a long run; `closed`: closing of the orifices [%], None for none."""
+        """Compute the piston's drift [m] in a long run; `closed`: closing of the orifices [%], None for none."""
         return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
     drift_without = drift(DEFAULT_READING, None, "converged")
