@@ -103,7 +103,7 @@ def plan_hold(
 
     In a locked hold, valves shut the cylinder off from its pump. If no duration in `HOLD_DURATIONS` suffices, the
     longest is planned. If `find` is None, a hold of `DEFAULT_DURATION` is planned. `flow` [m^3/s]: mean flow of the
-    pump under the usual duty; `false_alarm`: probability of the verdict `leak` without a leak; `detection`:
+    pump under the usual command and load; `false_alarm`: probability of the verdict `leak` without a leak; `detection`:
     probability of this verdict with the leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
@@ -118,8 +118,8 @@ class _HoldDraws:
     """Simulated locked holds of one duration, by which the smallest leak that they detect is found.
 
     In a locked hold, valves shut the cylinder off from its pump. `load` [N]: load that the cylinder holds; `flow`
-    [m^3/s]: mean flow of the pump under the usual duty; `duration` [s]; `false_alarm`: probability of the verdict
-    `leak` without a leak; `detection`: probability of this verdict with the leak.
+    [m^3/s]: mean flow of the pump under the usual command and load; `duration` [s]; `false_alarm`: probability of the
+    verdict `leak` without a leak; `detection`: probability of this verdict with the leak.
     """
 
     def __init__(
@@ -179,9 +179,9 @@ def _decay_per_conductance(rig: Rig) -> float:
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
     """Simulate a locked hold with a leak past the piston and with sensor noise; measure the leak as in a recording.
 
-    `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty; `seed`: of
-    the noise. Returns the summary of a recording with this hold. It has the leak measured in the hold, the flow and
-    the pressure difference; its Gram matrix is 0.
+    `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command and load;
+    `seed`: of the noise. Returns the summary of a recording with this hold. It has the leak measured in the hold, the
+    flow and the pressure difference; its Gram matrix is 0.
     """
     random, cylinder, sensors = np.random.default_rng(seed), rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE

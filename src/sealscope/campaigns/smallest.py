@@ -63,12 +63,12 @@ USUAL = PlannedDuty(COMMANDS[0])
 
 
 class DetectableLeak(NamedTuple):
-    """The smallest leaks that recordings of one duty and of one duration detect.
+    """The smallest leaks that recordings with one command and load, and of one duration, detect.
 
-    `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step of the leak that is detected, inf if there is none;
-    `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's leakage, inf if there is
-    none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the numbers could not be computed, else ""; `flow`
-    [m^3/s]: mean flow of the pump.
+    `duty`: command and load; `duration` [s]; `conductance` [m^3/(s Pa)]: smallest step of the leak that is detected,
+    inf if there is none; `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's
+    leakage, inf if there is none; `pressure` [Pa]: mean |p_A - p_B|; `note`: reason if the numbers could not be
+    computed, else ""; `flow` [m^3/s]: mean flow of the pump.
     """
 
     duty: PlannedDuty
@@ -83,10 +83,10 @@ class DetectableLeak(NamedTuple):
 class RecordingPlan(NamedTuple):
     """A planned recording, and the duties (commands and loads) that were compared for it.
 
-    `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible; `for_detection`:
-    the shortest recording that detects it, or the best that was tried; `for_separation`: the shortest recording that
-    also tells it from a leak of the pump, or the best that was tried; `compared`: results of all duties;
-    `usual_pressure` [Pa]: mean pressure difference of the usual duty, at which flows are stated; `false_alarm`,
+    `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible; `for_detection`: the
+    shortest recording that detects it, or the best that was tried; `for_separation`: the shortest recording that also
+    tells it from a leak of the pump, or the best that was tried; `compared`: results of all duties; `usual_pressure`
+    [Pa]: mean pressure difference under the usual command and load, at which flows are stated; `false_alarm`,
     `detection`: the wanted probabilities; `hold`: the locked hold that detects the target, None if none was planned.
     """
 
@@ -113,7 +113,7 @@ class RecordingPlan(NamedTuple):
         """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
 
         def leak_dict(leak: DetectableLeak) -> dict[str, Any]:
-            """Convert the smallest leaks of one duty to JSON values; infinite numbers become None."""
+            """Convert the smallest leaks under one command and load to JSON values; infinite numbers become None."""
             return {
                 **leak.duty._asdict(),
                 "duration_s": leak.duration,
@@ -137,7 +137,7 @@ class RecordingPlan(NamedTuple):
         }
 
     def text(self) -> str:
-        """Format the planned recording as lines of text, with the best duty and its smallest leak first."""
+        """Format the planned recording as lines of text, the best command and load with its smallest leak first."""
         best, separating = self.for_detection, self.for_separation
         at_pressure = f"at {self.usual_pressure / 1e6:.2g} MPa"
         target = "" if self.target is None else f"{self.lpm(self.target):.2g} L/min {at_pressure}: "
@@ -169,9 +169,10 @@ class RecordingPlan(NamedTuple):
 
 
 def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0) -> Experiment:
-    """Build the leak-free experiment of a duty; the piston starts where its motion is centred in the stroke.
+    """Build a leak-free experiment with the command and load of a duty; the piston's motion is centred in the stroke.
 
-    `duration` [s]. Raises InputError if the duty's command is a target of the position and not a voltage.
+    `duration` [s]. `seed`: of the sensor noise. Raises InputError if the command is a target of the position and not a
+    voltage.
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
@@ -184,7 +185,7 @@ def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0)
 def detectable_leak(
     rig: Rig, duty: PlannedDuty, duration: float, *, false_alarm: float = 0.01, detection: float = 0.9
 ) -> DetectableLeak:
-    """Compute the smallest leak that is detected in recordings of a duty and of `duration` [s].
+    """Compute the smallest leak that is detected in recordings with the command and load `duty`, of `duration` [s].
 
     The numbers are medians of `N_RECORDS` simulated recordings. `false_alarm`: probability of an alarm without a
     leak; `detection`: probability of an alarm with it. If a simulation fails, or the volume balance of its recording,
@@ -239,9 +240,10 @@ def _detectable_steps(recording: Recording, rig: Rig, false_alarm: float, detect
 def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Compute the factor by which an unknown step of the pump's leakage raises the standard error of the leak's step.
 
-    `blocks`: parts of the recording, reduced to Gram matrices of the balance's columns; `columns`: for each equation,
-    the indices of the columns with leak and pump. Both steps are in the middle of the recording. The factor is inf if
-    the balance has several equations or no column for the pump's leakage, or if the two steps cannot be told apart.
+    `blocks`: parts of the recording, reduced to Gram matrices of the volume balance's columns; `columns`: for each
+    equation, the indices of the columns with leak and pump. Both steps are in the middle of the recording. The factor
+    is inf if the balance has several equations or no column for the pump's leakage, or if the two steps cannot be told
+    apart.
     """
     column = columns[0]
     if PUMP not in column.names or len(columns) > 1:
@@ -268,14 +270,14 @@ def plan_recording(
     held: float | None = None,
     progress: Callable[[str, float], None] = lambda label, fraction: None,
 ) -> RecordingPlan:
-    """Find the shortest recording that detects a leak of `find` [m^3/s] at the mean pressure of the usual duty.
+    """Find the shortest recording that detects a leak of `find` [m^3/s] at the mean pressure under the usual duty.
 
     If `find` is None, the recording of `COMPARISON_SECONDS` that detects the smallest leak is planned. `usual`: the
-    machine's usual duty; `duties`: others to try, by default all combinations of `COMMANDS` and `LOADS`;
-    `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it; `held` [N]:
-    force that the cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if the rig
-    has such valves; `progress`: called with a label and the completed fraction. Raises InputError if the usual duty
-    cannot be simulated or judged.
+    machine's usual duty, i.e. its command and load; `duties`: others to try, by default all combinations of `COMMANDS`
+    and `LOADS`; `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it;
+    `held` [N]: force that the cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if
+    the rig has such valves; `progress`: called with a label and the completed fraction. Raises InputError if the usual
+    duty cannot be simulated or judged.
     """
     choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]

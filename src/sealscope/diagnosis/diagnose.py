@@ -109,15 +109,15 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """Changes of duty, noise, mains hum and mean pressures, which may explain an alarm without a leak."""
+        """Changes of duty (motion, load), noise, hum and mean pressures, which may explain an alarm without a leak."""
         return observe_rivals(self.recording, self.baseline, self.distrust)
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Scores that the detectors' statistics take in the healthy recordings, which have no leak.
+        """Distribution of the detectors' test results in the healthy recordings, which have no leak.
 
-        Other scores are judged by them. If the volume balance found that valves cut the pump off while the machine
-        rests, the healthy recordings are evaluated with the same assumption.
+        The scores of the judged recording are compared with it. If the volume balance found that valves cut the pump
+        off while the machine rests, the healthy recordings are evaluated with the same assumption.
         """
         leak = self.report(ORDER[0]).leak if ORDER[0] in detectors() else None
         is_shut_at_rest = isinstance(leak, BalanceLeak) and leak.balance.shut

@@ -113,7 +113,7 @@ def _interval_coverage(
 
 
 def _as_matching(values: npt.ArrayLike | None, n: int, what: str) -> Array:
-    """Convert `values` to an array (n,), filled with nan if `values` is None; raise InputError for another shape."""
+    """Convert `values` to an array (n,), all nan for None; raise InputError, which names `what`, for another shape."""
     array = np.full(n, math.nan) if values is None else np.asarray(values, dtype=np.float64)
     if array.shape != (n,):
         raise InputError(f"{what} must be as many as the true values, got {array.shape} for {n}")

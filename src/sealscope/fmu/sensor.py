@@ -10,8 +10,9 @@ The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
     G +- hypot(t_(n-1) sqrt(v/n), 1.96 o),    v = max(s^2, mean of sd^2)
 
 with the standard deviation s of the blocks' estimates, their standard errors sd, Student's t, and the systematic
-standard error o due to the other coefficients and to the size of the machine. The rise is the mean of the last n
-blocks minus that of the first N = `WINDOW` blocks, the baseline, which lies d blocks earlier. Its variance is
+standard error o due to the other coefficients and to the machine's sizes (displacement, piston area). The rise is the
+mean of the last n blocks minus that of the first N = `WINDOW` blocks, the baseline, which lies d blocks earlier. Its
+variance is
 
     variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
 
@@ -123,9 +124,9 @@ def variables(rig: Rig) -> Iterator[Variable]:
 class SensorChoice(NamedTuple):
     """The settings that are compiled into a soft sensor.
 
-    `rate` [Hz]: sampling rate; `size_error`: relative standard error of the leakage that an uncertain size of the
-    machine causes; `column_order`: indices into `COLUMNS` in the order that `weigh_rows` needs: first the `n_fast`
-    terms whose coefficients are fitted to each block, then the other terms, last the response.
+    `rate` [Hz]: sampling rate; `size_error`: relative standard error of the leakage that uncertain sizes of the machine
+    (displacement, piston area) cause; `column_order`: indices into `COLUMNS` in the order that `weigh_rows` needs:
+    first the `n_fast` terms whose coefficients are fitted to each block, then the other terms, last the response.
     """
 
     rate: float
@@ -226,7 +227,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the sensor's memory `y` to 0 at the start of a run.
 
-        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0.
+        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0. The arguments are those of an FMU's
+        rig; `x_0` is ignored.
         """
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
@@ -377,10 +379,9 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
     """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-    An estimate at standstill is left out if it is imprecise. `m`: the sensor's memory; `size_error`: relative
-    standard error due to the size of the machine; `n_rows`, `pressure` [Pa]: number of rows of the volume balance
-    in the block, and its mean abs(p_A - p_B); `is_learned`: True if the other coefficients are updated with the
-    block.
+    An estimate at standstill is left out if it is imprecise. `m`: the sensor's memory; `size_error`: relative standard
+    error due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block, and
+    its mean abs(p_A - p_B); `is_learned`: True if the other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -403,9 +404,9 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 def _fit_to_waiting(m: Any, size_error: float) -> None:
     """Fit the coefficients of the volume balance to the first `LEARNED` blocks, and append the leakage of each.
 
-    `m`: the sensor's memory, in which these blocks wait. The median of the precisions of their estimates becomes
-    the usual precision, to which later estimates are compared. `size_error`: relative standard error of the leakage
-    due to the size of the machine.
+    `m`: the sensor's memory, in which these blocks wait. The median of the precisions of their estimates becomes the
+    usual precision, to which later estimates are compared. `size_error`: relative standard error of the leakage due to
+    the machine's sizes (displacement, piston area).
     """
     model = m.model
     for k in range(LEARNED):
@@ -541,9 +542,9 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
-    `m`: the sensor's memory; `size_error`: relative standard error due to the size of the machine; `quantiles`:
-    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of
-    blocks and the misfit are always written; the other outputs are 0 while there are too few blocks.
+    `m`: the sensor's memory; `size_error`: relative standard error due to the machine's sizes; `quantiles`: Student's t
+    for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks and the
+    misfit are always written; the other outputs are 0 while there are too few blocks.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1

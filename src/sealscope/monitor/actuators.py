@@ -473,7 +473,8 @@ class WatchedActuators:
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last stored summary of each actuator in the settings, by name.
 
-        The state in a summary is replaced by "no data" if no block has come for `no_data_s` and the state is no leak.
+        The state in a summary is replaced by "no data" if it is unknown, or if no block has come for `no_data_s`
+        seconds. States that report a leak (`LEAKING`) are kept.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

@@ -36,13 +36,13 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 class Alarm:
     """An alarm of an actuator; times are on the clock of the samples [s], intervals have 95 % confidence.
 
-    `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which it was raised and last
-    changed; `onset_s`: time at which the leak began; `leak_lpm` [L/min]: flow of the leak; `cause`: path of the
-    leaking oil; `evidence`: reason for this; `next_check`: recommended inspection; `baseline`: version of the healthy
-    baseline; `returned_s`: time at which the cause ended, None while it lasts; `mark`: last mark of a person
-    ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is
-    not announced; `by_chance_per_1000_h`: upper limit of the false alarms of this strength that a healthy actuator
-    raises in 1000 operating hours.
+    `id`: name of the actuator with a running number; `level`: "warning" or "error"; `raised_s`, `updated_s`: times at
+    which it was raised and last changed; `onset_s`: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;
+    `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended
+    inspection; `baseline`: version of the healthy baseline; `returned_s`: time at which the cause ended, None while it
+    lasts; `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
+    `shelved_until_s`: time before which it is not announced; `by_chance_per_1000_h`: upper limit of the false alarms of
+    this strength that a healthy actuator raises in 1000 operating hours.
     """
 
     id: str
@@ -123,10 +123,10 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the estimate of one block of samples; return the alarm and the name of the event.
 
-        The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or ""
-        for none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.
-        `leak`: the leak that the watch of the actuator has found, None if there is none; `baseline`: version of the
-        healthy baseline.
+        The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
+        none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
+        the leak that the watch of the actuator has found, None if there is none; `baseline`: version of the healthy
+        baseline; `settings`: thresholds and debounce.
 
         A leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
         raises the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then
@@ -200,7 +200,7 @@ class AlarmJudge:
         A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the verdict on
         the recording before is a leak as well. The verdict `no leak`, or a leak below the warning threshold, ends the
         alarm. `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy
-        baseline.
+        baseline; `settings`: thresholds and the allowed rate of false alarms.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or ""
         for none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.

@@ -33,8 +33,8 @@ class HydraulicCircuit(NamedTuple):
     holds_load : bool
         Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
     flow_size : {"area", "displacement"}
-        Size of the machine by which the balance of volumes gives L/min; its uncertainty is that key of the table
-        ``[size]`` in ``diagnosis/inference/priors.toml``.
+        Piston area or pump displacement, by which the balance of volumes gives L/min; its uncertainty is that key of
+        the table ``[size]`` in ``diagnosis/inference/priors.toml``.
     watched_by : tuple of tuple of str
         Sets of channels from which the balance of volumes watches a running machine, the best set first.
     needed_channels : str

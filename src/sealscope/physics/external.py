@@ -86,7 +86,7 @@ def pilot_valve_flow(
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, negative if it flows backwards.
 
-    It is G_check dp times the opening of the valve. `G_check` [m^3/(s Pa)]: conductance of the fully open valve; for
-    the other parameters see `pilot_opening`.
+    It is G_check dp times the opening of the valve. `dp` [Pa]: pressure drop in the free direction; `G_check`
+    [m^3/(s Pa)]: conductance of the fully open valve; for the other parameters see `pilot_opening`.
     """
     return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)

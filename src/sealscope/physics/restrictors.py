@@ -11,7 +11,7 @@ from sealscope.physics.lanes import any_lane, select
 
 @law
 def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
-    """Compute the flow coefficient c = C_d A sqrt(2/rho) [m^3/(s Pa^0.5)] of an orifice, as in eqs. (4.9)-(4.12)."""
+    """Compute an orifice's flow coefficient C_d A sqrt(2/rho) [m^3/(s Pa^0.5)], A = `area` [m^2]; eqs. (4.9)-(4.12)."""
     return C_d * area * math.sqrt(2.0 / rho)
 
 

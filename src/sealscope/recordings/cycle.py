@@ -20,7 +20,7 @@ _EQUAL_PEAKS = 0.05
 
 
 def find_cycle(recording: Recording) -> float | None:
-    """Find the period of the duty cycle [s]; None if nothing repeats.
+    """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
     It is estimated from the command if that moves, else from the difference of the chamber pressures, or from the
     only one recorded. The result is cached with the recording, and shared by its copies with fewer channels

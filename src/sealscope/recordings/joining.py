@@ -33,7 +33,8 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
     It follows from the start in the provenance, else from the date in the name of the file, and from the first time
-    `t`. The name is that in the provenance, else `file`. A date without a time of day means midnight.
+    `t`. The name is that in the provenance, else `file`. Dates and times count as UTC; a date without a time of day
+    means midnight.
     """
     start = parse_epoch(str(recording.provenance.get("start", "")))
     if start is None:
@@ -55,7 +56,7 @@ def file_seconds(recording: Recording, path: Path) -> float:
 
 
 def _parse_file_name(name: str) -> float | None:
-    """Parse the date and time in a file's name to seconds since 1970; None if it contains no date."""
+    """Parse the date and time in a file's name to seconds since 1970, as if in UTC; None if it contains no date."""
     match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None

@@ -116,7 +116,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
 
     Let p be the fraction of unchanged samples among the 100 samples before or after a run, whichever is larger. A run
     of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such
-    runs are expected in the channel `values` (n,), and if the value jumps by more than three quantisation steps at
+    runs are expected in the channel `values` (n,), and if the value jumps by more than 3.5 quantisation steps at
     its beginning or end. A slow quantised signal at a turning point does not move either, but leaves in single steps.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)

@@ -331,7 +331,10 @@ class Rail(NamedTuple):
 
 
 def is_mostly_clipped(values: Array) -> bool:
-    """Test whether more than half of the finite values (n,) are clipped, as in a chamber that drains to the tank."""
+    """Test whether more than half of the finite values (n,) are clipped at the ends of the channel's range.
+
+    This is so in a chamber that drains to the tank.
+    """
     finite = values[np.isfinite(values)]
     return sum(rail.samples for rail in find_rails(finite)) > len(finite) / 2
 
@@ -340,7 +343,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     """Find the ends of a channel's range at which its finite values (n,) are clipped; the low end only if `low_end`.
 
     At a clipped end many samples have the same value: far more than any of the five nearest values has. They form
-    runs which the signal enters or leaves by a jump of more than three quantisation steps, or one and a half for a
+    runs which the signal enters or leaves by a jump of more than 3.5 quantisation steps, or 1.5 for a
     long run. The crest of a slow quantised signal does not count: its neighbours have nearly as many samples, and it
     is entered step by step. Nor does a square wave, which has as many samples at its other level. An end is also
     clipped if one of the runs `stuck` (first index and length, as from `find_stuck`) has this value.

@@ -108,7 +108,10 @@ class Picture:
         return "".join(f"{'M' if first else 'L'}{a:.{digits}f} {b:.{digits}f}" for first, a, b in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between two lines (n,), without points at which one of them is missing."""
+        """Draw the area between the lines `low` and `high` (n,) in values of the axes.
+
+        Points at which one of them is NaN are left out. `style`: its name in the style sheet.
+        """
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
             outline = np.append(x[is_known], x[is_known][::-1]), np.append(high[is_known], low[is_known][::-1])

@@ -96,8 +96,9 @@ def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> di
 def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarray:
     """Divide a run into blocks of time within which the solver takes all parameters as constant.
 
-    Returns the bounds of the blocks (blocks + 1,) as indices of outputs, from 0 to `n_out`. The run has `n_out`
-    outputs at `rate` [Hz]; `effects`: changes of parameters within the run.
+    Returns the bounds of the blocks (blocks + 1,) as indices of outputs, from 0 to `n_out`. Outputs are the times at
+    which the solver writes its results, `n_out` of them at `rate` [Hz]; `effects`: changes of parameters within the
+    run.
 
     A block is at most `LONGEST_BLOCK` long, and short enough that no effect changes by more than its `max_change`
     within it, but not shorter than the effect's `min_block`. Breakpoints of effects fall on bounds, to within one

@@ -237,7 +237,7 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command of the run, with the changes of amplitude and frequency by faults of the duty.
+        """The voltage command of the run, with the changes of amplitude and frequency by faults.
 
         Raises InputError if the experiment has a position target instead.
         """
@@ -247,7 +247,7 @@ class Experiment:
 
     @property
     def target(self) -> Position | None:
-        """The position target of the run, with the changes of amplitude and frequency by faults of the duty.
+        """The position target of the run, with the changes of amplitude and frequency by faults.
 
         None if the experiment has a voltage command instead.
         """
@@ -256,7 +256,7 @@ class Experiment:
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Return a command with the changes of amplitude and frequency that faults of the duty cause."""
+        """Return a command with the changes of amplitude and frequency that faults cause (`Fault.change_command`)."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command

@@ -87,7 +87,7 @@ class FaultRow:
 
     @property
     def is_sensor_fault(self) -> bool:
-        """True for a fault of a sensor, False for one of the machine or its duty."""
+        """True for a fault of a sensor, False for one of the machine or its commanded motion (duty)."""
         return self.kind.startswith("sensor")
 
     def parse(self, text: str) -> Fault | None:
@@ -120,12 +120,12 @@ class FaultRow:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of machine, sensor or duty other than a leak across the piston.
+    """A fault of machine, sensor or duty (the commanded motion) other than a leak across the piston.
 
     `name`: name of its kind, a key of `FAULTS`; `value`: a factor on the faulty parameter, or an addend in SI units;
-    `at`: side (A or B) or channel that is faulty, "" if there is nothing to choose; `opening`: extent of the fault
-    over time, 0 (healthy) to 1 (full size); `frequency_factor`: factor on the frequency of the duty. `str` gives the
-    text that `parse_fault` reads.
+    `at`: side (A or B) or channel that is faulty, "" if there is nothing to choose; `opening`: extent of the fault over
+    time, 0 (healthy) to 1 (full size); `frequency_factor`: factor on the frequency of the command. `str` gives the text
+    that `parse_fault` reads.
     """
 
     name: str
@@ -207,7 +207,8 @@ class Fault:
     def change_command(self, command: Command) -> Command:
         """Return the command with the changes of amplitude and frequency over time by this fault.
 
-        Only a fault of the duty changes the command; for any other fault it is returned unchanged.
+        Only a fault of the duty (the commanded motion) changes the command; for any other fault it is returned
+        unchanged.
         """
         return ChangedDuty(command, self) if self.name == "duty" else command
 
@@ -254,7 +255,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class ChangedDuty:
-    """A command whose amplitude and frequency a fault of the duty changes, without a jump of its phase.
+    """A command whose amplitude and frequency a fault changes, without a jump of its phase.
 
     `before`: the original command; `change`: the fault.
     """

@@ -66,9 +66,11 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
 def read_model(
     tree: Mapping[str, Any], kind: type[_T], place: str, entry_name: Callable[[str], str] = str, context: Any = None
 ) -> _T:
-    """Convert the tables of a TOML file to the model or dataclass `kind` (`plain_values.convert_type`).
+    """Convert the tables `tree` of a TOML file to the model or dataclass `kind` (`plain_values.convert_type`).
 
-    Raises InputError, with the `place`, if a value does not fit; the message names the entry, the rule and the value.
+    `place`: file, for error messages; `entry_name`: converts the name of an entry to its name in error messages;
+    `context`: passed to the validators of `kind`. Raises InputError if a value does not fit; the message names the
+    entry, the rule, the value and the place.
     """
     try:
         return convert_type(kind, tree, entry_name, context)

@@ -59,7 +59,7 @@ class Condition:
 
 
 def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Return the rig parameters of a test by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
+    """Return the rig parameters of a test `condition` by name, for `Rig.with_overrides` or `Experiment.of(set=...)`.
 
     Both throttles are closed equally. If they are fully open, `line.orifices` is left as the rig has it: absent in
     the thesis's model (section 4.2.1), present in a rig that includes the open valves.

@@ -83,7 +83,7 @@ def profile_key(name: str) -> str:
 
 
 def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
-    """Collect the inputs that all records of a plan share: hashes of rig and profile, length, onset and base seed."""
+    """Collect the inputs that all records of a plan share: rig and profile (as hashes), length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
         "profile": profile_key(plan.profile) if plan.profile else "",

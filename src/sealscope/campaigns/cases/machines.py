@@ -1,4 +1,4 @@
-"""Build the experiment of a case: a machine drawn from a profile, its duty, and a leak of the planned mean flow."""
+"""Build the experiment of a case: a machine drawn from a profile, its command, load, and a leak of known mean flow."""
 
 from __future__ import annotations
 

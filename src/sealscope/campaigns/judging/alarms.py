@@ -107,9 +107,10 @@ class Alarms:
                 yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
 
     def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the fractions of alarms of each detector for each fault other than a piston leak.
+        """Yield the fractions of alarms for each pair of a detector and a fault other than a piston leak.
 
-        Only records without a leak count. Two reference detectors, which always or never raise an alarm, come last.
+        Records that also have a piston leak are left out. Two reference detectors, which always or never raise an
+        alarm, come last.
         """
         for name, records in self._with_references().items():
             faulty = (record for record in records if record.row.fault and record.size == 0)

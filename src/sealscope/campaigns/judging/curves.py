@@ -70,6 +70,7 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all sizes of leak together, and for each size.
 
     A record without a score counts as lower than all others. A curve needs two records with a leak and two without.
+    `confidence`: that of their intervals.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -74,8 +74,8 @@ def judge(
     """Collect the verdicts of all detectors on the rows with `use` "judge", and compute their statistics.
 
     A detector states its verdict itself, or its score is compared with a threshold. The thresholds are `limits`, by
-    detector, if given; otherwise a scorer's fixed threshold, or one set from the leak-free rows of the same duty
-    (`compute_thresholds`).
+    detector, if given; otherwise a scorer's fixed threshold, or one set from the leak-free rows with the same command
+    and stroke direction (`compute_thresholds`).
 
     `false_alarm`: wanted false-alarm probability; `promise`: "average" or "bound", the sense in which it is kept
     (`quantile_threshold`); `confidence`: of all intervals; `onset_s` [s]: true onset of the leaks, None to compute no

@@ -45,8 +45,8 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the estimated onsets for each detector and size of leak.
 
-    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `onset_s` [s]: true
-    onset of all leaks.
+    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `onset_s` [s]: true onset
+    of all leaks. `confidence`: that of the errors' intervals.
     """
     for name, records in verdicts.items():
         for size, group in group_by(
@@ -64,7 +64,7 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the estimated leak flows [L/min] for each detector and size of leak.
 
-    Detectors that estimate no flow are skipped.
+    Detectors that estimate no flow are skipped. `confidence`: that of the errors' intervals.
     """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
@@ -85,6 +85,7 @@ def _iter_errors(
     """Yield the errors of one detector's estimates at one size of leak, or nothing if all estimates are missing.
 
     `stated`: for each record (estimate, true value, interval), with None for a missing estimate or interval.
+    `confidence`: that of the errors' intervals.
     """
     estimates = [math.nan if value is None else value for value, _, _ in stated]
     if np.isfinite(estimates).any():
@@ -99,7 +100,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
     Nothing is yielded if no record has a fault other than a leak. A record with both has two true causes and is left
-    out; a record without a result counts as `cannot tell`.
+    out; a record without a result counts as `cannot tell`. `confidence`: that of the fractions' intervals.
     """
     for name, records in verdicts.items():
         single_cause_records = [record for record in records if not (record.size > 0 and record.row.fault)]

@@ -136,7 +136,8 @@ def build_tables(
 def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
     """Build the table of all records, with their inputs, scores and statements, in the order of their ids.
 
-    Run times are left out, because they would differ between two runs of the same campaign.
+    Run times are left out, because they would differ between two runs of the same campaign. `detectors`: those whose
+    scores are included; `unit`: unit of the leak sizes, for the heads of columns.
     """
     ordered = sorted(rows, key=lambda row: row.id)
     factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))

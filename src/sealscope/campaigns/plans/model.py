@@ -177,8 +177,8 @@ class SimulatedPlan(_JudgedPlan):
     `keep_recordings`: True to store the recordings; `part`: purpose of the plan, such as development or judging.
 
     `factors`: by name, the levels (values) of each factor; records are made for every combination of levels. The
-    factors `command`, `controller`, `load` and `closed` set the duty, `family` selects families of the profile, and
-    other names are parameters of the rig.
+    factors `command`, `controller`, `load` and `closed` set how the machine is moved and loaded, `family` selects
+    groups of the profile's machines, and other names are parameters of the rig.
     """
 
     rig_name: Annotated[Text, Field(alias="rig")] = "thesis"

@@ -46,7 +46,7 @@ MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
 _MAX_MARKS, _MAX_FRACTION = 40, 0.1
 #: Largest size of a number, so that products of two do not overflow; times within the years that calendars have [s].
 _MAX_NUMBER, _FIRST_TIME, _LAST_TIME = 1e100, -6.2e10, 2.5e11
-#: Largest size of the logarithm of a number that is neither zero nor infinite.
+#: Largest size of the logarithm of a number that is neither zero nor infinite (double precision).
 _MAX_LOGARITHM = 750.0
 #: Largest ratio of a squared product to the product of the squares, which exceeds 1 only by rounding (Cauchy).
 _ROUNDING = 1.0 + 1e-6
@@ -150,8 +150,9 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return the summary of a recording's ringing if its `levels` and `duty` are valid; raise ValueError otherwise.
 
-    The length of `levels` must match the number of chambers, and that of `duty` the number of its quantities. Their
-    numbers are logarithms and must be below 750 in magnitude.
+    `levels` describe the pressures' wavelet details, `duty` how the machine is moved and loaded (`RmsBlocks`). The
+    length of `levels` must match the number of chambers, and that of `duty` the number of its quantities. Their numbers
+    are logarithms and must be below 750 in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -165,8 +166,8 @@ def _check_levels(summary: Any) -> Any:
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
-    They have a row for each field of `Octaves`, of which the last, a variance, is not negative. All must be below 750
-    in magnitude.
+    They have a row for each field of `Octaves`, of which the last, a variance, is not negative. They are logarithms of
+    RMS values, phases [rad] and the variances of these [rad^2]; all must be below 750 in magnitude.
     """
     if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"

@@ -1,4 +1,4 @@
-"""Summarise a machine from its healthy recordings: balance terms, sensors, smallest detectable leak, and problems."""
+"""Summarise a machine from its healthy recordings: volume balance, sensors, smallest detectable leak, and problems."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SmallestLeak(NamedTuple):
     Attributes
     ----------
     lpm : float or None
-        Flow of the leak [L/min], None if the machine's size is not stated.
+        Flow of the leak [L/min], None if the machine's sizes are not stated.
     share : float
         Flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move.
     halved_by : int or None
@@ -156,7 +156,8 @@ def _describe_rig(rig: Rig | None) -> str:
 def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) -> str:
     """Return the unit in which to display the channel `name`.
 
-    This is its unit in the log or, if that is not known, bar for Pa, mm for m and otherwise its SI `unit`.
+    This is its unit in the log of the first healthy recording or, if that is not known, bar for Pa, mm for m and
+    otherwise its SI `unit`.
     """
     log_unit = healthy[0].about.get("log_units", {}).get(name)
     return str(log_unit or {"Pa": "bar", "m": "mm"}.get(unit, unit))
@@ -242,9 +243,9 @@ def summarise_machine(
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
     """Estimate the coefficients of a volume balance from all recordings together, and their scatter.
 
-    `sums` holds the Gram matrix (m, m) of each recording, i.e. the products of the columns of its equations, whose
-    rows are scaled to unit noise. The scatter is the standard deviation between recordings. Returns the estimates by
-    the name of the term.
+    `sums` holds the Gram matrix (m, m) of each recording, i.e. the products of the columns of its equations, whose rows
+    are scaled to unit noise. `rig` and the recorded `channels` determine the equation. The scatter is the standard
+    deviation between recordings. Returns the estimates by the name of the term.
     """
     equation = equations(rig, channels)[0]
     roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
@@ -269,7 +270,7 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
-    """Estimate the smallest leak that a recording of a later day will show under the usual duty.
+    """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
     `summaries` are those of the healthy recordings by the detector `balance`, and `channels` the names of the
     recorded channels. The leak is detected with the probability `power` (`priors.toml`). The rise of the leakage due

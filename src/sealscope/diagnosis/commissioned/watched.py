@@ -119,7 +119,7 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    The result is None if the summary does not contain the sums of exactly one balance.
+    The result is None if the summary does not contain the sums of exactly one volume balance.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:

@@ -30,9 +30,9 @@ LEVEL = "against the rig's file"
 class LeakTest(NamedTuple):
     """Result of a test for a leak.
 
-    `name`: WITHIN, AGAINST or LEVEL, i.e. within the recording, against healthy recordings, or against the rig's
-    file; `chance`: probability of at least this `score` without a leak; `probability`: allowed probability of a false
-    alarm, with which the score exceeds the `threshold`.
+    `name`: WITHIN, AGAINST or LEVEL, i.e. within the recording, against healthy recordings, or against the rig's file;
+    `chance`: probability of at least this `score` without a leak; `probability`: allowed probability of a false alarm,
+    i.e. that without a leak the score exceeds the `threshold`.
     """
 
     name: str
@@ -46,8 +46,8 @@ class OtherEvent(NamedTuple):
     """Event other than a leak that explains a rare change in a recording.
 
     `cause`, `description`: those of the event; `probability`: posterior probability of an event with this cause;
-    `observable`: the rarest observable that it explains; `chance`: probability of that observable in a healthy
-    recording.
+    `observable`: the rarest observable that it explains; `chance`: probability that a healthy recording has at least
+    its score.
     """
 
     cause: str
@@ -91,9 +91,9 @@ class Case:
     def leak_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
 
-        It is 1 if other causes are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the
-        rig's file, a leak that began within the recording may have raised it: the probability is then that of an
-        alarm of that test, or 1 if there is none.
+        It is 1 if other causes are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the rig's
+        file, a leak that began within the recording may have raised it: the result is then that of the alarm of the
+        test for such a leak, or 1 if that test raised none.
         """
         if not self.weigh_rivals:
             return 1.0

@@ -131,8 +131,9 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
     """Compute the fields of `Evidence` that state a leak's size, by their names.
 
-    `flow`: mean flow of the leak, None if unknown (no fields). The size is relative to the pump and, if the machine's
-    size is stated, in L/min with a 95 % interval; otherwise the field `refuses` says that L/min are not stated.
+    `flow`: mean flow of the leak, None if unknown (no fields); `leak`: measured leakage, which converts it. The size is
+    a fraction of the pump's mean flow (`relative`) and, if the sizes of the machine are stated, a flow in L/min with a
+    95 % interval; otherwise the field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}
@@ -168,8 +169,8 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
     `bound`: upper bound of the leak's flow [m^3/s]. If leakage is measured, both results are flows [m^3/s]. Otherwise
-    they are changes of the ringing of the pressures, as the logarithm of its RMS. The bound of the ringing is
-    infinite if it was not measured, after an alarm, or if the sampling rate is too low for it to exclude a leak.
+    they are changes of the pressures' ringing (the RMS of their wavelet details), as a logarithm. The bound is infinite
+    if it was not measured, after an alarm, or if the sampling rate is too low for it to exclude a leak.
     """
     if case.leak is not None:
         return bound, bound_worth_stating(case.leak.pump_flow[1])

@@ -16,10 +16,10 @@ from sealscope.diagnosis.inference.observable import Observable
 class Event:
     """An event that may happen to a machine or its instruments within a recording, from `events.toml`.
 
-    `cause`: heading under which a verdict names the event, None if a verdict never does; `probability`: prior
-    probability that it begins within a recording; `affected`: patterns "data: name" of the observables that it
-    changes; `disturbed`: patterns of those that it may change as a side effect; `description`: words for it in a
-    reason.
+    `name`: such as "piston leak" or "pump wear"; `cause`: heading under which a verdict names the event, None if a
+    verdict never does; `probability`: prior probability that it begins within a recording; `affected`: patterns "data:
+    name" of the observables that it changes; `disturbed`: patterns of those that it may change as a side effect;
+    `description`: words for it in a reason.
     """
 
     name: str

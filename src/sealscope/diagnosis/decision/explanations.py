@@ -6,8 +6,8 @@ factor of 1. Thus a step of the noise together with a leak is explained by two e
 factor of a change is at most 1 / (-e p log p), where p is the probability of the change in a healthy recording, or 1
 for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy recordings (`null`).
 
-A term of the balance describes a change only to within a fraction. Therefore the logarithms of the Bayes factors of
-the same data are divided by 1 + 2 m B, with the largest of them, B, and the misfit m (`priors.toml`). Alternative
+A term of the volume balance describes a change only to within a fraction. Therefore the logarithms of the Bayes factors
+of the same data are divided by 1 + 2 m B, with the largest of them, B, and the misfit m (`priors.toml`). Alternative
 explanations then do not differ by more than the terms are known.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
@@ -68,7 +68,8 @@ def explain(
     observables : sequence of Observable
         Tests of a recording, by all detectors.
     chance : callable, optional
-        Probability of an observable in a healthy recording (`null.HealthyNull.chance`), by default as it states.
+        Probability that a healthy recording has at least the score of an observable (`null.HealthyNull.chance`), by
+        default the one that its detector states (`Observable.chance`).
     rise : LeakRise, optional
         Leakage above that of healthy recordings. A leak causes it in proportion to its size and to the time since its
         onset.
@@ -76,8 +77,9 @@ def explain(
     Returns
     -------
     tuple of Explanation
-        Sets of events, the most probable first: each single event, and combinations of up to `MAX_EVENTS` events that
-        the observables support. The probabilities are conditional on some event having happened.
+        Sets of events, such as a piston leak or a sensor drift (`events.toml`), the most probable first: each single
+        event, and combinations of up to `MAX_EVENTS` events that the observables support. The probabilities are
+        conditional on some event having happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -205,9 +207,9 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
-    `chance`: probability of the observable in a healthy recording. An increase of the leakage makes an alternative to
-    it, such as an external leak, seem to increase as well. Therefore the log factor of such an observable is at most
-    that of the leakage (`rise`) plus the log likelihood ratio of the two.
+    `chance`: probability that a healthy recording has at least its score. An increase of the leakage makes an
+    alternative to it, such as an external leak, seem to increase as well. Therefore the log factor of such an
+    observable is at most that of the leakage (`rise`) plus the log likelihood ratio of the two.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:

@@ -93,8 +93,9 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     """Describe in words the largest drop of the pressures' ringing that the data allow.
 
-    If a leak may be hidden, the reason is added. `ringing`: precision of the measured ringing, None if it was not
-    measured; `provider`: name of the detector.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. If a leak may be
+    hidden, the reason is added. `ringing`: precision of the measured ringing, None if it was not measured; `provider`:
+    name of the detector.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)

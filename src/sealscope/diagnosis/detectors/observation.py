@@ -66,8 +66,9 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and pressure levels, which may be mistaken for a leak.
 
-    The changes are tested within the recording and, if `baseline` is not empty, against its healthy recordings.
-    `distrust` is the reason why the pressures cannot be judged, in which case the report is empty; None if they can.
+    The duty is how the machine is moved and loaded. The changes are tested within the recording and, if `baseline` is
+    not empty, against its healthy recordings. `distrust` is the reason why the pressures cannot be judged, in which
+    case the report is empty; None if they can.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -99,7 +100,8 @@ def run_detector(
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
     """Run a detector with those baseline recordings that it can use.
 
-    If it cannot use the recording, or none of the given baselines, the report is empty and states the reason.
+    `distrust`: reason why the pressures cannot be judged, None if they can. If the detector cannot use the recording,
+    or none of the given baselines, the report is empty and states the reason.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -170,9 +172,10 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
     """Collect how improbable each test result is in the healthy recordings, as surprisals -log(chance).
 
-    They are the null distribution of the observables of all detectors. For comparisons between recordings there is
-    one distribution for each kind of data: the largest surprisal of each healthy recording when it is compared with
-    all others. With `shut`, the balance's surprisals are those under the hypothesis that the pump is cut off at rest.
+    They are the null distributions of the test results (observables) of all detectors. A test for a change within a
+    recording has one value from each healthy recording. The tests of one kind of data (`Observable.data`) that compare
+    recordings share a distribution: the largest surprisal of each healthy recording, compared with all others. With
+    `shut`, those of the volume balance are under the hypothesis that valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -194,7 +197,8 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
     """Compare the ringing of each healthy recording with that of all others; yield the tests (observables) of each.
 
-    Nothing is yielded for fewer than three recordings of the same chambers and sampling rate.
+    The ringing is the RMS of the pressures' wavelet details. Nothing is yielded for fewer than three recordings of the
+    same chambers and sampling rate.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]

@@ -66,7 +66,7 @@ BATCH_SAMPLES = 8192
 
 
 class BlockStream:
-    """Division of a stream of samples into blocks, each reduced to Gram matrices of the balance.
+    """Division of a stream of samples into blocks, each reduced to Gram matrices of the volume balance.
 
     The blocks do not depend on how many samples arrive at a time.
 
@@ -195,7 +195,7 @@ class BlockStream:
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Estimate the sign of the recorded flow in each balance: 1 if it is correct, -1 if a sensor is reversed.
+        """Estimate the sign of the recorded flow in each volume balance: 1 if it is right, -1 if a sensor is reversed.
 
         `rows`: rows (r, m) of the regression of each balance.
 
@@ -256,8 +256,8 @@ class BlockStream:
         """Estimate two constants of a recording: absolute minus gauge pressure, and the speed that counts as rest.
 
         They are estimated at the first call only. The difference of absolute and gauge pressure is estimated for each
-        sensor from its first `n_samples`. The speeds below which pump or piston count as resting are estimated only
-        if the balance needs them, and are otherwise None.
+        sensor from its first `n_samples`. The speeds below which pump or piston count as resting are estimated only if
+        the volume balance needs them, and are otherwise None.
         """
         if self._absolute_offsets is None:
             self._absolute_offsets = {
@@ -408,12 +408,12 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
 def derive_drive_signals(
     samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
 ) -> dict[str, Array]:
-    """Add signals from a model of the drive to the samples of a recording.
+    """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    The entry `START` is the decay exp(-t/lag) of the drive's initial state. The pump's speed "omega" [rad/s] is added
-    if the command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing. With
-    `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts
-    as leakage.
+    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is the decay exp(-t/lag) of the drive's
+    initial state. The pump's speed "omega" [rad/s] is added if the command u is the only channel that shows it: it is
+    the drive's response to u, NaN where u is missing. With `loaded` the drive responds to the load p_A - p_B as well.
+    Otherwise the droop of the real speed under load counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -435,7 +435,7 @@ def _hold_missing(values: Array) -> Array:
 
 
 def min_samples_for_step(rate: float) -> int:
-    """Compute the minimum number of samples to test a recording for a step, i.e. those of `MIN_BLOCKS` blocks."""
+    """Compute the minimum number of samples at a `rate` [Hz] to test for a step, i.e. those of `MIN_BLOCKS` blocks."""
     stride = stride_samples(rate)
     return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
 

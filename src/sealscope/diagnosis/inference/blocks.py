@@ -1,8 +1,8 @@
-"""Likelihood of a balance's coefficients in blocks of a recording, from sums over the rows of each block.
+"""Likelihood of a volume balance's coefficients in blocks of a recording, from sums over the rows of each block.
 
-A balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A block is
-a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side). Gram
-matrices of blocks add up to that of their union. A stream and a whole recording are therefore handled alike, and a
+A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A
+block is a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side).
+Gram matrices of blocks add up to that of their union. A stream and a whole recording are therefore handled alike, and a
 recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
 (`row_weights`).
 
@@ -11,9 +11,9 @@ level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its s
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2.
 
-Here d is the column of g, o are the other columns with their drifts, y is the left side and s^2 the variance of a
-row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of o o' over all rows,
-plus the precision of the priors, and m that of o y. The likelihood of g is exp(eta' g - g' Lambda g / 2).
+d is the column of g (the tested column), o are the other columns with their drifts, y is the left side and s^2 the
+residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
+o o' over all rows, plus the precision of the priors, and m that of o y. The likelihood is exp(eta'g - g'Lambda g/2).
 """
 
 from __future__ import annotations
@@ -96,9 +96,10 @@ class Blocks:
         return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
-        """Restore the full Gram matrices (K, E, size, size) of blocks that `pack` has reduced.
+        """Return the blocks with full Gram matrices, of which `pack` has stored the upper triangles only.
 
-        Raise InputError if the stored shapes do not fit `size`.
+        `size`: number of columns m, with which `gram` has the shape (K, E, m, m). Raise InputError if the stored shapes
+        do not fit it.
         """
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
@@ -173,7 +174,7 @@ class Blocks:
 class ColumnRoles:
     """Role of each column in one equation's Gram matrices, and the priors on its coefficient.
 
-    A column belongs to a term of the balance or to its left side. Indices of columns:
+    A column belongs to a term of the volume balance or to its left side. Indices of columns:
 
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
     - `nuisance`: terms whose coefficients are unknown in any machine;
@@ -326,7 +327,7 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 
 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
-    """Compute the likelihood of one coefficient of a balance in each block, with all other coefficients eliminated.
+    """Compute the likelihood of one coefficient of a volume balance in each block, with all others eliminated.
 
     `columns`: roles of the columns (leak, motion, left side) in each equation; the likelihoods of the equations are
     multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its scale.
@@ -353,12 +354,13 @@ def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
 
 
 class _NormalEquations(NamedTuple):
-    """Sums of a regression of the left side on nuisance columns that drift and on one tested column.
+    """Sums of a regression on nuisance columns, whose coefficients drift, and on the tested column.
 
-    The nuisance columns are multiplied by their drift polynomials, c columns in all. `gram` (c, c) and `moment` (c,):
-    products of these columns with each other and with the left side. Sums of the tested column in each of K blocks:
-    `coupling` (K, c), its products with the nuisance columns; `energy` (K,), its sum of squares; `tested_moment`
-    (K,), its product with the left side. `left_square`: sum of squares of the left side.
+    The tested column is that of the coefficient to estimate. The nuisance columns are multiplied by their drift
+    polynomials, c columns in all. `gram` (c, c) and `moment` (c,): products of these columns with each other and with
+    the left side. Sums of the tested column in each of K blocks: `coupling` (K, c), its products with the nuisance
+    columns; `energy` (K,), its sum of squares; `tested_moment` (K,), its product with the left side. `left_square`: sum
+    of squares of the left side.
     """
 
     gram: Array
@@ -417,10 +419,10 @@ class _Prior(NamedTuple):
 
 
 class _NuisanceFit(NamedTuple):
-    """Fit of the nuisance coefficients: `coefficients` (c,) and `variance` of a row, inflated for overlapping rows.
+    """Fit of the nuisance coefficients: `coefficients` (c,), and `variance` of a row's residual.
 
-    `prior_precision` (c,): prior precision of the coefficients, times `variance`; `prior_moment`
-    (c,): its product with their prior mean.
+    The variance is inflated for overlapping rows. `prior_precision` (c,): prior precision of the coefficients, times
+    `variance`; `prior_moment` (c,): its product with their prior mean.
     """
 
     coefficients: Array
@@ -430,7 +432,7 @@ class _NuisanceFit(NamedTuple):
 
 
 def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
-    """Fit all coefficients of a regression except the tested one, and the variance of a row.
+    """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
     `normal`: sums of the regression, from which the tested coefficient, free in each block, is eliminated. Each other
     (nuisance) column has `degrees` coefficients: a constant one and those of the polynomials of its drift. `prior`:
@@ -502,11 +504,12 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
 
 
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
-    """Subtract a sensor offset from the pressure of the tested column, and append a column for the offset's error.
+    """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `roles`: roles of the columns; `test`: index of the tested column;
-    `coefficients` (K,): coefficient g of that column in each block; `offset` [Pa]. The appended column -g dt is the
-    derivative of the balance with respect to the offset. It becomes the last of the m + 1 columns of the result.
+    `gram` (K, m, m): Gram matrices of K blocks; `roles`: roles of the columns; `test`: index of the tested column, i.e.
+    that of the coefficient g to estimate, a pressure times the sampling interval dt; `coefficients` (K,): g in each
+    block; `offset` [Pa]: subtracted from the pressure. The appended column -g dt is the derivative of the volume
+    balance with respect to the offset. It becomes the last of the m + 1 columns of the result.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -525,8 +528,8 @@ def _eliminate_nuisance(
     `gram` (K, m, m): Gram matrices of the blocks; `roles`: roles of the columns (leak, motion, left side); `test`:
     index of the tested column; `nuisance`: indices of the columns to eliminate. The precision is the Schur complement
     (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix of the tested column's sums of squares, G the Gram matrix of
-    the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the variance of a
-    row.
+    the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the residual
+    variance of a row.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -608,7 +611,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
-    """Estimate a weighted mean of coefficients of the first balance of a machine, and its standard error.
+    """Estimate a weighted mean of coefficients of a machine's first volume balance, and its standard error.
 
     `roles`: roles of its columns (leak, motion, left side). `weights` maps the index of a nuisance column to its
     weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
@@ -625,9 +628,9 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 
 
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Compute the Gram matrix of a whole recording for each equation, divided by the variance of a row, (E, m, m).
+    """Compute the Gram matrix of a whole recording for each equation, over the residual variance of a row, (E, m, m).
 
-    `columns`: roles of the columns (leak, motion, left side) in each equation.
+    `columns`: roles of the columns (leak, motion, left side) in each of E equations.
     """
     grams = []
     for e, roles in enumerate(columns):

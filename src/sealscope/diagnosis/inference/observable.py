@@ -24,7 +24,7 @@ class Observable:
     Parameters
     ----------
     name : str
-        What changed: a term of the balance, "noise of the pressures", "RMS of d3 of p_A".
+        What changed: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
     data : str
         What it is computed from, such as "volumes", "rise", "drift" or "details", as the patterns in
         `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative descriptions of one
@@ -83,7 +83,7 @@ class Observable:
 
 
 class Flow(NamedTuple):
-    """A leakage flow and its standard error [m^3/s]; the error excludes the uncertainty of the machine's size."""
+    """A leakage flow and its standard error [m^3/s], which excludes the uncertainty of the machine's sizes."""
 
     value: float
     deviation: float
@@ -192,11 +192,11 @@ class LeakMeasure(Protocol):
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from this detector's flows [m^3/s] to L/min; None if the machine's size is not stated."""
+        """Factor from this detector's flows [m^3/s] to L/min; None if the machine's sizes are not stated."""
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's size, which scales all flows."""
+        """Relative standard deviation of the machine's sizes (displacement, piston area), which scale all flows."""
 
     @property
     def ratio(self) -> Interval | None:
@@ -227,11 +227,11 @@ class LeakMeasure(Protocol):
 
 
 class Ringing(NamedTuple):
-    """Precision of the measured ringing of the pressures, for a recording without a measured leakage.
+    """Precision of the pressures' ringing, for a recording without a measured leakage.
 
-    `bound`: 95 % upper bound of a change of the ringing, as the logarithm of its RMS; `rate`: sampling rate [Hz];
-    `healthy`: number of healthy recordings it was compared with; `is_dated`: true if their dates are known; `unused`:
-    recorded columns that are not assigned to a channel.
+    The ringing is an oscillation, measured by the RMS of wavelet details. `bound`: 95 % upper bound of a change of the
+    logarithm of this RMS; `rate`: sampling rate [Hz]; `healthy`: number of healthy recordings it was compared with;
+    `is_dated`: true if their dates are known; `unused`: recorded columns that are not assigned to a channel.
     """
 
     bound: float

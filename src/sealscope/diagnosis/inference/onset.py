@@ -161,7 +161,7 @@ class StepTest:
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return the test as one of several whose best counts, with a `share` of the false-alarm probability."""
+        """Return the test with a `share` of the false-alarm probability, as one of several of which the best counts."""
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:

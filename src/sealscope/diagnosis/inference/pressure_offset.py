@@ -11,9 +11,9 @@ flow,
 
 F (level and slope) and B (level, slope and curvature) are projected out. z maximises its prior times the restricted
 likelihood, over onsets and (q, kappa). The prior is a normal density for good sensors, with small odds of a wide one.
-The walk may be no larger than the one fitted without z; otherwise z and a free walk would describe changes that no
-leak explains. What the balance leaves repeats from cycle to cycle: no more than `size.readings` residuals count as
-independent. If the leak does not change, there is no information on z. It then stays near zero, and no result
+The walk may be no larger than the one fitted without z; otherwise z and a free walk would describe changes that no leak
+explains. The residual of the volume balance repeats from cycle to cycle: no more than `size.readings` residuals count
+as independent. If the leak does not change, there is no information on z. It then stays near zero, and no result
 depends on it. Behind a servo valve both chambers have the same leak, step and z, so their whitened rows are stacked.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
@@ -42,7 +42,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 
     `columns`: roles of the columns (leak, motion, left side) in each equation. The offset is that of maximum a
     posteriori probability; it is subtracted in the Gram matrices and added to `zero`. Return the blocks unchanged if
-    the balance has no flow offset, or too few blocks have information.
+    the volume balance has no flow offset, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -80,11 +80,14 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
     independent = min(1.0, INFERENCE.size.readings / len(z))
 
     def log_likelihood(position: float) -> float:
-        """Compute the log likelihood of an offset, given by its asinh, at the best onset, step and random walk."""
+        """Compute the log likelihood of an offset at the best onset and size of the leak's step, and random walk.
+
+        `position`: asinh of the offset in units of its usual standard deviation.
+        """
         return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior of an offset, given by its asinh, up to a constant."""
+        """Compute minus the log posterior of an offset, up to a constant; `position` as in `log_likelihood`."""
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)

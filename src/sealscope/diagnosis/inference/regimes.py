@@ -1,9 +1,9 @@
 """Two hypotheses on the valves while the pump rests: they connect it to the cylinder (open), or cut it off (shut).
 
-If they are open, the leakage of pump and piston is in the balance at rest as in motion. If they are shut, leakage and
-flow offset of the pump count in motion only: at rest only the piston leaks. Both balances are linear in the same
-columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B) in motion and r that at rest;
-their covariance allows for errors that differ from block to block. With open valves r scatters about g; with shut
+If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut,
+leakage and flow offset of the pump count in motion only: at rest only the piston leaks. Both balances are linear in the
+same columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B) in motion and r that at
+rest; their covariance allows for errors that differ from block to block. With open valves r scatters about g; with shut
 valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
@@ -28,7 +28,7 @@ from sealscope.recordings.recording import Array
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
-    """Convert blocks to the balance for valves that are open, or `shut`, while the pump rests.
+    """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
     `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`). For
     open valves these two columns are dropped from the Gram matrices; for shut valves they are combined with the
@@ -42,7 +42,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 
 
 def shut_at_rest_matrix(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) that converts the m columns of a balance to the n columns for a pump cut off at rest.
+    """Build the matrix (m, n) that converts the m columns of a volume balance to the n for a pump cut off at rest.
 
     With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`). The column of
     the offset becomes the offset minus the offset at rest, that of the leak at rest becomes the leak minus the leak
@@ -65,9 +65,9 @@ def shut_at_rest_matrix(names: Sequence[str]) -> Array:
 def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
     """Add the column for the leakage of the turning pump to Gram matrices (E, m, m) of a recording without rests.
 
-    The balance for a pump that is cut off at rest has this additional column (`terms.shut_at_rest`). In a recording
-    without rests it equals the leak's column, which is therefore repeated. `names` (m - 1,): names of the columns
-    without the left side. The result has the shape (E, m + 1, m + 1).
+    The volume balance for a pump that is cut off at rest has this additional column (`terms.shut_at_rest`). In a
+    recording without rests it equals the leak's column, which is therefore repeated. `names` (m - 1,): names of the
+    columns without the left side. The result has the shape (E, m + 1, m + 1).
     """
     index = [*range(len(names) + 1)]
     index.insert(names.index(LEAK), names.index(LEAK))

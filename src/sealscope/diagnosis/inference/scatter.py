@@ -1,9 +1,9 @@
 """Rise of a recording's leakage, i.e. the leakage above that of healthy recordings, whose scatter is estimated.
 
 The Gram matrices of the healthy recordings, without the flow's offset, are added up and give the coefficients of all
-terms of the balance. A recording's residual under these coefficients, projected on the leak's column, is its rise.
-Its other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy recording over
-the n - 1 others measures the scatter, including all effects that the model does not describe: y_j = r_j (n - 1)/n.
+terms of the volume balance. A recording's residual under these coefficients, projected on the leak's column, is its
+rise. Its other coefficients may differ from the healthy ones within a prior. The rise r_j of each healthy recording
+over the n - 1 others measures the scatter, including all effects that the model does not describe: y_j = r_j (n - 1)/n.
 For the judged recording y is its rise.
 
 The width of that prior is known only to within a factor: one machine, held at one temperature, repeats its
@@ -227,11 +227,11 @@ class Rise(NamedTuple):
 class RecordingSums(NamedTuple):
     """Summary of one recording, for the comparison with other recordings of the same machine.
 
-    `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the variance of a row, with the
-    flow's offset eliminated. `flow`: mean magnitude of the pump's flow [m^3/s]; `pressure`: mean magnitude of p_A -
-    p_B [Pa]. The others are None if unknown: `start_s`, date [s since 1970]; `oil_degC`, temperature of the oil;
-    `held` (6,), leaks during holds with shut valves, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of
-    the pressure drop due to motion over the speed, and its standard error.
+    `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
+    with the flow's offset eliminated. `flow`: mean magnitude of the pump's flow [m^3/s]; `pressure`: mean magnitude of
+    p_A - p_B [Pa]. The others are None if unknown: `start_s`, date [s since 1970]; `oil_degC`, temperature of the oil;
+    `held` (6,), leaks during holds with shut valves, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of the
+    pressure drop due to motion over the speed, and its standard error.
     """
 
     sums: Array
@@ -270,9 +270,9 @@ def _conductance_of_flow(recording: RecordingSums) -> float:
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: the recording; `baseline`: the healthy ones; `columns`: roles of the columns (leak, motion, left side)
-    in each equation, the same for all recordings. The rise is in the unit of the leak's coefficient, for the laminar
-    leak m^3/(s Pa).
+    `judged`: sums of the volume balance of the recording; `baseline`: those of the healthy ones; `columns`: roles of
+    the columns (leak, motion, left side) in each equation of the balance, the same for all recordings. The rise and
+    its standard deviation are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa).
     """
     healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
     prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
@@ -725,10 +725,10 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Compare the flow that the piston's motion takes with that of healthy recordings.
+    """Estimate the log ratio of the flow that the piston's motion takes to that in healthy recordings.
 
-    Returns the logarithm of the ratio of the two flows, and its standard error from the recording alone. The ratio
-    differs from 1 if area over displacement changed: another machine, or another scale of a sensor.
+    Returns the logarithm and its standard error from the recording alone. The ratio differs from 1 if area over
+    displacement changed: another machine, or another scale of a sensor.
 
     `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: roles of
     their columns. The flow is the sum of the coefficients of motion, weighted by the sums of squares of their columns
@@ -799,8 +799,8 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
-    `baseline`. `columns`: roles of the columns (leak, motion, left side) in each equation. Return None if the balance
-    has no column of an orifice, or the recording has no information on one of the two leaks.
+    `baseline`. `columns`: roles of the columns (leak, motion, left side) in each equation. Return None if the volume
+    balance has no column of an orifice, or the recording has no information on one of the two leaks.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -824,7 +824,7 @@ def compare_laws(
 def compare_with_leak(
     judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles], rival: str
 ) -> float | None:
-    """Compare how well the leak and another term of the balance, `rival`, explain a recording's excess flow.
+    """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
     Returns the log likelihood ratio of the rival to the leak, for one independent reading, from the residual sums of
     squares under the coefficients of the healthy recordings, `baseline`. While the rival (for example an external
@@ -853,7 +853,7 @@ def compare_with_leak(
 
 
 class _Residual(NamedTuple):
-    """Residual of a recording's balance under the coefficients of healthy recordings.
+    """Residual of a recording's volume balance under the coefficients of healthy recordings.
 
     `products` (m,): scalar products of the residual with each column, and last with itself; `nuisance`: indices of
     the c columns whose coefficients may differ between recordings; `prior_precision` (c,): precisions of the priors

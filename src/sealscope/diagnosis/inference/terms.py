@@ -239,7 +239,7 @@ class Term(NamedTuple):
 
     @property
     def compared(self) -> bool:
-        """True if the coefficient is fitted only to compare recordings, whose duties differ."""
+        """True if the coefficient is fitted only to compare recordings with different motion and load."""
         return self.drift == "speed"
 
 
@@ -343,8 +343,8 @@ def _chamber_terms(side: str) -> tuple[Term, ...]:
 def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    w is the weight of chamber A in the balance, computed by `weight_A`; V_A and V_B are the volumes of the chambers
-    at the current position, from the rig's file.
+    w is the weight of chamber A in the volume balance, computed by `weight_A`; V_A and V_B are the volumes of the
+    chambers at the current position, from the rig's file.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -369,7 +369,7 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
     """Make the term of an external leak from one side of the cylinder: max(p, 0) dt times `weight`.
 
-    `weight`: effect of a flow out of that side on the balance, with its sign; `p`: gauge pressure of the side.
+    `weight`: effect of a flow out of that side on the volume balance, with its sign; `p`: gauge pressure of the side.
     """
     p = f"p_{side}"
 
@@ -383,8 +383,8 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
 def _compensated_leak_term(side: str) -> Term:
     """Make the term of an external leak from one side in a circuit whose check valve refills the low-pressure side.
 
-    The leak changes the balance only while its side has the higher pressure: max(p, 0) dt for A, and -max(p, 0) dt
-    for B. In all other intervals the term is 0.
+    The leak changes the volume balance only while its side has the higher pressure: max(p, 0) dt for A, and -max(p, 0)
+    dt for B. In all other intervals the term is 0.
     """
 
     def lost_volume(s: Signals) -> Array:
@@ -448,7 +448,7 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
-        """Make a term of the edge's flow, with a coefficient in `unit`, from a function for its increments."""
+        """Make a term of the flow over the edge: an unknown coefficient, in `unit`, times `increments`."""
         return Term(f"{name} {edge}", unit, increments, "sensor fault", "edge", ("u", upstream, downstream))
 
     return (
@@ -459,7 +459,7 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
 
 
 def _chamber_equation(side: str, rig: Rig) -> Equation:
-    """Make the balance of one chamber of a cylinder behind a servo valve.
+    """Make the volume balance of one chamber of a cylinder behind a servo valve.
 
     The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An
     overlap of the edges reduces the flow in both directions, just as a leak does under the pressure of friction. Only
@@ -565,7 +565,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's balance with two more terms: leakage and flow offset while the pump or the piston rests.
+    """Return a pump's volume balance with two more terms: leakage and flow offset while the pump or the piston rests.
 
     They are inserted before the terms of the leak.
     """
@@ -578,7 +578,7 @@ def with_rests(equation: Equation) -> Equation:
 
 
 def shut_at_rest(equation: Equation) -> Equation:
-    """Return a pump's balance for valves that cut the pump off from the cylinder while it rests.
+    """Return a pump's volume balance for valves that cut the pump off from the cylinder while it rests.
 
     The pump's leakage, as an additional term, and the flow offset count in motion only.
     """
@@ -598,11 +598,11 @@ def shut_at_rest(equation: Equation) -> Equation:
 
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
-    """Return a balance with additional terms, inserted before those of the leak, which remain the last."""
+    """Return a volume balance with additional terms, inserted before those of the leak, which remain the last."""
     first_leak = len(equation.terms) - len(_LEAKS)
     return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
 
 
 def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:
-    """Return a balance without the terms that need a channel outside of `channels`."""
+    """Return a volume balance without the terms that need a channel outside of `channels`."""
     return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))

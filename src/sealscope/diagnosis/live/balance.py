@@ -56,7 +56,7 @@ N_WAKING: int = _PRIORS.wakes
 
 
 class BlockConductance(NamedTuple):
-    """Leakage conductance and duty of the machine in one block.
+    """Leakage conductance of the machine in one block, and the pressure and flow at which it was measured.
 
     Attributes
     ----------
@@ -64,12 +64,12 @@ class BlockConductance(NamedTuple):
         Times at which the samples of the block begin and end [s].
     g, sd : float
         Conductance of pump and piston together, and its standard error [m^3/(s Pa)]. Values of `g` can be compared
-        between blocks, as they do not shift when later blocks improve the other coefficients of the balance.
+        between blocks, as they do not shift when later blocks improve the other coefficients of the volume balance.
     total : float
         Conductance by the latest estimates of the other coefficients [m^3/(s Pa)].
     offset : float
         Standard error of the conductance that is common to all blocks, due to the other coefficients and to the
-        machine's size [m^3/(s Pa)].
+        machine's sizes [m^3/(s Pa)].
     pressure : float
         Mean of abs(p_A - p_B) [Pa].
     pump_flow : float
@@ -169,7 +169,7 @@ class LiveBalance:
     block_seconds, has_begun = BLOCK_SECONDS, True
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
-        """Set up the balance for a rig and the channels `names`, with no samples yet.
+        """Set up the volume balance for a rig and the channels `names`, with no samples yet.
 
         `litres` tells if the rig states the sizes that are needed for L/min; by default this is found from the rig.
         """
@@ -209,7 +209,7 @@ class LiveBalance:
         return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples, and yield the result of each block of the balance that they complete.
+        """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
         A result is the conductances of a block, or the reason for none. The next block is processed only when its
         result is asked for. The first `LEARNED` blocks are estimated together. After a gap the coefficients of the
@@ -266,7 +266,7 @@ class LiveBalance:
         return self._estimate_first_blocks(blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the coefficients of the balance to the first blocks, and return the leakage conductance in each.
+        """Fit the coefficients of the volume balance to the first blocks, and return the leakage conductance in each.
 
         Blocks at standstill are left out. The median precision of these conductances becomes the usual one.
         """
@@ -279,7 +279,7 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time between two successive equations of the balance [s].
+        """Half the time between two successive equations of the volume balance [s].
 
         The samples of a block reach beyond its first and last equation by this much.
         """
@@ -292,7 +292,7 @@ class LiveBalance:
     def _relative_motion(self, block: Blocks) -> float:
         """Compute the motion of the machine in a block, relative to earlier blocks.
 
-        The measure is the mean square of the left side of the balance, i.e. of the measured volume
+        The measure is the mean square of the left side of the volume balance, i.e. of the measured volume
         (`coefficients.relative_motion`).
         """
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
@@ -312,8 +312,8 @@ class LiveBalance:
     def _estimate_block(self, block: Blocks, is_learned: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block.
 
-        Returns a NotJudged if the machine stands still and the estimate is therefore too uncertain. With
-        `is_learned`, the block also updates the other coefficients of the balance.
+        Returns a NotJudged if the machine stands still and the estimate is therefore too uncertain. With `is_learned`,
+        the block also updates the other coefficients of the volume balance.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
@@ -327,7 +327,7 @@ class LiveBalance:
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop all learned coefficients of the balance, for example after a repair.
+        """Drop all learned coefficients of the volume balance, for example after a repair.
 
         They are then learned anew from the blocks that begin at `since` [s] or later, including stored ones.
         """
@@ -338,7 +338,7 @@ class LiveBalance:
         self._waiting = 0 if self._stored is None else int(np.count_nonzero(self._stored.start >= since))
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
-        """Test the terms of the balance and the signals of the last blocks for changes.
+        """Test the terms of the volume balance and the signals of the last blocks for changes.
 
         The blocks are those from the time `since` to the block that ends at `end` [s]. The result is None if the
         stored blocks do not reach from `onset` to `end`, and an empty tuple if there are too few blocks.

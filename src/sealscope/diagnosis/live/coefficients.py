@@ -1,4 +1,4 @@
-"""Estimate a balance's coefficients recursively, from sums over the last blocks; compiled.
+"""Estimate a volume balance's coefficients recursively, from sums over the last blocks; compiled.
 
 The columns are ordered as n nuisances (coefficients other than the leak's), leak, left side. C (n, n) are the
 products of the nuisances' columns with each other and m (n,) those with the left side, summed over the blocks, with
@@ -75,7 +75,7 @@ def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
 
 @law
 def load_block(model: Any, gram: Any, column_order: Any) -> None:
-    """Copy the products of a balance's columns in one block to `model.block`, in the order of the model.
+    """Copy the products of a volume balance's columns in one block to `model.block`, in the order of the model.
 
     `model` is a `Coefficients`, and `gram` (m, m) holds the products. `column_order` (n + 2,) holds the indices of
     these columns: n nuisances (terms other than the leak), the leak, and the left side.
@@ -112,7 +112,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
 @large_law
 def _solve(model: Any) -> None:
-    """Solve the normal equations C x = r of a balance in place, for three right-hand sides r.
+    """Solve the normal equations C x = r of a volume balance in place, for three right-hand sides r.
 
     `model` is a `Coefficients` with n coefficients, whose `matrix[:, n:]` holds the right-hand sides. C (n, n) and
     the first of them are computed here from the sums, with the leak's column eliminated.
@@ -129,7 +129,7 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute a balance's residual sum of squares with given nuisance coefficients and the best leak coefficient.
+    """Compute a volume balance's residual sum of squares with given nuisance and best leak coefficients.
 
     `sums` (n + 2, n + 2) are the products of the columns of n nuisances (coefficients other than the leak's), leak
     and left side. Column 0 of `solution` (n, k) holds the nuisance coefficients.
@@ -150,7 +150,7 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute a balance's coefficients other than the leak's, and the variance of its equations.
+    """Compute a volume balance's coefficients other than the leak's, and the variance of its equations.
 
     `model` is a `Coefficients` with the sums from which both are computed, and in which they are stored.
     """

@@ -148,7 +148,7 @@ class HealthyLevel:
 
 @dataclass(frozen=True)
 class WatchBaseline(HealthyLevel):
-    """Leakage and duty of the healthy machine, measured while the baseline was learned.
+    """Leakage, pressure difference and flow of the healthy machine, measured while the baseline was learned.
 
     Attributes
     ----------
@@ -225,8 +225,8 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
     """Test whether a duty lies between the limits `low` and `high`, extended by a margin.
 
-    A duty consists of the logarithms of the mean pressure difference and of the mean pump flow. The margin towards
-    low pressures is larger, because a leak lowers the pressure difference.
+    A duty consists of the logarithms of the mean pressure difference [Pa] and of the mean pump flow [m^3/s]. The margin
+    towards low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
     min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)
@@ -246,7 +246,7 @@ class BaselineLearning:
     flow : float
         Sum of their flows of a unit conductance [L/min per m^3/(s Pa)].
     duty_low, duty_high : tuple of float, or None
-        Smallest and largest duty of a block so far.
+        Smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s].
     group : list of float
         Conductances of the group of blocks that is not yet complete. A complete group has `GROUP` blocks.
     count : int

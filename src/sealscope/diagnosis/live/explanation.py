@@ -1,7 +1,8 @@
 """Explain an increase of the leakage of a running machine by a leak or by another event.
 
-The e-detector (`sequential`) detects the increase at its rate of false alarms. The probability that a leak, a sensor
-or the duty caused it is computed as for a recording, from the same observables and the same table of events.
+The e-detector (`sequential`) detects the increase at its rate of false alarms. The probability that a leak, a sensor or
+the duty (motion and load) caused it is computed as for a recording, from the same observables and the same table of
+events.
 """
 
 from __future__ import annotations

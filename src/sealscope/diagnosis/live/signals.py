@@ -1,7 +1,7 @@
 """Features of a running machine that no volume balance contains, block by block.
 
-They are duty, noise, mains hum, the sense of p_A - p_B, and mean pressures. Features and tests are those of the
-blocks of a recording (`inference.changes`).
+They are duty (motion and load), noise, mains hum, the sense of p_A - p_B, and mean pressures. Features and tests are
+those of the blocks of a recording (`inference.changes`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _GROUP_SIZES = (1, 2, 4)
 class SignalWindow:
     """Features of the last `WINDOW` blocks of a running machine, and tests for their changes.
 
-    The features are duty, noise, mains hum and mean pressures.
+    The features are duty (motion and load), noise, mains hum and mean pressures.
     """
 
     def __init__(self) -> None:

@@ -337,15 +337,15 @@ class Watch:
         return self._add_flows(estimate, estimator, blocks)
 
     def _has_known_duty(self, block: BlockConductance) -> bool:
-        """Test whether a block's duty is within the range of the baseline; True while there is no baseline."""
+        """Return True if a block's pressure and flow are in the baseline's range, or if there is no baseline."""
         baseline = self.baseline
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        A change of duty is one from known duties, those of the baseline, to others or back. `row` is the block as an
-        array with one row of `_BLOCK`.
+        The duty is the mean pressure difference and pump flow; a change is one from known duties, those of the
+        baseline, to others or back. `row` is the block as an array with one row of `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")

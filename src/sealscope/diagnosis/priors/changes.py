@@ -58,7 +58,7 @@ class HealthyLevelPriors(PriorTable):
 
 
 class OctavePriors(PriorTable):
-    """Ratio of the spectra of p_A and p_B in octaves, in the comparison with healthy recordings.
+    """Ratio of the spectra of two channels, such as p_A and p_B, in octaves, in the comparison with healthy recordings.
 
     - `lowest`, `highest` [Hz]: limits of the frequencies that are compared.
     - `share`: highest frequency that is compared, over the sampling rate.
@@ -82,7 +82,7 @@ class OctavePriors(PriorTable):
 
 
 class PhasePriors(PriorTable):
-    """Phase between p_A and p_B in octaves, in the comparison with healthy recordings.
+    """Phase between two channels, such as p_A and p_B, in octaves, in the comparison with healthy recordings.
 
     - `error` [rad]: standard error of the phase that a filter of known cut-off frequency causes in an octave.
     - `scatter` [rad]: standard deviation of the phase between days.

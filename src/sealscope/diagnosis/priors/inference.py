@@ -116,7 +116,8 @@ class OilPriors(PriorTable):
     - `shift` [h]: time in which the oil warms by the largest difference.
     - `per_drop`, `per_drop_deviation`: the leak is inversely proportional to this power of the viscous pressure drop
       of the motion; the exponent and its standard deviation.
-    - `drop_tells`: probability that a change of this pressure drop is due to the oil and not to the duty.
+    - `drop_tells`: probability that a change of this pressure drop is due to the oil and not to the load and speed of
+      the machine.
     """
 
     warmest: float

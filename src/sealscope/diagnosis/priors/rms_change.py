@@ -6,8 +6,8 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class WalkPriors(PriorTable):
     """Random walk of the logarithm of the RMS over time.
 
-    - `machine`, `noise`, `duty` [1 in 90 s]: half-Cauchy scales of the standard deviation of its change in `time`.
-      They are the parts due to the machine, to noise and to a duty that does not repeat.
+    - `machine`, `noise`, `duty` [1 in 90 s]: half-Cauchy scales of the standard deviation of its change in `time`. They
+      are the parts due to the machine, to noise and to a duty (motion and load) that does not repeat.
     - `tried`: number of rates of the walk between recordings that are tried.
     - `time` [s]: time for which the scales are stated.
     - `least`: smallest fraction of a wavelet detail's energy that is due to the machine.
@@ -22,7 +22,7 @@ class WalkPriors(PriorTable):
 
 
 class DutyExponents(PriorTable):
-    """Exponents of power laws for the RMS of a wavelet detail over the duty.
+    """Exponents of power laws for the RMS of a wavelet detail over the duty (how the machine is moved and loaded).
 
     Each field is a prior standard deviation of the exponent of one quantity.
 

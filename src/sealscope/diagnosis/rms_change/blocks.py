@@ -1,7 +1,8 @@
-"""Cut a recording into comparable blocks, and compute for each the RMS of the wavelet details and of the duty.
+"""Cut a recording into comparable blocks, and compute for each the RMS of the wavelet details and features of the duty.
 
-A block is a whole fraction of the command's cycle, so that blocks of the same phase differ only by noise and by
-changes of the machine. Without a cycle, a block is a window of fixed length.
+The duty is how the machine is moved and loaded, measured by the command and p_A - p_B. A block is a whole fraction of
+the command's cycle, so that blocks of the same phase differ only by noise and by changes of the machine. Without a
+cycle, a block is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -105,8 +106,8 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    Both are described for `RmsBlocks`. Samples at the ends, where the wavelet transform depends on padding, are left
-    out.
+    The duty is how the machine is moved and loaded. Both are described for `RmsBlocks`. Samples at the ends, where the
+    wavelet transform depends on padding, are left out.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -138,9 +139,9 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 def cut_blocks(recording: Recording) -> RmsBlocks:
     """Cut a recording into blocks and compute the log RMS of wavelet details and features of the duty of each.
 
-    The recording must be uniformly sampled and its gaps filled in. Blocks of which too many samples were missing are
-    left out, and so are samples at the ends, where the wavelet transform depends on padding. From the results the
-    mean differences between the phases of a duty cycle are removed.
+    The duty is how the machine is moved and loaded. The recording must be uniformly sampled and its gaps filled in.
+    Blocks of which too many samples were missing are left out, and so are samples at the ends, where the wavelet
+    transform depends on padding. From the results the mean differences between the phases of a duty cycle are removed.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]

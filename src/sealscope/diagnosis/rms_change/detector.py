@@ -56,7 +56,7 @@ class RmsChange:
         return None if frozen is None else f"{frozen} is constant"
 
     def learn(self, recording: Recording) -> Summary:
-        """Summarise a healthy recording for later comparisons: log RMS, duty, chambers, sampling rate and start."""
+        """Summarise a healthy recording: log RMS of details, duty (motion and load), chambers, rate and start."""
         levels, duty = measure_levels(recording)
         return {
             "chambers": list(judged_chambers(recording)),
@@ -183,8 +183,9 @@ def _make_observable(
 ) -> Observable:
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
-    `size` is the change of the log RMS, and `chance` the p-value of a single test. It is multiplied by the number of
-    tests: a rise and a fall of each judged quantity in each chamber.
+    `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `chance` the p-value of a single
+    test. It is multiplied by the number of tests: a rise and a fall of each judged quantity in each of the `chambers`.
+    `onset`: time of the change [s], None for a comparison with healthy recordings.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

@@ -6,10 +6,10 @@ amplitude follows from
 
     y = log RMS d_j - log sqrt(S_j + E_1) = w g + error,    w = S_j / (S_j + E_1),
 
-with E_1 of the same block or recording. A change of the noise therefore cancels, and where noise dominates the weight
-w is small. For d1, y is the log RMS itself. The effect of the duty is eliminated: g follows powers of the duty's
-features (`blocks.DUTY`) with priors on the exponents (`priors.toml`). For a duty that does not repeat, g has a wider
-random walk.
+with E_1 of the same block or recording. A change of the noise therefore cancels, and where noise dominates the weight w
+is small. For d1, y is the log RMS itself. The effect of the duty (how the machine is moved and loaded) is eliminated: g
+follows powers of the duty's features (`blocks.DUTY`) with priors on the exponents (`priors.toml`). For a duty that does
+not repeat, g has a wider random walk.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing's amplitude in each block of a recording.
 
-    Noise is subtracted (`subtract_noise`), and the effect of the duty eliminated. Returns one `Information` (a normal
-    likelihood over the blocks) for each column of `blocks.log_rms`, and the mean of each column's fraction of energy
-    that is not noise.
+    Noise is subtracted (`subtract_noise`), and the effect of the duty (how the machine is moved and loaded) eliminated.
+    Returns one `Information` (a normal likelihood over the blocks) for each column of `blocks.log_rms`, and the mean of
+    each column's fraction of energy that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance

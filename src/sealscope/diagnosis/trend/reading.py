@@ -82,13 +82,14 @@ class LeakReading:
     pump : float
         Mean flow of the pump [m^3/s].
     size_error : float
-        Relative standard error of the machine's size.
+        Relative standard error of flows due to the machine's sizes (displacement, piston area).
     sums : RecordingSums or None
         Sums of the volume balance, for comparison with other recordings; None without a balance.
     terms : tuple of ColumnRoles
         Terms of the volume balance that `sums` belongs to.
     ringing : Summary or None
-        Summary of the pressures' ringing, for comparison with other recordings; None if the channels do not allow it.
+        Summary of the pressures' ringing (RMS of their wavelet details), for comparison with other recordings; None if
+        the channels do not allow it.
     """
 
     file: str
@@ -143,9 +144,9 @@ def estimate_reading(
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
     """Estimate the leakage by the best method that the channels of a recording allow.
 
-    The methods are the volume balance, the pressure response and the damping of the pressures' ringing, in this
-    order. The recording `part` must have no defects. Returns a mapping with the fields of `LeakReading` that depend
-    on the method, or only with its `problem` if no method is possible.
+    `rig`, `machine`: assumed sizes. The methods are the volume balance, the pressure response and the damping of the
+    pressures' ringing, in this order. The recording `part` must have no defects. Returns a mapping with the fields of
+    `LeakReading` that depend on the method, or only with its `problem` if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     no_balance, no_response = unusable_reason(balance, part), unusable_reason(response, part)
@@ -174,7 +175,10 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
 
 
 def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Collect the fields of `LeakReading` that follow from the solution of a volume balance, by their names."""
+    """Collect the level, its error and other fields of `LeakReading` from a solved volume balance, by their names.
+
+    `machine`: assumed sizes, of which only the piston area is taken.
+    """
     size, total = solution.size, solution.conductance
     return {
         "basis": "volume balance",

@@ -55,7 +55,7 @@ class Trend:
         Method by which the levels were estimated: volume balance, pressure response, or the damping of the pressures'
         ringing.
     unit : str
-        Unit of the levels: ``L/min``, or ``%`` of the first recordings if the machine's size is not known.
+        Unit of the levels: ``L/min``, or ``%`` of the first recordings if the machine's sizes are not known.
     pressure : float or None
         Pressure difference at which L/min are stated [Pa].
     points : tuple of TrendPoint
@@ -401,9 +401,9 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. The temperature is
-    that of the first recording. Levels are conductances [m^3/(s Pa)] or, for the ringing, logarithms; the difference
-    of a logarithm from the healthy mean is converted to %.
+    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. The temperature is that
+    of the first recording. Levels are conductances [m^3/(s Pa)] or, for the ringing, logarithms of an RMS; the
+    difference of a logarithm from the healthy mean is converted to %.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (

@@ -1,8 +1,9 @@
 """Describe the increase of a machine's leakage over its recordings in the form that `decision.decide` judges.
 
 The sequential test of `wear` gives the chance that a healthy machine shows such an increase: the time between two
-recordings over the mean time to a false alarm. Other explanations are observed as in a diagnosis: terms of the
-balance in all recordings since the onset, and the ringing of the last recording.
+recordings over the mean time to a false alarm. Other explanations are observed as in a diagnosis: terms of the volume
+balance in all recordings since the onset, and the ringing (RMS of the pressures' wavelet details) of the last
+recording.
 """
 
 from __future__ import annotations
@@ -174,10 +175,11 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Compute the present leakage [L/min], with an interval that includes the error of the machine's size.
+    """Compute the present leakage [L/min], with an interval that includes the error of the machine's sizes.
 
-    `total` is the leakage with the interval of its estimate, `size_deviation` the relative standard error of the
-    size, and `pressure` the pressure difference at which the flow is stated [Pa].
+    `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error due to
+    these sizes (displacement, area), which scale all flows; `pressure`: pressure difference at which the flow is stated
+    [Pa].
     """
     below, above = (np.hypot(end - total.value, WITHIN_95 * total.value * size_deviation) for end in total[1:])
     return TotalLeakage(total.value, (total.value - float(below), total.value + float(above)), pressure)
@@ -186,7 +188,8 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing since the last repair, in the form of a detector's observations.
 
-    `chance` is the probability of such a decrease in a healthy machine. The ringing gives no upper bound of a leak.
+    The ringing is the RMS of their wavelet details. `chance` is the probability of such a decrease in a healthy
+    machine. The ringing gives no upper bound of a leak.
     """
     size = -wear.leak.value / 100.0  # change of the logarithm, from %
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
@@ -229,8 +232,8 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
     """Test the pressures' ringing of the last recording for a change since the onset of the leak.
 
-    It is compared with the recordings before the onset that have the same channels and sampling rate. The result
-    contains no observations if there are none.
+    The ringing is the RMS of their wavelet details. It is compared with the recordings before the onset that have the
+    same channels and sampling rate. The result contains no observations if there are none.
     """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":

@@ -66,7 +66,7 @@ class TotalLeakage:
     Attributes
     ----------
     lpm, interval_lpm : float and pair of floats, or None
-        The flow and its 95 % interval [L/min], None if the machine's size is not known.
+        The flow and its 95 % interval [L/min], None if the machine's sizes are not known.
     pressure : float
         Mean absolute pressure difference that drives the flow [Pa].
     findable_lpm : float or None

@@ -288,8 +288,8 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a reader starts to decode a message; return the number of earlier attempts that never finished.
 
-        After a restart, a message whose decoding crashed the process can thus be refused. `digest`: hash of the
-        message.
+        After a restart, a message whose decoding crashed the process can thus be refused. `reader`: id of the MQTT
+        client that decodes; `digest`: hash of the message.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)

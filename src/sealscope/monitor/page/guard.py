@@ -24,7 +24,7 @@ BACKLOG = 64
 
 
 class Admission:
-    """The check of the token by which a page admits visitors; it delays an address after wrong tokens.
+    """The check of the token by which a page admits visitors; it delays a client's IP address after wrong tokens.
 
     `token`: the valid token; `now`: function that returns a monotonic time [s].
 
@@ -40,7 +40,7 @@ class Admission:
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
-        """Compute the time [s] that an address must wait until its next token is checked, 0 if it need not wait.
+        """Compute the time [s] that a client's IP address must wait until its next token is checked, 0 for no wait.
 
         After `_FREE_ATTEMPTS` wrong tokens from its network the pause doubles with each further one, up to
         `_MAX_PAUSE_S`.
@@ -52,7 +52,7 @@ class Admission:
         return max(0.0, last + min(_FIRST_PAUSE_S * 2.0**doublings, _MAX_PAUSE_S) - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right; if it is wrong, count that for its address and return False.
+        """Return True if a token is right; if it is wrong, count that for the client's IP `address` and return False.
 
         A right token clears the count of the address. `session`: True if `token` is the cookie of a browser that has
         stated the token before.

@@ -99,7 +99,7 @@ def site(
 
 
 class _Pages:
-    """The request handlers of the page; each method serves one address of `_ROUTES`."""
+    """The request handlers of the page; each method serves one URL path of `_ROUTES`."""
 
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
@@ -113,7 +113,7 @@ class _Pages:
         self._admission = None if token is None else Admission(token)
 
     def file(self, request: Request) -> Response:
-        """Answer with the static file of the request's address."""
+        """Answer with the static file of the request's URL path."""
         name, kind = _FILES[request.url.path]
         text = str(read_package_file(name)) if name.startswith("vendor/") else _read_packaged(name)
         return Response(text, media_type=kind)
@@ -305,7 +305,7 @@ def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None
 
 
 def _refuse_for_now(wait: float) -> Response:
-    """Build the answer to an address that must wait `wait` seconds before its next token (status 429)."""
+    """Build the answer, with status 429, to a client who after wrong tokens must wait `wait` seconds."""
     return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 

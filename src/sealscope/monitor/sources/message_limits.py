@@ -69,7 +69,8 @@ def check_cbor(payload: bytes) -> int:
 def check_json(payload: bytes) -> int:
     """Check the numbers of quotation marks and brackets in a JSON message; return its number of colons.
 
-    Colons within texts are counted, too. Raises MessageLimit if quotation marks or brackets are too many.
+    Their number, with which `check_json_keys` finds repeated keys, includes those within texts. Raises MessageLimit if
+    quotation marks or brackets are too many.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:

@@ -1,8 +1,8 @@
 """Integration of many runs at once: the same laws and methods on lanes, eight runs to a vector register.
 
 The last axis of an array is the lane, that is the place of a run in the register. A group is WIDTH runs with the same
-choices of `RigNumbers` and the same shape of the command; numbers, leak, and the command's gain and offset may differ
-between lanes.
+choices of `RigNumbers` and the same waveform of the command; numbers, leak, and the command's gain and offset may
+differ between lanes.
 """
 
 from __future__ import annotations
@@ -142,16 +142,12 @@ def advance(
 
     The groups are `groups[0]` <= g < `groups[1]`, each of WIDTH runs; the first step is `start`.
 
-    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method.
-    `y` (groups, 14, WIDTH): states.
-    `shape` (n, nodes): the command's shape at the times `nodes` [s] within each step; (n, 2 nodes) if the load [N] at
-    the same times follows.
-    `drive` (groups, 2, WIDTH): gain and offset [V] of the command.
-    `leaks` (groups, LEAK_ROWS, WIDTH): numbers of the leaks.
-    `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a span of steps.
-    `bounds` (cells + 1,): steps at which the cells begin, and the end.
-    `p`: the choices that all rigs share.
-    `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before every `every`-th step.
+    `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method. `y` (groups, 14, WIDTH): states. `shape` (n, nodes):
+    the commands' common waveform at the times `nodes` [s] within each step; (n, 2 nodes) if the load [N] at the same
+    times follows. `drive` (groups, 2, WIDTH): gain and offset [V] of the command. `leaks` (groups, LEAK_ROWS, WIDTH):
+    numbers of the leaks. `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a
+    span of steps. `bounds` (cells + 1,): steps at which the cells begin, and the end. `p`: the choices that all rigs
+    share. `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before every `every`-th step.
     `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]

@@ -3,7 +3,7 @@
 A gap is a run of rows in which a needed channel has no value. The logger may have lost these rows, as the clock shows
 (`corrections.clock`), or may have written zeros for both chamber pressures (`remove_dropouts`). Up to `SPLINE`
 samples are bridged by a cubic spline. A longer gap is bridged by the channel's values whole duty cycles before or
-after, with an offset so that both ends meet, or by a straight line if the duty does not repeat. `Recording.bridged`
+after, with an offset so that both ends meet, or by a straight line if the motion does not repeat. `Recording.bridged`
 marks these rows, which are no readings. The flow balance gives less weight to blocks of samples with long gaps
 (`flag_holes`); other detectors omit the blocks that `flag_bridged` marks.
 """
@@ -76,7 +76,7 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
     A gap is a run of rows in which a needed channel has no value. It is filled by a spline if it is short, else from
-    another cycle of the duty or by a straight line. In its rows the missing values of all channels are filled;
+    another cycle of the motion or by a straight line. In its rows the missing values of all channels are filled;
     recorded values stay. Returns the same recording if there is nothing to fill. The clock must be even
     (`clock.resample_evenly`).
     """
@@ -111,9 +111,9 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
     """Interpolate short gaps linearly in the channels that are not `needed`, except at the ends.
 
-    A gap is short up to `SPLINE` samples in a pressure, and up to the prior `motion` [s] in other channels, because a
-    moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the same
-    recording if these channels have no missing values.
+    A gap is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml` in other channels,
+    because a moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the
+    same recording if these channels have no missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -146,7 +146,7 @@ def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> F
 def flag_holes(recording: Recording) -> Flags:
     """Flag the rows (n,) of long gaps, whose missing values have been filled (`Recording.bridged`).
 
-    A gap is long if it is longer than the prior `hole` [s] and longer than `MAX_INTERVAL` sampling steps.
+    A gap is long if it is longer than `gaps.hole` [s] of `priors.toml` and longer than `MAX_INTERVAL` sampling steps.
     """
     flags = np.zeros(len(recording), dtype=bool)
     if recording.bridged is not None:
@@ -163,7 +163,7 @@ def _finite_mean(values: Array) -> float:
 
 
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
-    """Fill a gap in all channels, in place, from a nearby cycle of the duty; return True if there is a similar one.
+    """Fill a gap in all channels, in place, from a nearby cycle of motion; return True if there is a similar one.
 
     The gap has the samples `first` to `stop` - 1. `period`: length of a cycle [samples], known to within `_SLACK`.
     The nearest two cycles on either side of the gap are tried. A cycle is similar if its `_cycle_mismatch` in the
@@ -185,11 +185,12 @@ def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: 
 def _cycle_mismatch(
     channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, shift: int, half_cycle: int
 ) -> float:
-    """Compute the relative difference of the duty around a gap from the duty `shift` samples away.
+    """Compute how much the machine's motion around a gap differs from its motion `shift` samples away.
 
-    The gap has the samples `first` to `stop` - 1. Both stretches extend up to `half_cycle` samples beyond it on
-    either side. The mismatch is the rms difference of the two, without their means, divided by the standard deviation
-    of the shifted one. It is infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
+    The motion is shown by one signal: the command, else p_A - p_B or the only chamber pressure (`duty_signal`). The gap
+    has the samples `first` to `stop` - 1. Both stretches extend up to `half_cycle` samples beyond it on either side.
+    The result is the rms difference of the two, without their means, divided by the standard deviation of the shifted
+    one. It is infinite if too few samples are known, or if a `needed` channel lacks samples to copy.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as it exists here and there

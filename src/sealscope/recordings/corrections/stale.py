@@ -117,8 +117,8 @@ def _is_constant_or_missing(values: Array) -> bool:
 def _jumps_at(values: Array, row: int) -> bool:
     """Return True if a channel (n,) changes across the index `row` by more than it usually does.
 
-    The change is taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (the prior `leap`) of
-    all changes of the channel over as many samples.
+    The change is taken over `2 * _MAX_REPEAT + 1` samples. The usual change is a high quantile (`stale.leap` of
+    `priors.toml`) of all changes of the channel over as many samples.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -128,7 +128,7 @@ def _jumps_at(values: Array, row: int) -> bool:
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
     """Return True if a channel changes in the given rows by more than a small fraction of its range.
 
-    `rows` (k,): indices of the rows. The fraction is the prior `moves`.
+    `rows` (k,): indices of the rows. The fraction is `stale.moves` of `priors.toml`.
     """
     all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     min_fraction: float = _PRIORS.moves

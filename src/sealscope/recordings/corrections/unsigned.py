@@ -74,8 +74,8 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 def _piston_speed(x: Array, rate: float) -> Array:
     """Compute the piston speed (n,) [m/s] from the position `x` (n,) [m] sampled at `rate` [Hz].
 
-    It is the central difference of the positions half a window before and after a sample; half a window is the prior
-    `half` [s]. Missing positions are interpolated linearly.
+    It is the central difference of the positions half a window before and after a sample; half a window is
+    `unsigned.half` [s] of `priors.toml`. Missing positions are interpolated linearly.
     """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
@@ -88,8 +88,8 @@ def _piston_speed(x: Array, rate: float) -> Array:
 def _moves_both_ways(values: Array) -> bool:
     """Return True if a signal (n,) has enough motion in both directions.
 
-    Its positive and its negative values are summed. The smaller sum must exceed the larger one times the prior
-    `least`.
+    Its positive and its negative values are summed. The smaller sum must exceed the larger one times `unsigned.least`
+    of `priors.toml`.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -156,7 +156,7 @@ def _noise_variance(speed: Array, rate: float) -> float:
 
 
 def _average_nearby(values: Array, rate: float) -> Array:
-    """Average values (n,) sampled at `rate` [Hz] around each sample, over the prior `nearby` [s] on either side."""
+    """Average values (n,) sampled at `rate` [Hz] over `unsigned.nearby` [s] of `priors.toml` on either side of each."""
     n_half = max(1, round(_PRIORS.nearby * rate))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first = np.maximum(np.arange(values.size) - n_half, 0)

@@ -222,7 +222,7 @@ def clock_text(clock: float) -> str:
 
 
 def parse_epoch(stamp: str) -> float | None:
-    """Parse a stamp in ISO form to seconds since 1970, to a millisecond; None if the text is no stamp."""
+    """Parse an ISO date and time, as if in UTC, to seconds since 1970, to a millisecond; None if it is none."""
     try:
         moment = np.datetime64(stamp, "ms")
     except ValueError:

@@ -37,7 +37,7 @@ class Member:
     """One experiment of a set of experiments that are integrated together.
 
     `row`: its index in the batch; `numbers`: the model's parameters; `effects`: changes of them within the run. Its
-    command is `gain` times the command shape that the set shares, plus `offset` [V].
+    command is `gain` times the waveform that the set shares (`ExperimentSet.shape`), plus `offset` [V].
     """
 
     row: int
@@ -66,7 +66,7 @@ class Member:
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: their laws, command shape, load and solver settings are equal."""
+    """Experiments that are integrated together: their laws, command waveform (`shape`), load and solver are equal."""
 
     members: tuple[Member, ...]
     shape: Command
@@ -108,7 +108,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 class _ScaledCommand(NamedTuple):
-    """A command as gain times shape plus offset [V]; `key` is a text that is equal for equal shapes."""
+    """A command as gain times waveform (`shape`) plus offset [V]; `key` is a text that is equal for equal shapes."""
 
     key: str
     shape: Command
@@ -117,9 +117,9 @@ class _ScaledCommand(NamedTuple):
 
 
 def _split_command(command: Command) -> _ScaledCommand:
-    """Split a command into gain, shape and offset, so that commands of equal shape can be simulated together.
+    """Split a command into gain, waveform and offset, so that commands of equal waveform can be simulated together.
 
-    The shape of a sine is the sine of amplitude 1. Any other command is its own shape, with gain 1 and offset 0.
+    The waveform of a sine is the sine of amplitude 1. Any other command is its own waveform, with gain 1 and offset 0.
     """
     if isinstance(command, Sine):
         shape = Sine(1.0, command.omega, command.phase)
@@ -128,7 +128,7 @@ def _split_command(command: Command) -> _ScaledCommand:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets that can be integrated together: equal laws, command shape, load, solver settings.
+    """Group experiments into sets that can be integrated together: equal laws, waveform, load, solver settings.
 
     Raises InputError if one of them cannot be in a batch, or if they differ in duration or sampling rate.
     """
@@ -206,9 +206,9 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 class Cells:
     """Model parameters of the runs of a set over time, constant within cells.
 
-    A cell is a span of outputs, the same for all runs. `bounds` (cells + 1,): outputs at which the cells begin, and
-    the end; `base` (runs, parameters): parameters without changes; `changing`: indices of the parameters that change,
-    with their `values` (runs, changing, cells).
+    A cell is a span of outputs, i.e. of times at which the solver writes its results, the same for all runs. `bounds`
+    (cells + 1,): outputs at which the cells begin, and the end; `base` (runs, parameters): parameters without changes;
+    `changing`: indices of the parameters that change, with their `values` (runs, changing, cells).
     """
 
     bounds: np.ndarray
@@ -282,7 +282,8 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
     """Build the parameters (2, INSTRUMENT_ROWS) of one run's pressure instruments for a span of time.
 
     `ends` (2,): begin and end of the span [s]; `samples`: number of samples in it, over which changing parameters
-    are taken as linear; `readings`: changes of the instruments. The rows are p_A and p_B.
+    are taken as linear; `readings`: changes of the instruments. The first axis is p_A and p_B; the second has the
+    quantities whose indices are constants of `signals` (`GAIN` to `MAX_CODE`).
     """
     from sealscope.simulation.batch import signals
 
@@ -384,10 +385,10 @@ class SetRun:
             self._prepare_statistics(bounds)
 
     def _prepare_filters(self, rate: float) -> None:
-        """Compute the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
+        """Set `taps` to the coefficients of each run's anti-alias filter, which includes the delays of its transducers.
 
-        Coefficient k multiplies the output that is k - `taps_before` outputs after the sample. `rate` [Hz]: rate of
-        the outputs.
+        The filter computes a sample of the recording from the solver's outputs, which are `oversampling` times as many.
+        Coefficient k multiplies the output k - `taps_before` steps after the sample. `rate` [Hz]: rate of the outputs.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -514,10 +515,11 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command's shape [V] and the load [N] at all times that the solver's steps in a chunk need.
+        """Compute the command [V] and the load [N] at all times that the solver's steps in a chunk need.
 
-        The chunk has the outputs start <= output < stop; each step needs the inputs at `nodes` times within it.
-        Returns (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
+        The command is the one that all runs share, before the gain and offset of each. The chunk has the outputs
+        start <= output < stop; `nodes` are the times within a step at which its inputs are needed. Returns
+        (steps, nodes), or (steps, 2 nodes) with the load in the last columns if there is one.
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times, load = t[:, None] + self.nodes, self.experiment_set.experiment.load

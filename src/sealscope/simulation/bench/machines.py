@@ -30,12 +30,12 @@ _PATH_STEP = 0.05
 
 @dataclass(frozen=True)
 class BenchMachine:
-    """One healthy machine in one recording: how it deviates from the designed rig, its drifts and its duty.
+    """One healthy machine in one recording: how it deviates from the designed rig, its drifts, its command and load.
 
     `overrides`: the machine's parameters by dotted name, in SI units; `duration` [s]: length of the recording, over
     which the drifts have their sizes; `closed`: closed fraction of both throttles; `command`: voltage command or
-    position target of the duty. A position target is followed by the controller of the name `controller`, built for
-    the designed `rig` and not for the machine.
+    position target. A position target is followed by the controller of the name `controller`, built for the designed
+    `rig` and not for the machine.
     """
 
     profile: str
@@ -50,7 +50,7 @@ class BenchMachine:
     controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
-        """Make the experiment of this machine on its duty, with a start position from which its strokes are centred.
+        """Make the experiment of this machine, with a start position from which its strokes are centred.
 
         `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are
         the machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of

@@ -114,7 +114,7 @@ class NuisanceChoice:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Duty:
-    """The duties of a profile's machines, of which each machine draws one.
+    """The commands and loads of a profile's machines, of which each machine draws one.
 
     A machine draws one of `commands`, a factor on its amplitude from the range `amplitude`, the closed fraction of
     both throttles from `closed` (in the file: per cent), one of `loads` on the rod, and one of `controllers` that
@@ -263,8 +263,8 @@ _Nuisances = Annotated[
 class Family:
     """A family of machines, which differs from the other machines of a profile in one respect.
 
-    `nuisances` replace those of the profile for the same parameters; `duty` replaces the profile's, None keeps it;
-    `warms`: True if the oil warms linearly in all of them; `why`: the reason for the family.
+    `nuisances` replace those of the profile for the same parameters; `duty` (commands and loads) replaces the
+    profile's, None keeps it; `warms`: True if the oil warms linearly in all of them; `why`: the reason for the family.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -277,7 +277,7 @@ class Family:
 
 @dataclass(frozen=True)
 class Profile:
-    """The differences between healthy machines of one kind (`nuisances`), and their duty.
+    """The differences between healthy machines of one kind (`nuisances`), and their duty, i.e. commands and loads.
 
     `families`: groups of machines that differ from the others; `place`: the file, for messages; `seeds`: name from
     which the seeds of cases are derived, "" for `name`, so that a renamed profile can draw the same cases.
@@ -302,7 +302,8 @@ class Profile:
     def of_family(self, name: str) -> Profile:
         """Build the profile of one family's machines from this profile.
 
-        The nuisances (differences between machines) and the duty of the family replace those of this profile.
+        The nuisances (differences between machines) and the duty (commands and loads) of the family replace those of
+        this profile.
         """
         family = self.family(name)
         nuisances = _replace_nuisances(self.nuisances, family.nuisances)
@@ -363,9 +364,9 @@ class _File(BaseModel):
 def _read_profile(path: Path, place: str) -> Profile:
     """Read a profile of machines from its TOML file.
 
-    If the file names a profile that it extends, it inherits the nuisances of that profile, and its duty unless it
-    states one, but not its families. `place` names the file in messages. Raises InputError if the file breaks a
-    rule.
+    If the file names a profile that it extends, it inherits the nuisances of that profile, and its duty (commands and
+    loads) unless it states one, but not its families. `place` names the file in messages. Raises InputError if the file
+    breaks a rule.
     """
     tree = read_toml(path, "a profile", place)
     try:

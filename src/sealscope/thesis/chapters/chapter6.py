@@ -271,7 +271,7 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def _cycle_mask(t: Array, k: int) -> Array:
-    """Return the mask of the samples at times `t` [s] in cycle `k` of the duty, counted from 0."""
+    """Return the mask of the samples at times `t` [s] in cycle `k`, counted from 0, of the position sine `DUTY`."""
     return np.asarray((t >= k * CYCLE) & (t < (k + 1) * CYCLE))
 
 

@@ -28,8 +28,9 @@ def format_note(name: str, **values: Any) -> str:
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    The texts are those of `id` in `claims.toml`, or of `kind` for claims that share texts. Values named `sheet`,
-    `simulation` and `why` replace the text of that name.
+    `tests`: results, None for a test that cannot be made. The texts are those of `id` in `claims.toml`, or of `kind`
+    for claims that share texts. Values named `sheet` (finding by the thesis's data sheet), `simulation` (finding by
+    simulation) and `why` (reason of the verdict) replace the text of that name.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

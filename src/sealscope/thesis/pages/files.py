@@ -30,13 +30,13 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     files: list[str] = []
 
     def write_bytes(name: str, content: bytes) -> None:
-        """Write a file below the folder, and add it to the list of files."""
+        """Write the file `name` below the folder, and add it to the list of files."""
         with atomic_write(folder / name) as temporary:
             temporary.write_bytes(content)
         files.append(name)
 
     def write_rows(name: str, rows: Iterable[Sequence[object]]) -> None:
-        """Write rows as a CSV file below the folder, and add it to the list of files."""
+        """Write rows as the CSV file `name` below the folder, and add it to the list of files."""
         with atomic_write(folder / name) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(rows)
         files.append(name)

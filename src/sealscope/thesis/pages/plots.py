@@ -120,7 +120,8 @@ def choose_grid(n_panels: int) -> tuple[int, int]:
 def _draw_figure(figure: Figure) -> MplFigure:
     """Lay out and draw a figure with matplotlib.
 
-    From the top: a warning if a run is not resolved, the legend if all panels share it, the panels, and the caption.
+    From the top: a warning if a run changed when the solver's step was halved, the legend if all panels share it, the
+    panels, and the caption.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure

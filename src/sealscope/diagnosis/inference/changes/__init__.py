@@ -1,1 +1,1 @@
-"""Changes within a recording, each as an observable: terms of the balance, duty, noise, hum, levels of pressure."""
+"""Changes within a recording, as observables: terms of the volume balance, motion, noise, hum, levels of pressure."""

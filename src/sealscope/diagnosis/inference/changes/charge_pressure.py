@@ -52,7 +52,7 @@ TINY = 1e-300
 
 
 class LowDrifts(NamedTuple):
-    """Drifts of the low values of p_A and p_B [Pa/s], with standard errors; NaN for a chamber that is never low."""
+    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s]; NaN for a chamber never near it."""
 
     low_A: float
     low_A_error: float
@@ -70,7 +70,7 @@ class LowDrifts(NamedTuple):
 
 @np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
-    """Estimate how fast the lowest pressures of each chamber drift [Pa/s], i.e. its charge pressure.
+    """Estimate how fast the lowest pressures of each chamber, i.e. the charge pressure there, drift [Pa/s].
 
     In a closed circuit a chamber that carries no load is at the charge pressure. The result is None without both
     pressures and the pump's angle or speed, or if neither pressure can be fitted.
@@ -93,8 +93,8 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
 class ChargeTrend(NamedTuple):
     """Trend of the charge pressure in a recording, which tells if oil may have left the circuit.
 
-    `fall` [Pa/s], with its standard `error`; `pressure`: absolute charge pressure [Pa]; `begin`, `end`: times of the
-    first and the last sample [s].
+    `fall` [Pa/s]: rate at which the charge pressure falls, with its standard `error` [Pa/s]; `pressure`: charge
+    pressure, absolute [Pa]; `begin`, `end`: times of the first and the last sample [s].
     """
 
     fall: float
@@ -106,10 +106,10 @@ class ChargeTrend(NamedTuple):
     def loss_support(self, flow: float, onset: float) -> float:
         """Compute twice the log likelihood ratio of a loss of oil to none, by the fall of the charge pressure.
 
-        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. The slope fitted
+        A constant loss `flow` [m^3/s] since `onset` [s] empties an accumulator with the gas volume V. The rate fitted
         over the whole recording is then, with the fraction f of the recording before the onset,
 
-            fall = pressure flow / V (1 - f)^2 (1 + 2 f).
+            fall = (pressure flow / V) (1 - f)^2 (1 + 2 f).
 
         V has a log-normal prior. A measured fall may also have another cause, with a small probability.
         """
@@ -183,12 +183,12 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
-    """Compute the standard error of a lower envelope's slope from its scatter between the n parts of a recording.
+    """Compute the standard error [Pa/s] of a lower envelope's slope from its scatter between n parts of a recording.
 
     The robust weights of the fit hide a part that lies off the envelope as a whole, but this error does not. With the
     low quantile r_k of the residuals in part k, and the mean time t_k of that part, it is
 
-        error^2 = sum (r_k - mean)^2 / (n - 2) / sum (t_k - mean)^2.
+        error^2 = (sum (r_k - mean)^2 / (n - 2)) / sum (t_k - mean)^2.
     """
     parts = [part for part in np.array_split(np.arange(len(residual)), PARTS) if part.size]
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])

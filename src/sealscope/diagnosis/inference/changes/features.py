@@ -1,8 +1,9 @@
-"""Tests of steps of features that no balance contains: of the duty's amplitude, of sensor noise, of hum.
+"""Tests of steps of features that no volume balance contains: of the amplitude of motion, of sensor noise, of hum.
 
-Each feature is one number in each block with motion, tested against its scatter between blocks: what a pump's ripple,
-a held load or a drive that is off show at rest is another regime. A leak changes none of them: the operator gives the
-command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not ring.
+Each feature is one number in each block with motion, tested against its scatter between blocks. Blocks at rest, with a
+pump's ripple, a held load or a drive that is off, cannot be compared with them. A leak changes none of them: the
+operator gives the command, the noise is above the frequency of the ringing, which a leak damps, and p_A + p_B does not
+ring.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ _NEIGHBOURS = _PRIORS.neighbours
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step, i.e. for a change of the machine's duty.
+    """Test the amplitudes of command and motion for a step.
 
-    Returns a test for each of the two that is recorded; none if either is constant. A change of the duty changes both
-    alike; a leak changes one of them, in open or closed loop.
+    Returns a test for each of the two that is recorded; none if either is constant. A change of what the machine is
+    commanded to do (its duty) changes both alike; a leak changes one of them, in open or closed loop.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:

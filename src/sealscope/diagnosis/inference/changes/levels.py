@@ -74,9 +74,9 @@ class LevelChange(NamedTuple):
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
-    The speed is the difference of x or theta over a fixed time, or else omega or u itself. The acceleration is the
-    difference of the speed over that time. The position is relative to its mean. Missing values are NaN. Return None
-    if none of these channels is recorded.
+    `rate`: sampling rate [Hz]. The speed is the difference of x or theta over a fixed time, or else omega or u itself.
+    The acceleration is the difference of the speed over that time. The position is relative to its mean. Missing values
+    are NaN. Return None if none of these channels is recorded.
     """
     name = next((name for name in ("x", "theta", "omega", "u") if name in channels), None)
     if name is None:
@@ -138,9 +138,10 @@ def pressure_level_rows(
 ) -> Array:
     """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
-    The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A,
-    p_B. `channels`: samples by channel name; `means` (2,): subtracted from the pressures. Samples faster than a fixed
-    fraction of `max_speed` count as moving; by default it is the `top_speed` of these samples.
+    The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
+    `channels`: samples by channel name; `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures.
+    Samples faster than a fixed fraction of `max_speed` count as moving; by default it is the `top_speed` of these
+    samples.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -159,7 +160,7 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
     The result (K, 4) contains level_A, level_B, half_A and half_B [Pa]. It is None if a block has too few samples of
     one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`: samples in a block;
-    `means` (2,): were subtracted from the pressures.
+    `means` (2,) [Pa]: were subtracted from the pressures.
     """
     n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
     if n_free == 2:

@@ -100,9 +100,9 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 
 
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
-    """Fit coefficients (m,) to values (n,) by reweighted least squares, with weights 1/sqrt(1 + (residual/scale)^2).
+    """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
-    Returns the coefficients and the weights (n,).
+    The weights are 1/sqrt(1 + (residual/scale)^2). Returns the coefficients and the weights (n,).
     """
     equations, weight = stack_equations(design, values), np.ones(len(values))
     for _ in range(ITERATIONS):

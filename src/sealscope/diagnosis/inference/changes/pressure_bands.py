@@ -208,10 +208,11 @@ class _Filters(NamedTuple):
 
 
 def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filters:
-    """Compute how filters of the given `sides` change the spectra of healthy recordings, for all f_c and noises.
+    """Compute how a low-pass filter of one channel changes the spectra of healthy recordings.
 
-    The sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of that of
-    the octave with the least power per frequency.
+    All cutoff frequencies and noises are tried, for each of the `sides`: 0 filters channel A, 1 filters channel B. The
+    sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of that of the
+    octave with the least power per frequency.
     """
     from itertools import product
 

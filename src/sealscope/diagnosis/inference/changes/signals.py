@@ -1,4 +1,4 @@
-"""Observables that no balance contains: duty, noise, hum, sense and levels of the pressures.
+"""Observables that no volume balance contains: duty (motion and load), noise, hum, sense and levels of the pressures.
 
 A leak changes none of them. Called for each recording, whichever provider measures the leak.
 """
@@ -31,7 +31,7 @@ def observe_signals(recording: Recording) -> Observed:
 
 @np.errstate(all="ignore")
 def _test_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and pressure levels of a recording for steps; the report is empty if it is too short."""
+    """Test commanded motion, sensors and pressure levels for steps; the report is empty for too short a recording."""
     shortest = CHANGES.features.shortest
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):
         return Observed(SIGNALS, lack="too short for changes of its signals")
@@ -60,9 +60,10 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield an observable of the step of the duty if command and motion change by similar ratios, else nothing.
+    """Yield an observable of the step of the duty (motion and load) if command and motion change by similar ratios.
 
-    A leak changes only one of them. `tests`: step tests of the log amplitudes of command and motion (`duty_tests`).
+    Otherwise nothing is yielded: a leak changes only one of them. `tests`: step tests of the log amplitudes of command
+    and motion (`duty_tests`).
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():

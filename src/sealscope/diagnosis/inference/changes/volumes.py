@@ -1,4 +1,4 @@
-"""Steps of the coefficients of a balance's terms, as observables: rival descriptions of the same residual.
+"""Steps of the coefficients of a volume balance's terms, as observables: rival descriptions of the same residual.
 
 Each hypothesis is one step of one coefficient, at an unknown onset. They differ only in the term, so that twice their
 log likelihood ratios can be compared directly.
@@ -116,8 +116,9 @@ def _step_hypotheses(
 ) -> Iterator[_Hypothesis]:
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
-    `centred`: sums of the balance without the sensor offset of p_A - p_B, for leaks; `recorded`: sums with the
-    pressures as recorded; `has_accumulator`: True if the accumulator's volume shows external leaks.
+    `centred`: sums of the volume balance without the sensor offset of p_A - p_B, for leaks; `recorded`: sums with the
+    pressures as recorded; `terms`, `columns`: the balance's terms, and the roles of its columns (leak, motion, left
+    side); `has_accumulator`: True if the accumulator's volume shows external leaks.
     """
     first = columns[0]
     for index, term in enumerate(terms):
@@ -161,7 +162,7 @@ def _observable_name(term: Term) -> str:
 
 
 def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
-    """Compute the root mean square of the pressure [Pa] that drives the term `name` of a balance.
+    """Compute the root mean square of the pressure [Pa] that drives the term `name` of a volume balance.
 
     It follows from the sums of squares of the term's column and of the flow offset's. If the balance has no flow
     offset, the result is the mean of abs(p_A - p_B) instead.

@@ -89,10 +89,11 @@ class LockedHold(NamedTuple):
     def own_offset(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given that of the recording, `offset` [Pa].
 
-        The two differ where the gains of the sensors do, with the standard deviation s = gain x pressure. The
-        difference d at the end of the hold is either the own offset, if a leak has equalised the pressures, or that
-        of a load, which may be any up to the pressures themselves. The more probable of the two is assumed. Returns
-        the own offset, and ((own - `offset`) / s)^2, its cost as -2 log of a relative probability density.
+        The two differ where the gains of the sensors do, with the standard deviation s = `held_oil.gain`
+        (`priors.toml`) times the pressure. The difference d at the end of the hold is either the own offset, if a leak
+        has equalised the pressures, or that of a load, which may be any up to the pressures themselves. The more
+        probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its cost as -2 log of a
+        relative probability density.
         """
         last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
         pressure, deviation = float(last.max()), INFERENCE.held_oil.gain * float(last.max())
@@ -448,8 +449,8 @@ class HeldChambers:
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume that a leak of unit coefficient loses since each of o onsets, at all r readings, (r, o).
 
-        A reading is a mean over several samples of a hold. The volumes have the sign of the flow in each side's
-        balance, and are relative to their mean over the hold.
+        A reading is a mean over several samples of a hold. The volumes have the sign of the flow in the volume balance
+        of each side, and are relative to their mean over the hold.
         """
         columns = []
         for hold, flow in zip(self.holds, leak.flows, strict=True):

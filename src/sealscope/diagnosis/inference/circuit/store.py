@@ -1,7 +1,8 @@
 """External leakage, from the volume of an accumulator that replaces the lost oil, in blocks of whole cycles.
 
-The gas of the accumulator expands, by V dp/(n p) at its charge, when oil is lost, when the rod extends, and when it
-warms. With the pressure p of the unloaded side, the volume delivered by the middle of block k is
+The gas of the accumulator (volume V and polytropic exponent n at the charge pressure) expands by V dp/(n p) when oil is
+lost, when the rod extends, and when it warms. With the pressure p of the unloaded side, the volume delivered by the
+middle of block k is
 
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 

@@ -1,6 +1,6 @@
 """Balances of recordings without position or without flow: over whole cycles, or while the piston is held.
 
-A suitable test function removes the piston's displacement from the balance. A box of one cycle, convolved with
+A suitable test function removes the piston's displacement from the volume balance. A box of one cycle, convolved with
 itself, has a double zero at every harmonic of the cycle. Over it a piston that a control loop returns displaces
 nothing,
 
@@ -117,7 +117,7 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
 def _build_blocks(
     signals: Signals, equation: Equation, half_width: float, is_used: NDArray[np.bool_], begin: float, one_sided: bool
 ) -> Blocks | None:
-    """Compute the blocks of a balance whose rows are means over triangular windows of a `half_width` [s].
+    """Compute the blocks of a volume balance whose rows are means over triangular windows of a `half_width` [s].
 
     `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
     `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None if fewer than
@@ -174,10 +174,11 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 
 
 def _shrink_offset(values: Array, names: list[str]) -> None:
-    """Reduce the columns of the leak in rows (r, c) of a balance by the part that sensor offsets may cause, in place.
+    """Reduce, in place, the columns of the leak in rows (r, c) by the part that sensor offsets may cause.
 
-    `names`: names of the columns. The mean pressure difference d of a row becomes d - z^2/d, or 0 if it is smaller
-    than the largest usual offset z (Breiman's garrote). The column of an orifice is scaled by the same factor.
+    The rows are those of a volume balance; `names`: names of the columns. The mean pressure difference d of a row
+    becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote). The column of an
+    orifice is scaled by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]
@@ -187,6 +188,6 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
 
 
 def _mean_flow(increments: Array, rate: float) -> float:
-    """Compute the mean magnitude of a flow [m^3/s] from increments of a volume [m^3]; 0 if all are missing (NaN)."""
+    """Compute a flow's mean magnitude [m^3/s] from volume increments [m^3] at `rate` [Hz]; 0 if all are missing."""
     known = increments[np.isfinite(increments)]
     return float(np.abs(known).mean()) * rate if known.size else 0.0

@@ -148,7 +148,7 @@ class ResponseLeak:
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow [m^3/s] to L/min; None if the machine's size is not stated."""
+        """Factor from a flow [m^3/s] to L/min; None if the machine's sizes are not stated."""
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
@@ -156,10 +156,10 @@ class ResponseLeak:
         return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return the smallest detectable leak, in a record whose total leakage is None.
+        """Return the smallest detectable leak, without the total leakage, which pressures alone do not show.
 
-        Pressures alone do not show the total leakage. `detectable_flow`: flow [m^3/s] of the smallest leak that would
-        be detected if it began within the recording; None if that was not tested.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording;
+        None if that was not tested.
         """
         pump_flow, lpm_per_flow = self.pump_flow[0], self.lpm_per_flow
         return TotalLeakage(

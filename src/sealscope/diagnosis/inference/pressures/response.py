@@ -5,8 +5,8 @@ parameters with each of them increased in turn. Their states continue from block
 leads from block to block (`Follower`), both live and over a recording. Over a recording all blocks are then fitted
 together (`fit.Joint`). Of the two laws of friction the one that is more probable at the beginning is used.
 
-The result is the factor p(pressures | command) of the likelihood. A balance of position and angle is conditional on
-p_A and p_B, so the two likelihoods may be multiplied.
+The result is the factor p(pressures | command) of the likelihood. A volume balance of position and angle is conditional
+on p_A and p_B, so the two likelihoods may be multiplied.
 
 Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (iterated filter as Gauss-Newton steps).
 """

@@ -1,4 +1,4 @@
-"""The weak form of a balance: rows of a linear regression from samples, without derivatives and without a cycle.
+"""The weak form of a volume balance: rows of a linear regression from samples, without derivatives or a cycle.
 
 A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions of compact support and integrated,
 
@@ -38,9 +38,9 @@ _FINE_RATE = 1e4
 class Rows(NamedTuple):
     """Rows of a linear regression, one for each of r test functions.
 
-    `time` (r,): middle of each test function [s since the first sample]; `values` (r, c): integral of the test
-    function times the increments of each of c columns, i.e. a weighted mean rate of change [1/s of the column's
-    unit]; `whole` (r,): flags of the rows without a missing sample.
+    `time` (r,): middle of each test function [s since the first sample]; `values` (r, c): integral of the test function
+    times the increments of each of c columns, i.e. a weighted mean rate of change [unit of the column's increments per
+    second]; `whole` (r,): flags of the rows without a missing sample.
     """
 
     time: Array
@@ -71,7 +71,10 @@ def test_function(rate: float) -> Array:
 
 @lru_cache(maxsize=8)
 def _transposed_test_function(rate: float) -> Array:
-    """Return the transpose of `test_function`, shape (stride, SPAN), in the memory order that BLAS reads fastest."""
+    """Return the transpose of `test_function`, shape (stride, SPAN), in the memory order that BLAS reads fastest.
+
+    `rate`: sampling rate [Hz].
+    """
     return np.ascontiguousarray(test_function(rate).T)
 
 

@@ -72,7 +72,7 @@ class BalanceLeak:
 
     @property
     def cause(self) -> Cause:
-        """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance does not separate them.
+        """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
         Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
         the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine. If only
@@ -261,7 +261,7 @@ class BalanceLeak:
         """95 % upper bound of the leak's mean flow [m^3/s]; infinite if nothing was tested.
 
         With healthy recordings it bounds the leakage above theirs, also by holds of the load if there are any.
-        Otherwise it bounds a leak that begins within the recording. It covers the uncertainty of the machine's size
+        Otherwise it bounds a leak that begins within the recording. It covers the uncertainty of the machine's sizes
         and of the leak's law.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
@@ -342,13 +342,13 @@ class BalanceLeak:
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a computed flow [m^3/s] to the machine's flow [L/min]; None if its size is not stated."""
+        """Factor from a computed flow [m^3/s] to the machine's flow [L/min]; None if its sizes are not stated."""
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's size, which scales all flows."""
+        """Relative standard deviation of the machine's sizes (displacement, piston area), which scale all flows."""
         return self.balance.size.deviation
 
     @property
@@ -401,7 +401,7 @@ class BalanceLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over time [L/min] with its 95 % interval; None if the machine's size is not stated.
+        """Return the leakage over time [L/min] with its 95 % interval; None if the machine's sizes are not stated.
 
         With an onset `onset_s` [s] it is the growth of the leakage since then, without one (None) the total leakage.
         """

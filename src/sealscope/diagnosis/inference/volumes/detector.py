@@ -67,7 +67,7 @@ MIN_STRIDE = 2
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Return True if the pump replaces the oil that leaks, so that the balance shows the leakage.
+    """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
 
     Every pump leaks at least a fraction of its mean flow (`held.share` in `priors.toml`). The lower end of the
     leakage's 95 % interval must exceed it. A smaller leakage means that no control loop returns or holds the piston.
@@ -126,7 +126,7 @@ class VolumeBalance:
         return self._balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
-        """Choose among the balances that need no position the one with the smallest upper bound of a leak.
+        """Choose among the volume balances that need no position the one with the smallest upper bound of a leak.
 
         A balance of holds behind shut valves is always usable, any other only if the pump compensates the leakage
         (`compensates_leakage`). Return None if none is usable.
@@ -142,7 +142,7 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _recorded(self, recording: Recording) -> RecordedBlocks | None:
-        """Return the blocks of a recording for a balance with a position, computed once; None if it allows none."""
+        """Return the blocks of a recording for a volume balance with a position, computed once; None if it has none."""
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
@@ -160,10 +160,10 @@ class VolumeBalance:
         )
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording for later comparisons; None if it allows no balance.
+        """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
         The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
-        and `scale`, the factor from the rig's flows to the machine's, 0 if the machine's size is not stated. If the
+        and `scale`, the factor from the rig's flows to the machine's, 0 if the machine's sizes are not stated. If the
         machine rests, it also contains `shut_sums`, the sums for a pump that is cut off at rest, and `shut_odds`, the
         log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks during holds, and
         `held_odds`, the log odds from these. Of a load that valves hold: `creep_odds`, the log odds that it creeps.
@@ -220,7 +220,7 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
-        """Return True unless a control loop may hold the load of a balance without the pump (`terms.locked`).
+        """Return True unless a control loop may hold the load, in a volume balance without the pump (`terms.locked`).
 
         With a recorded command valves hold it. Without one the load must creep in the healthy recordings with these
         `summaries`: a control loop would replace what leaks, and slow motions are no creep.
@@ -242,7 +242,7 @@ class VolumeBalance:
         return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Report on a recording: tests of each term of the balance for a step, and the leakage.
+        """Report on a recording: tests of each term of the volume balance for a step, and the leakage.
 
         The leakage is compared with that of the healthy recordings in `baseline` that have the same terms.
         """
@@ -282,7 +282,7 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Make the report of a balance: tests, leakage, and the fraction of the recording that is judged.
+        """Make the report of a volume balance: tests, leakage, and the fraction of the recording that is judged.
 
         `healthy`: sums of the healthy recordings. The report contains only a reason if the leakage can be tested
         neither for a step nor against healthy recordings.
@@ -305,11 +305,11 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Compare the flow that the piston's motion takes with that of healthy recordings.
+    """Test whether the piston's motion takes another flow than in healthy recordings.
 
     Yields one observable, or none if there are too few healthy recordings. A change means another machine or another
     scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
-    `roles`: roles of the columns in the balance (leak, motion, left side).
+    `roles`: roles of the columns in the volume balance (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 

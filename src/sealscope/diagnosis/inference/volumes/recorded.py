@@ -70,7 +70,7 @@ END_QUANTILE = 0.02
 
 
 class Size(NamedTuple):
-    """Scale of the machine's flows, since a balance is computed with an assumed displacement of the pump.
+    """Scale of the machine's flows, since a volume balance is computed with an assumed displacement of the pump.
 
     `scale`: true flow of the machine over the computed one, with its relative standard `deviation`; `stated`: true if
     flows can be stated in L/min; `ratio`: measured ratio of displacement to area, relative to the assumed one, None
@@ -155,7 +155,7 @@ class RecordedBalance:
     def volume_ratio(self) -> float:
         """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if it is not measured.
 
-        In the balance the volumes of the cylinder are larger by this factor than those from the rig's file.
+        In the volume balance the volumes of the cylinder are larger by this factor than those from the rig's file.
         """
         ratio = self.size.ratio
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
@@ -233,7 +233,7 @@ class RecordedBalance:
 
         The leaks in holds are compared with the total leakage: through open valves the resting pump would leak as
         much as the turning one. Check valves that refill a chamber would hide what leaves it, so they are left out.
-        The odds are limited by `rest.most` of `priors.toml`.
+        The log odds are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
@@ -266,8 +266,8 @@ class RecordedBalance:
 
         They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion,
         weighted by the sums of squares of their columns. If the rig's file states the areas, they are used, scaled to
-        the flows of the balance. A side that never carries the load takes the area of the other. Both are zero if
-        nothing moves.
+        the flows of the volume balance. A side that never carries the load takes the area of the other. Both are zero
+        if nothing moves.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -301,8 +301,8 @@ class RecordedBalance:
     def position_delay(self) -> Estimate | None:
         """Delay of the recorded position behind the flow [s], with its standard deviation; negative if x is early.
 
-        It is the coefficient of the balance's term of lag over the piston area. None if the balance has no such term
-        or no motion, or if the measured area is not positive.
+        It is the coefficient of the volume balance's term of lag over the piston area. None if the balance has no such
+        term or no motion, or if the measured area is not positive.
         """
         roles = self.columns[0]
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -355,9 +355,9 @@ class RecordedBalance:
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A loop replaces what leaks, so that the piston hardly moves. The flow by which it moves in holds is compared
-        with zero and with that of a pump that holds a load, as fractions of the flow in motion. The odds are limited
-        by `rest.most` of `priors.toml`.
+        A loop replaces what leaks, so that the piston hardly moves. A flow in holds near zero therefore speaks against
+        creep, and one near the flow by which a pump holds a load (a fraction of the flow in motion) speaks for it. The
+        log odds are limited to +-`rest.most` of `priors.toml`.
         """
         holding_flow, pressure = INFERENCE.rest.holding * self.mean_flow, self.mean_pressure()
         flow, low, high = (value * pressure for value in self.conductance)
@@ -385,10 +385,10 @@ class RecordedBalance:
 def _flow_scale(balance: RecordedBalance) -> Size:
     """Determine the scale of the machine's flows and its uncertainty from the sizes that the rig's file states.
 
-    The flow of a flow meter needs no scale. Otherwise the balance measures the ratio of displacement to area. A
+    The flow of a flow meter needs no scale. Otherwise the volume balance measures the ratio of displacement to area. A
     stated displacement gives the scale directly, a stated area through that ratio. If both are stated and disagree,
-    their difference is the uncertainty. Behind a servo valve, and for a load
-    that shut valves hold, the areas give the flow.
+    their difference is the uncertainty. Behind a servo valve, and for a load that shut valves hold, the areas give the
+    flow.
     """
     roles, rig, is_meter = balance.columns[0], balance.rig, measures_flow(balance.recording.units)
     prior = INFERENCE.size

@@ -59,7 +59,7 @@ CASES: dict[str, tuple[str, float | None]] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading of the throttles' equations, which the thesis states inconsistently or incompletely.
+    """One reading (interpretation) of the throttles' equations, which the thesis states inconsistently or incompletely.
 
     `metering`: "meter-out" (the text: the return flow is throttled on both sides) or "literal" (eqs. 4.11, 4.12 as
     printed); `closed_means`: a throttle is closed by a fraction of its "area" (eq. 4.8) or of its "diameter" (the
@@ -74,13 +74,13 @@ class Reading:
 
     @property
     def title(self) -> str:
-        """Short description of the reading, such as "meter-out, closed by area, 7 mm"."""
+        """Short description of this interpretation of the equations, such as "meter-out, closed by area, 7 mm"."""
         metering = "as printed" if self.metering == "literal" else "meter-out"
         text = f"{metering}, closed by {self.closed_means}, {self.d_line_mm:g} mm"
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
     def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Return the rig's parameters under this reading for throttles closed by `closed_pct` [%].
+        """Return the rig's parameters under this interpretation, for throttles closed by `closed_pct` [%].
 
         A closing of 0 means open throttles, None a rig without throttles. Each parameter is a pair (dotted name,
         value).
@@ -120,7 +120,7 @@ def make_experiment(
 ) -> Experiment:
     """Build the experiment of a command with throttles closed by `closed_pct` [%], None for no throttles.
 
-    `reading`: reading of the throttles' equations; `solver`: "as_published" for the thesis's method and step;
+    `reading`: interpretation of the throttles' equations; `solver`: "as_published" for the thesis's method and step;
     `duration` [s]; `overrides`: parameters that replace the reading's.
     """
     values = {**dict(reading.values(closed_pct)), **overrides}
@@ -133,9 +133,9 @@ def make_drift_experiment(
 ) -> Experiment:
     """Build the long experiment in which the drift of the piston is measured, with the command of section 4.3.
 
-    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: reading of the thesis's equations of
-    the throttles; `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that replace the
-    reading's.
+    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
+    equations of the throttles; `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that
+    replace the reading's.
     """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
@@ -146,8 +146,8 @@ def run_both_solvers(
 ) -> Runs:
     """Simulate a command with the thesis's solver and with a converged one; return both runs by solver.
 
-    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: reading of the thesis's equations of
-    the throttles.
+    `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
+    equations of the throttles.
     """
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 

@@ -1,7 +1,7 @@
 """Judge the testable sentences of chapter 4.
 
-Claims on the orifices are judged on converged runs under both readings of the equations (`cases.Reading`); the
-results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
+Claims on the orifices are judged on converged runs under both interpretations ("readings") of the equations
+(`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
     """Format how many tests passed, such as "7 of 16 tests pass".
 
-    If only some passed, the text also names the readings of the equations under which all tests pass.
+    If only some passed, the text also names the interpretations of the equations under which all tests pass.
     """
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
@@ -174,11 +174,11 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` of the thesis by converged runs under both readings of the throttles' equations.
+    """Judge claim 4.`number` of the thesis by converged runs under both interpretations of the equations.
 
-    The claim's text states the results of both solvers. `numbers`: results of the runs by solver and reading; `test`:
-    yields the outcomes of the tests on the results of one reading; `format_numbers`: formats the results of all
-    readings.
+    The claim's text states the results of both solvers. `numbers`: results of the runs by solver and interpretation
+    (`Reading`); `test`: yields the outcomes of the tests on the results under one interpretation; `format_numbers`:
+    formats the results under all of them.
     """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
@@ -198,10 +198,10 @@ def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats the range [kPa] of some numbers over all readings of the equations.
+    """Build a function that formats the range [kPa] of some numbers over all interpretations of the equations.
 
-    `head`: text before the range; `values`: computes these numbers [Pa] from the summaries of the runs of one reading
-    (`summarise_run`).
+    `head`: text before the range; `values`: computes these numbers [Pa] from the summaries of the runs under one
+    interpretation (`summarise_run`).
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
@@ -217,13 +217,13 @@ def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> li
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Simulate some cases, given as (command, closing [%]), under both readings and with both solvers.
+    """Simulate some cases, (command, closing [%]) each, under both interpretations and with both solvers.
 
-    Returns, by solver and reading, a list with the summary of each case's run (`summarise_run`).
+    Returns, by solver and interpretation, a list with the summary of each case's run (`summarise_run`).
     """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
-        """Simulate one case under one reading with one solver, and summarise its run."""
+        """Simulate one case under one interpretation, orifices closed by `closed` [%], and summarise its run."""
         return cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
 
     return {
@@ -302,7 +302,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     """Judge claims 4.18 and 4.19 on the drift of the piston with orifices."""
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
-        """Compute the drift [m] of the piston in a long run; `closed`: closing of the orifices [%], None for none."""
+        """Compute the piston's drift [m] in a long run; `closed`: closing of the orifices [%], None for none."""
         return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
     drift_without = drift(DEFAULT_READING, None, "converged")
@@ -315,11 +315,11 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
         """Build a function that formats the piston's additional drift with orifices, at each closing.
 
-        It states the range over both readings of the equations; `head`: text before it.
+        It states the range over both interpretations of the equations; `head`: text before it.
         """
 
         def format_drift(rows: list[list[float]]) -> str:
-            """Format the added drift [mm] at each closing, as the range over `rows`, one row for each reading."""
+            """Format the added drift [mm] at each closing, as the range over `rows`, one for each interpretation."""
             parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
             texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
             return f"{head} {', '.join(texts)}"
@@ -359,7 +359,7 @@ _HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
     """Judge the claims of chapter 4, and tabulate summaries of the runs with one command.
 
-    The table has a row for each reading of the throttles' equations, solver and closing of the orifices.
+    The table has a row for each interpretation of the throttles' equations, solver and closing of the orifices.
     """
     without_orifices = (_judge_cases_without_orifices, _judge_step_and_gains, _judge_equations_and_tables)
     with_orifices = (_judge_opening, _judge_larger_closings, _judge_drift)

@@ -60,15 +60,15 @@ _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0,
 
 
 def item_reading(item: Item) -> Reading:
-    """Return the reading of the throttles' equations that an item names, the default one if it names none."""
+    """Return the interpretation of the throttles' equations that an item names, the default one if it names none."""
     return Reading(**item.inputs.get("reading", {}))
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
     """Simulate a case of Table 4.2 or 4.3 with the thesis's solver and with a converged one.
 
-    The item names the case, and may name a reading of the throttles' equations. Returns the runs by solver, and the
-    notes for the figure or table.
+    The item names the case, and may name an interpretation of the throttles' equations. Returns the runs by solver, and
+    the notes for the figure or table.
     """
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
@@ -76,9 +76,9 @@ def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
 
 
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
-    """Format the notes on a figure of a case: reading of the equations, and runs that failed or are not resolved.
+    """Format the notes on a figure of a case: variant of the equations, and runs that failed or need a smaller step.
 
-    `reading`: None for a case without orifices.
+    `reading`: one way to understand the thesis's inconsistent equations (`Reading`); None for a case without orifices.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:

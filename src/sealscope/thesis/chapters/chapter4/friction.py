@@ -1,4 +1,4 @@
-"""Draw Figs. 4.2 and 4.3: friction models, and the rig's Stribeck curve for both readings of eq. (4.22).
+"""Draw Figs. 4.2 and 4.3: friction models, and the rig's Stribeck curve for both interpretations of eq. (4.22).
 
 Eq. (4.22) is printed with an unbalanced bracket, which can be closed in two places.
 """
@@ -38,9 +38,9 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 
 
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Compute the friction [N] at the threshold velocity v_th and just above it, for both readings of eq. (4.22).
+    """Compute the friction [N] at the threshold velocity v_th and just above it, for both forms of eq. (4.22).
 
-    Returns the two forces by the name of the reading: "continuous", or "literal" with the bracket as printed.
+    Returns the two forces by the name of the form: "continuous", or "literal" with the bracket as printed.
     """
     v_th = thesis_rig().friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
@@ -85,7 +85,7 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, its slope, and both readings of eq. (4.22) near standstill."""
+    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22) near standstill."""
     rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
