@@ -90,7 +90,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
     watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
     needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion",
 )
-#: All circuits.
+#: All circuits. A rig has the first one whose choice it meets, so that one with a choice of its own stands first.
 CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 

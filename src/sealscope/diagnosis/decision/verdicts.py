@@ -21,7 +21,7 @@ def decide_without_leak(bound: float, max_bound: float) -> Verdict:
 def bound_worth_stating(flow: float) -> float:
     """Compute the largest upper bound of an undetected leak that still allows the verdict `no leak`.
 
-    It is a fraction (`worth.share` in `priors.toml`) of the pump's `flow`, in the same unit, or 0 if `flow` is not
-    positive.
+    It is a fraction (`worth.share` in `priors.toml`) of the pump's mean `flow` while it delivers, in the same unit, or
+    0 if `flow` is not positive.
     """
     return float(DECISION.worth.share) * flow if flow > 0.0 else 0.0
