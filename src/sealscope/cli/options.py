@@ -260,7 +260,8 @@ class StatedMachine:
         """Diagnose a recording of this machine.
 
         `baseline`: healthy recordings, or empty; a commissioned machine has its own instead. `file`: name of the
-        recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`.
+        recording in the diagnosis; `settings`: further arguments of `sealscope.diagnose`, or of the commissioned
+        machine's `diagnose`.
         """
         from dataclasses import replace
 

@@ -182,15 +182,15 @@ class _OilRegression(NamedTuple):
     `left` (r,): volume displaced by the piston, minus the compression expected from the priors; `oil` (r, 4): columns
     of compressibility, dead volumes of A and B, and free air, whose coefficients are deviations from the priors;
     `deviations` (4,): standard deviations of the priors; `inflation`: number of readings over the number of
-    independent ones; `min_variance`: variance of a reading in addition to that of the noise, since the model describes
-    the compressed volume only to within a fraction.
+    independent ones; `misfit_variance`: variance of a reading in addition to that of the noise, since the model
+    describes the compressed volume only to within a fraction.
     """
 
     left: Array
     oil: Array
     deviations: Array
     inflation: float
-    min_variance: float
+    misfit_variance: float
 
 
 class _LeakRegression(NamedTuple):
@@ -296,13 +296,13 @@ class HeldChambers:
                 volumes.append(displaced - displaced.mean())
         oil, dead_deviation = np.vstack(columns), prior.compressibility * prior.dead_deviation / prior.dead
         compressed = oil @ [prior.compressibility, 0.0, 0.0, prior.air]
-        min_variance = prior.misfit**2 * float(compressed @ compressed) / len(oil)
+        misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(oil)
         return _OilRegression(
             left=np.concatenate(volumes) - compressed,
             oil=oil,
             deviations=np.array([prior.compressibility * prior.deviation, dead_deviation, dead_deviation, prior.air]),
             inflation=max(len(oil) / self.n_readings, 1.0),
-            min_variance=max(min_variance, float(np.finfo(float).tiny)),
+            misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
         )
 
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
@@ -340,12 +340,12 @@ class HeldChambers:
         replace displaced oil. The variance of a reading, which weights the priors of the oil against the readings, is
         found by iteration.
         """
-        left, oil, deviations, inflation, min_variance = self._regressions[is_refilled]
+        left, oil, deviations, inflation, misfit_variance = self._regressions[is_refilled]
         design, n_leaks = np.column_stack([columns, oil]), columns.shape[1]
         scale = np.sqrt((design**2).sum(axis=0))
         scale[~(scale > 0.0)] = 1.0
         degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
-        variance = max(float(left @ left) / len(left), min_variance)
+        variance = max(float(left @ left) / len(left), misfit_variance)
         gram, moments, scales = design.T @ design, design.T @ left, np.outer(scale, scale)
         for _ in range(MAX_ITERATIONS):
             prior = np.concatenate([np.zeros(n_leaks), variance * inflation / deviations**2])
@@ -355,7 +355,7 @@ class HeldChambers:
             solution = inverse @ moments
             residual = left - design @ solution
             cost = float(residual @ residual) + float(prior @ solution**2)
-            previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + min_variance
+            previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + misfit_variance
             if abs(variance - previous) <= TOLERANCE * previous:
                 break
         covariance = variance * inflation * inverse
@@ -468,7 +468,7 @@ class HeldChambers:
         `leak`: its flow with a coefficient of 1. The result is log prior - N/2 log(residual sum of squares), for N
         independent readings and a coefficient >= 0, with the properties of the oil eliminated.
         """
-        left, oil, deviations, inflation, min_variance = self._regressions[leak.is_refilled]
+        left, oil, deviations, inflation, misfit_variance = self._regressions[leak.is_refilled]
         design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
         variance = self._fits_without_leak[leak.is_refilled].variance
         precision = oil.T @ oil + np.diag(variance * inflation / deviations**2)
@@ -479,7 +479,7 @@ class HeldChambers:
         total, energies, moments = gram[0, 0], np.diag(gram)[1:], np.maximum(gram[0, 1:], 0.0)
         is_informative = energies > RIDGE * max(float(energies.max()), np.finfo(float).tiny)
         gain = np.where(is_informative, moments**2 / np.where(is_informative, energies, 1.0), 0.0)
-        residual_squares = np.maximum(total - gain, 0.0) + min_variance * len(left)
+        residual_squares = np.maximum(total - gain, 0.0) + misfit_variance * len(left)
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(residual_squares))
 
     @cached_property
