@@ -82,7 +82,9 @@ def held_press(
 
 def test_a_hold_of_twelve_seconds_sees_no_leak_where_there_is_none() -> None:
     for seed in range(3):
-        leaks = held_press(seed).leaks
+        chambers = held_press(seed)
+        leaks = chambers.leaks
+        assert chambers.total_leak().value < 0.01 * SEAL
         assert leaks.piston < 1e-3 * SEAL
         assert max(leaks.outside_A, leaks.outside_B) < 1e-3 * SEAL
 
@@ -151,6 +153,28 @@ def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> No
     p = p.copy()
     p[400] = np.nan
     assert len(find_locked_holds((t, p, x, x), rests[1:], RATE)) == 1
+
+
+def test_what_passes_an_open_valve_and_the_resting_pump_is_no_oil_that_does_not_compress() -> None:
+    """Side B empties into A, which stays at the charge pressure, as it does not behind valves that are shut.
+
+    No leak of a cut-off cylinder fits. A fit whose oil hardly compresses, so that nothing leaves B, did.
+    """
+    tau, after = 4.0, 0.1  # time constant of the pump's slip and B's volume, and stroke left of A [s, m]
+    phase = np.arange(0.0, 10.0, 1.0 / RATE)
+    p_A, x = np.full(phase.size, CHARGE + P_ATM), np.full(phase.size, after)
+    p_B = p_A + 1e6 * np.exp(-phase / tau)
+    t = np.concatenate([k * 20.0 + phase for k in range(4)])
+    rests = np.ones(t.size, dtype=bool)
+    rests[:: phase.size] = False
+    noise = np.random.default_rng(3).standard_normal((2, t.size))
+    channels = t, np.tile(p_A, 4) + 3e3 * noise[0], np.tile(p_B, 4) + 3e3 * noise[1], np.tile(x, 4)
+    sides = CylinderSides(AREA_A, AREA_B, 0.0, STROKE)
+    chambers = HeldChambers(find_locked_holds(channels, rests[1:], RATE), sides, 0.0, float(t[-1]), CHARGE + P_ATM)
+    usual_slip = AREA_B * (STROKE - after + 0.3 * STROKE) * 8e-10 / tau  # oil as the priors expect it, no air
+    total = chambers.total_leak()
+    assert 0.5 * usual_slip < total.value < 4.0 * usual_slip
+    assert total.value > 5.0 * total.deviation
 
 
 @pytest.mark.parametrize("size", few([0.02, 0.1], 1))

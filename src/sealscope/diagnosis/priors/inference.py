@@ -200,8 +200,9 @@ class SensePriors(PriorTable):
 class HeldOilPriors(PriorTable):
     """Oil that is enclosed in the sides of a cylinder while shut valves hold it; such a time is a hold.
 
-    - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and its relative standard deviation.
-    - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and its relative standard deviation.
+    - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and the standard deviation of its
+      logarithm.
+    - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and the same of it.
     - `unlike`: largest ratio of the areas of both sides.
     - `right`: probability that the holds are right about a leak's size if they disagree with the whole recording.
     - `agrees`: standard deviation of the logarithm of the ratio of the conductances from holds and whole recording.
@@ -218,7 +219,7 @@ class HeldOilPriors(PriorTable):
     - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
     - `resolved` [Pa]: margin in addition, below which a sensor does not tell a pressure from the charge pressure.
     - `steady` [s]: time over which a pressure is averaged before it is compared with the charge pressure.
-    - `air`: volume fraction of free air in the oil.
+    - `air`, `air_deviation`: volume fraction of free air in the oil, and the same of it.
     """
 
     compressibility: float
@@ -241,6 +242,7 @@ class HeldOilPriors(PriorTable):
     resolved: float
     steady: float
     air: float
+    air_deviation: float
 
 
 class PressurePriors(PriorTable):

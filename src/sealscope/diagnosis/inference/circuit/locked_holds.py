@@ -8,10 +8,11 @@ Such a hold leaves each chamber a closed volume with leaks. From the beginning o
 with the piston's areas m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk
 modulus K and free air alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are those of the
 pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way,
-while a check valve may fill the other side. All holds form one linear regression, each side of a hold about its mean,
-with the priors of the oil (`held_oil` in `priors.toml`) as additional readings. The onset of the leak and the sensor
-offset z of p_A - p_B are those of the highest posterior; a leak that has equalised the pressures determines z. The
-three leaks are hypotheses, each with its probability.
+while a check valve may fill the other side. All holds form one regression, each side of a hold about its mean. The
+logarithms of K, alpha and the volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that
+no oil is incompressible; the regression is linearised about the estimate, iteratively. The onset of the leak and the
+sensor offset z of p_A - p_B are those of the highest posterior; a leak that has equalised the pressures determines z.
+The three leaks are hypotheses, each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -19,7 +20,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -49,6 +50,8 @@ N_ONSETS = 4
 UNKNOWN = 1e30
 #: Maximum number of iterations of a fit, relative change of the variance that ends them, relative ridge of a matrix.
 MAX_ITERATIONS, TOLERANCE, RIDGE = 20, 1e-3, 1e-12
+#: Largest change of the logarithm of a property of the oil in one iteration.
+MAX_STEP = 0.5
 #: Quantile of the lower chamber pressure that counts as charge pressure.
 LOWEST = 0.02
 #: Probability outside of the interval of an onset.
@@ -177,20 +180,45 @@ class UnitLeak(NamedTuple):
 
 
 class _OilRegression(NamedTuple):
-    """Linear regression of displaced volumes on the properties of the oil, over r readings of all holds.
+    """Regression of displaced volumes on the properties of the oil, over r readings of all holds.
 
-    `left` (r,): volume displaced by the piston, minus the compression expected from the priors; `oil` (r, 4): columns
-    of compressibility, dead volumes of A and B, and free air, whose coefficients are deviations from the priors;
-    `deviations` (4,): standard deviations of the priors; `inflation`: number of readings over the number of
-    independent ones; `misfit_variance`: variance of a reading in addition to that of the noise, since the model
-    describes the compressed volume only to within a fraction.
+    The properties are compressibility, dead volume of A and of B, and free air, each relative to its usual value; the
+    regression is on their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the
+    piston; `strained` and `aired` (r, 3): volumes taken up by the compression of the oil and of the free air with the
+    usual properties, in the stroke, and in the dead volumes of A and of B; `inflation`: number of readings over the
+    number of independent ones; `misfit_variance`: variance of a reading in addition to that of the noise, since the
+    model describes the compressed volume only to within a fraction.
     """
 
-    left: Array
-    oil: Array
-    deviations: Array
+    displaced: Array
+    strained: Array
+    aired: Array
     inflation: float
     misfit_variance: float
+
+    def leaked(self, logs: Array) -> Array:
+        """Compute the volume that left each chamber (r,): the displaced minus the compressed, for given `logs` (4,)."""
+        oil, air, volumes = _oil_factors(logs)
+        return self.displaced - (oil * self.strained + air * self.aired) @ volumes
+
+    def slopes(self, logs: Array) -> Array:
+        """Compute the derivatives of the compressed volumes by the logarithms of the oil's properties, (r, 4)."""
+        oil, air, volumes = _oil_factors(logs)
+        strained, aired = oil * self.strained * volumes, air * self.aired * volumes
+        dead = strained[:, 1:] + aired[:, 1:]
+        return np.column_stack([strained.sum(axis=1), dead, aired.sum(axis=1)])
+
+
+def _oil_factors(logs: Array) -> tuple[float, float, Array]:
+    """Convert logarithms of the oil's properties (4,) to factors of compressibility, free air, and volumes (3,)."""
+    compressibility, dead_A, dead_B, air = np.exp(logs)
+    return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
+
+
+def _oil_deviations() -> Array:
+    """Return the prior standard deviations of the logarithms of the oil's properties (4,)."""
+    prior = INFERENCE.held_oil
+    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
 
 class _LeakRegression(NamedTuple):
@@ -270,38 +298,43 @@ class HeldChambers:
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of displaced volumes on oil properties, without and with check valves that refill a chamber."""
+        """Regressions of the volumes that the piston displaces in holds on the properties of the enclosed oil.
+
+        The first is for chambers without check valves, the second for check valves that refill a chamber.
+        """
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
-        """Build the linear regression of displaced volumes on the properties of the oil.
+        """Build the regression of the volumes that the piston displaces in holds on the properties of the oil.
 
         Its rows are the readings of each hold, side A before side B, relative to their mean over the hold. A reading
         is a mean of several samples (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the
         charge pressure, so displacement counts only while the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
-        volumes, columns = [], []
+        displaced, strained, aired = list[Array](), list[Array](), list[Array]()
         for hold in self.holds:
             for index, area, p in ((0, self.sides.area_A, hold.p_A), (1, -self.sides.area_B, hold.p_B)):
                 stroke_end = self.sides.low if area > 0.0 else self.sides.high  # where the chamber is smallest
-                dead_volume = abs(area) * prior.dead * stroke
-                volume = abs(area) * abs(float(hold.x.mean()) - stroke_end) + dead_volume
-                oil = np.zeros((len(hold.edges) - 1, 4))  # compressibility, dead volumes of A and B, free air
-                oil[:, 0], oil[:, 1 + index] = volume * hold.mean(p), dead_volume * hold.mean(p)
-                oil[:, 3] = -volume * P_ATM * hold.mean(1.0 / p)
-                columns.append(oil - oil.mean(axis=0))
+                volumes = np.zeros(3)  # in the stroke, and the dead volumes of A and B
+                volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
+                volumes[1 + index] = abs(area) * prior.dead * stroke
                 increments = -area * np.diff(hold.x, prepend=hold.x[0])
-                displaced = hold.mean(np.cumsum(increments * self._is_closed(hold, p) if is_refilled else increments))
-                volumes.append(displaced - displaced.mean())
-        oil, dead_deviation = np.vstack(columns), prior.compressibility * prior.dead_deviation / prior.dead
-        compressed = oil @ [prior.compressibility, 0.0, 0.0, prior.air]
-        misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(oil)
+                counted = increments * self._is_closed(hold, p) if is_refilled else increments
+                for columns, values in (
+                    (displaced, hold.mean(np.cumsum(counted))),
+                    (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
+                    (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),
+                ):
+                    columns.append(values - values.mean(axis=0))
+        strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
+        compressed = (strained_volumes + aired_volumes).sum(axis=1)
+        misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(compressed)
         return _OilRegression(
-            left=np.concatenate(volumes) - compressed,
-            oil=oil,
-            deviations=np.array([prior.compressibility * prior.deviation, dead_deviation, dead_deviation, prior.air]),
-            inflation=max(len(oil) / self.n_readings, 1.0),
+            np.concatenate(displaced),
+            strained_volumes,
+            aired_volumes,
+            inflation=max(len(compressed) / self.n_readings, 1.0),
             misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
         )
 
@@ -333,6 +366,17 @@ class HeldChambers:
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
         return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
 
+    def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
+        """Compute the flow with a conductance of 1 through open valves and the pump out of one chamber into the other.
+
+        The chamber is A if `is_A` is True, else B. The other one stays at its pressure, since check valves or a
+        shuttle valve connect it to the charge pressure.
+        """
+        sign = 1.0 if is_A else -1.0
+        differences = [sign * (hold.p_A - hold.p_B - hold.own_offset(0.0)[0]) for hold in self.holds]
+        flows = [np.maximum(difference, 0.0) for difference in differences]
+        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
+
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
         """Fit the coefficients of c leaks together with the properties of the oil.
 
@@ -340,25 +384,28 @@ class HeldChambers:
         replace displaced oil. The variance of a reading, which weights the priors of the oil against the readings, is
         found by iteration.
         """
-        left, oil, deviations, inflation, misfit_variance = self._regressions[is_refilled]
-        design, n_leaks = np.column_stack([columns, oil]), columns.shape[1]
-        scale = np.sqrt((design**2).sum(axis=0))
-        scale[~(scale > 0.0)] = 1.0
+        regression, n_leaks, logs = self._regressions[is_refilled], columns.shape[1], np.zeros(4)
+        left, misfit_variance = regression.leaked(logs), regression.misfit_variance
         degrees_of_freedom = max(self.n_readings - n_leaks, 1.0)
         variance = max(float(left @ left) / len(left), misfit_variance)
-        gram, moments, scales = design.T @ design, design.T @ left, np.outer(scale, scale)
-        for _ in range(MAX_ITERATIONS):
-            prior = np.concatenate([np.zeros(n_leaks), variance * inflation / deviations**2])
-            matrix = (gram + np.diag(prior)) / scales
+        precisions = np.append(np.zeros(n_leaks), regression.inflation / _oil_deviations() ** 2)
+        for _ in range(MAX_ITERATIONS):  # each is linear about the properties of the iteration before
+            left, design = regression.leaked(logs), np.column_stack([columns, regression.slopes(logs)])
+            scale = np.sqrt((design**2).sum(axis=0))
+            scale[~(scale > 0.0)] = 1.0
+            scales, prior, means = np.outer(scale, scale), variance * precisions, np.append(np.zeros(n_leaks), -logs)
+            matrix = (design.T @ design + np.diag(prior)) / scales
             matrix.flat[:: len(scale) + 1] += RIDGE
             inverse = np.linalg.inv(matrix) / scales
-            solution = inverse @ moments
+            solution = inverse @ (design.T @ left + prior * means)
             residual = left - design @ solution
-            cost = float(residual @ residual) + float(prior @ solution**2)
+            cost = float(residual @ residual) + float(prior @ (solution - means) ** 2)
             previous, variance = variance, cost / len(left) * self.n_readings / degrees_of_freedom + misfit_variance
-            if abs(variance - previous) <= TOLERANCE * previous:
+            steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
+            logs = logs + steps
+            if abs(variance - previous) <= TOLERANCE * previous and np.abs(steps).max() <= TOLERANCE:
                 break
-        covariance = variance * inflation * inverse
+        covariance = variance * regression.inflation * inverse
         # part of the covariance that would vanish if the properties of the oil were known
         gain = covariance[:n_leaks, n_leaks:] @ np.linalg.pinv(covariance[n_leaks:, n_leaks:])
         by_oil = gain @ covariance[n_leaks:, :n_leaks]
@@ -367,7 +414,7 @@ class HeldChambers:
     @cached_property
     def _fits_without_leak(self) -> tuple[_LeakRegression, _LeakRegression]:
         """Fits of the oil's properties without any leak, first without and then with check valves."""
-        without, refilled = (np.empty((len(regression.left), 0)) for regression in self._regressions)
+        without, refilled = (np.empty((len(regression.displaced), 0)) for regression in self._regressions)
         return self._fit(without, False), self._fit(refilled, True)
 
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
@@ -468,10 +515,11 @@ class HeldChambers:
         `leak`: its flow with a coefficient of 1. The result is log prior - N/2 log(residual sum of squares), for N
         independent readings and a coefficient >= 0, with the properties of the oil eliminated.
         """
-        left, oil, deviations, inflation, misfit_variance = self._regressions[leak.is_refilled]
+        regression, usual = self._regressions[leak.is_refilled], np.zeros(4)
+        left, oil, misfit_variance = regression.leaked(usual), regression.slopes(usual), regression.misfit_variance
         design = np.column_stack([left, self._leak_columns(leak, self.onsets)])
         variance = self._fits_without_leak[leak.is_refilled].variance
-        precision = oil.T @ oil + np.diag(variance * inflation / deviations**2)
+        precision = oil.T @ oil + np.diag(variance * regression.inflation / _oil_deviations() ** 2)
         scale = np.sqrt(np.diag(precision))
         coupling = (oil / scale).T @ design
         # products of the left side (first) and of the leak for each onset, without the oil (Schur complement)
@@ -514,10 +562,14 @@ class HeldChambers:
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
         """Three possible leaks with their probabilities, past the piston, to the outside from A, and from B."""
+        return self._weigh_hypotheses([self._unit_outside_leak(is_A) for is_A in (True, False)])
+
+    def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
+        """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order."""
         piston_onset, offset = self.piston_fit
         # each fit with the index of its onset
         fits = [(self.fit_piston_leak(piston_onset, offset), int(np.abs(self.onsets - piston_onset).argmin()))]
-        for leak in (self._unit_outside_leak(is_A=True), self._unit_outside_leak(is_A=False)):
+        for leak in leaks:
             onset = int(self._onset_posteriors(leak).argmax())
             fits.append((self._fit_leak(leak, float(self.onsets[onset])), onset))
         log_posteriors = np.array([fit.likelihood + self._onset_log_priors[onset] for fit, onset in fits])
@@ -528,6 +580,24 @@ class HeldChambers:
             LeakHypothesis(float(probability), float(fractions_after[onset]), fit)
             for probability, (fit, onset) in zip(probabilities, fits, strict=True)
         ]
+
+    def total_leak(self) -> Flow:
+        """Estimate the mean conductance of whatever leaks in the holds, also through valves that are open.
+
+        Through open valves the pump leaks into the other chamber, which check valves keep at the charge pressure: only
+        one chamber loses oil, driven by p_A - p_B. The leak is the piston's, one to the outside, or one of this kind;
+        the estimates are weighted by their probabilities. Check valves that refill a chamber would hide what leaves
+        it, so none are assumed.
+        """
+        chambers = replace(self, charge=0.0)
+        sides = (True, False)
+        leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
+        leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]
+        hypotheses = chambers._weigh_hypotheses(leaks)
+        means = [h.probability * h.fraction_after * h.fit.value for h in hypotheses]
+        deviations = [h.fraction_after * h.fit.deviation for h in hypotheses]
+        variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
+        return Flow(sum(means), variance**0.5 if any(means) else deviations[0])
 
     @cached_property
     def leaks(self) -> HeldLeaks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -232,18 +232,15 @@ class RecordedBalance:
         """Compute the log odds that valves really shut off the chambers in holds; None without holds.
 
         The leaks in holds are compared with the total leakage: through open valves the resting pump would leak as
-        much as the turning one. Check valves that refill a chamber would hide what leaves it, so they are left out.
-        The log odds are limited to +-`rest.most` of `priors.toml`.
+        much as the turning one. The log odds are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
-        leaks, total_leak = replace(self.chambers, charge=0.0).leaks, self.conductance
-        values = np.array([leaks.piston, leaks.outside_A, leaks.outside_B])
-        deviations = np.array([leaks.deviation, leaks.deviation_A, leaks.deviation_B])
-        variance = float((deviations[values > 0.0] ** 2).sum()) if values.any() else leaks.deviation**2
+        held, total_leak = self.chambers.total_leak(), self.conductance
+        variance = held.deviation**2
         total_variance = ((total_leak.high - total_leak.low) / (2.0 * WITHIN_95)) ** 2
         max_odds: float = INFERENCE.rest.most
-        odds = rest_log_odds(float(values.sum()), variance, total_leak.value, variance + total_variance)
+        odds = rest_log_odds(held.value, variance, total_leak.value, variance + total_variance)
         return float(np.clip(odds, -max_odds, max_odds))
 
     def _cylinder_sides(self) -> CylinderSides | None:
