@@ -131,8 +131,8 @@ def _check_sums(summary: Any) -> Any:
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
         raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {summary.sums.shape}")
     shut = summary.shut_sums
-    if shut is not None and shut.shape != (1, size + 1, size + 1):
-        raise ValueError(f"shut_sums must be of the shape (1, {size + 1}, {size + 1}), got {shut.shape}")
+    if shut is not None and shut.shape != (1, size + 2, size + 2):
+        raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
     if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
         raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
     drop = summary.viscous_drop

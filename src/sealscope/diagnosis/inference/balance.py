@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.terms import (
     HALF_DIFFERENCE,
     MIN_ABSOLUTE_PRESSURE,
     MIN_REST,
-    REST_LEAK,
+    MOVING_BIAS,
     START,
     Equation,
     RestLimits,
@@ -105,7 +105,7 @@ class BlockStream:
         self._strides = max(SPAN, round(block_s / STRIDE))
         # samples on either side of a block that its speeds and rests depend on
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
-        self._finds_rests = any(REST_LEAK in columns.names for columns in self.columns)
+        self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
         self._rest_limits: RestLimits | None = None  # from the first samples on

@@ -36,7 +36,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_LEAK, RESTS, Equation
+from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -180,6 +180,7 @@ class ColumnRoles:
     - `nuisance`: terms whose coefficients are unknown in any machine;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
     - `motion`: motion of the piston, or flow of the valve's edges;
+    - `within`: terms that a comparison of recordings leaves out (`terms.HOLDING`);
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
@@ -193,6 +194,7 @@ class ColumnRoles:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
+        self.within = tuple(k for k, term in enumerate(equation.terms) if term.nuisance and term.name == HOLDING)
         self.leak = self.names.index(LEAK)
         drift_priors = vars(INFERENCE.drift)
         self.drift_rate = np.array([drift_priors[term.drift] if term.nuisance else 0.0 for term in equation.terms])
@@ -204,8 +206,8 @@ class ColumnRoles:
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
-        at_rest = tuple(self.names.index(name) for name in RESTS) if REST_LEAK in self.names else ()
-        self.slow = (*(k for k in self.nuisance if k not in self.fast), *at_rest)
+        states = tuple(self.names.index(name) for name in STATES) if MOVING_BIAS in self.names else ()
+        self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.drivers = tuple(term.driver for term in equation.terms)
         self.healthy_conductance = equation.healthy

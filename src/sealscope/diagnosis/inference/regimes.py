@@ -1,15 +1,19 @@
 """Two hypotheses on the valves while the pump rests: they connect it to the cylinder (open), or cut it off (shut).
 
-If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut,
-leakage and flow offset of the pump count in motion only: at rest only the piston leaks. Both balances are linear in the
-same columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B) in motion and r that at
-rest; their covariance allows for errors that differ from block to block. With open valves r scatters about g; with shut
-valves and a healthy piston, about zero:
+If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
+pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
+rest only the piston leaks. A pump may also turn slowly to hold the load, and is then connected. The leakage of such
+holds has a third coefficient, else a drive that is switched off would look like a leak that ends. Between recordings
+one coefficient is compared for all rests, since many machines show the piston's leak in such holds alone. Both
+balances select from the same columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B)
+in motion and r that at rest; their covariance allows for errors that differ from block to block. With open valves r
+scatters about g; with shut valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
 where V are the variances of the estimates, and s and w the relative scatters of the prior. The odds of the recordings
-of one machine multiply. Since a leaking piston moves r towards g, the healthy recordings decide.
+of one machine multiply. Since a leaking piston moves r towards g, the healthy recordings decide (`shut` in
+`volumes.detector`).
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -22,86 +26,95 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
-from sealscope.diagnosis.inference.terms import BIAS, LEAK, REST_BIAS, REST_LEAK, RESTS
+from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
+
+#: Fraction of the sum of squares of p_A - p_B below which a state of the machine does not occur, but for rounding.
+NEGLIGIBLE = 1e-6
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`). For
-    open valves these two columns are dropped from the Gram matrices; for shut valves they are combined with the
-    others (`shut_at_rest_matrix`).
+    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston
+    (`terms.with_rests`). For open valves these columns are dropped from the Gram matrices. For shut valves the flow
+    offset in motion replaces that of all times (`terms.shut_at_rest`).
     """
+    names = (*roles.names, "left")
     if shut:
-        transform = shut_at_rest_matrix(roles.names)
-        return replace(blocks, gram=np.asarray(transform.T @ blocks.gram @ transform))
-    without_rests = [k for k, name in enumerate((*roles.names, "left")) if name not in RESTS]
-    return replace(blocks, gram=np.asarray(blocks.gram[..., without_rests, :][..., without_rests]))
+        blocks, bias = _drop_holding(blocks, roles), names.index(MOVING_BIAS)
+        index = [bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
+    else:
+        index = [k for k, name in enumerate(names) if name not in STATES]
+    return replace(blocks, gram=np.asarray(blocks.gram[..., index, :][..., index]))
 
 
-def shut_at_rest_matrix(names: Sequence[str]) -> Array:
-    """Build the matrix (m, n) that converts the m columns of a volume balance to the n for a pump cut off at rest.
+def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
+    """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    With the pump cut off, its flow offset and its leakage count in motion only (`terms.shut_at_rest`). The column of
-    the offset becomes the offset minus the offset at rest, that of the leak at rest becomes the leak minus the leak
-    at rest, and the offset at rest is dropped: n = m - 1. `names` (m - 1,): names of the columns without the left
-    side, which is the last column.
+    In a recording without rests the column of the leakage of the turning pump equals that of the leak, and that of
+    the holding pump is zero. `names` (m - 1,): names of the columns without the left side. The result has the shape
+    (E, m + 2, m + 2).
     """
-    columns = []
-    for k, name in enumerate((*names, "left")):
-        column = np.zeros(len(names) + 1)
-        column[k] = 1.0
-        if name == BIAS:
-            column[names.index(REST_BIAS)] = -1.0
-        elif name == REST_LEAK:
-            column[names.index(LEAK)], column[k] = 1.0, -1.0
-        if name != REST_BIAS:
-            columns.append(column)
-    return np.column_stack(columns)
-
-
-def duplicate_leak_column(gram: Array, names: Sequence[str]) -> Array:
-    """Add the column for the leakage of the turning pump to Gram matrices (E, m, m) of a recording without rests.
-
-    The volume balance for a pump that is cut off at rest has this additional column (`terms.shut_at_rest`). In a
-    recording without rests it equals the leak's column, which is therefore repeated. `names` (m - 1,): names of the
-    columns without the left side. The result has the shape (E, m + 1, m + 1).
-    """
+    leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
-    index.insert(names.index(LEAK), names.index(LEAK))
-    return np.asarray(gram[:, index][:, :, index])
+    index[leak:leak] = [leak, leak]
+    expanded = np.asarray(gram[:, index][:, :, index])
+    expanded[:, leak + 1] = expanded[:, :, leak + 1] = 0.0
+    return expanded
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if the pump or the piston rests in any block.
+    """Return True if the pump rests in any block.
 
-    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`).
+    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston
+    (`terms.with_rests`).
     """
-    bias = roles.names.index(REST_BIAS)
-    return bool(blocks.gram[:, 0, bias, bias].sum() > 0.0)  # its column is zero in motion
+    return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
+
+
+def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
+    """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
+
+    `states`: names of the columns of p_A - p_B in these states, such as `TURNING`; the others are as for `has_rests`.
+    """
+    leak, *others = (roles.names.index(name) for name in (LEAK, *states))
+    energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
+    return float(1.0 - energies[others].sum() / max(energies[leak], np.finfo(float).tiny))
+
+
+def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
+    """Set the column of a pump that holds the load to zero if the pump is never off.
+
+    Holds are then the only rests, and show the leak past the piston. The arguments are those of `has_rests`.
+    """
+    if _rest_share(blocks, roles, TURNING, HOLDING) > NEGLIGIBLE:
+        return blocks
+    gram, held = blocks.gram.copy(), roles.names.index(HOLDING)
+    gram[..., held, :] = gram[..., held] = 0.0
+    return replace(blocks, gram=gram)
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
-    `roles`: roles of the columns of `blocks`, which include leakage and flow offset at rest (`terms.with_rests`). The
+    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston. The
     odds are limited by `rest.most` in `priors.toml`, and 0 if the recording says nothing about the valves.
     """
     gram = blocks.gram[:, 0]
-    at_rest, bias = (roles.names.index(name) for name in RESTS)
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
-    columns = [*roles.nuisance, at_rest, bias]
+    turning, bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
+    columns = [*roles.nuisance, turning, bias]
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, roles.left]
     coefficients, covariance = _fit_with_robust_covariance(grams, moments)
-    leaks = [columns.index(roles.leak), columns.index(at_rest)]
-    motion, extra_at_rest = coefficients[leaks]  # the columns add up: the leak at rest is the sum of both
-    rest_variance, extra_variance = float(covariance[np.ix_(leaks, leaks)].sum()), float(covariance[leaks[1], leaks[1]])
+    rest, extra_in_motion = (columns.index(k) for k in (roles.leak, turning))
+    rest_leak, motion = coefficients[rest], coefficients[rest] + coefficients[extra_in_motion]
+    rest_variance, extra_variance = float(covariance[rest, rest]), float(covariance[extra_in_motion, extra_in_motion])
     if not (rest_variance > 0.0 and extra_variance > 0.0):
         return 0.0
-    odds = rest_log_odds(motion + extra_at_rest, rest_variance, motion, extra_variance)
+    odds = rest_log_odds(rest_leak, rest_variance, motion, extra_variance)
     max_odds: float = INFERENCE.rest.most
     return float(np.clip(odds, -max_odds, max_odds))
 

@@ -768,15 +768,18 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
 def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
 
-    They are those without a prior on differences between recordings. `gram` (E, m, m): Gram matrices of E equations;
+    They are those without a prior on differences between recordings. Columns that count only within a recording
+    (`ColumnRoles.within`) are left out. `gram` (E, m, m): Gram matrices of E equations;
     `columns`: roles of the columns (leak, motion, left side) in each equation. The result is the Schur complement of
     the same shape, in which the rows and columns of the eliminated coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
+        for k in roles.within:
+            reduced[e][k] = reduced[e][:, k] = 0.0
         unshared = [k for k in roles.compared if k != roles.leak and not np.isfinite(roles.between_deviation[k])]
-        cross = gram[e][:, unshared]
-        reduced[e] -= cross @ solve(gram[e][np.ix_(unshared, unshared)], cross.T)
+        cross = reduced[e][:, unshared].copy()
+        reduced[e] -= cross @ solve(reduced[e][np.ix_(unshared, unshared)], cross.T)
         reduced[e][unshared] = reduced[e][:, unshared] = 0.0
     return reduced
 

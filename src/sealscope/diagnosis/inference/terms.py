@@ -70,7 +70,7 @@ class Signals:
     ) -> None:
         self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
         self._rest_limits = rest_limits
-        self._rests: Array | None = None
+        self._states: tuple[Array, Array] | None = None
         self.step = cache(lambda name: np.asarray(np.diff(channels[name])))
         self.mean = cache(lambda name: _interval_means(channels[name]))
 
@@ -140,19 +140,33 @@ class Signals:
         """Flags (n,) of the samples in which the piston moves towards B or stands still."""
         return np.asarray(self.speed >= 0.0)
 
-    def at_rest(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Compute a flag of each sampling interval, shape (n - 1,): 1 if the piston or the pump stands still, else 0.
+    def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Compute a flag of each sampling interval, shape (n - 1,): 1 if pump and piston move, else 0.
 
         `pump_volume` computes the increments of the pump's volume [m^3] from these signals. Without `rest_limits` all
-        flags are 0.
+        flags are 1.
         """
+        return self._find_states(pump_volume)[0]
+
+    def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Compute a flag of each sampling interval, shape (n - 1,): 1 if the pump turns and the piston rests, else 0.
+
+        The pump then holds the load by replacing what leaks. `pump_volume` is that of `moving`. Without `rest_limits`
+        all flags are 0.
+        """
+        return self._find_states(pump_volume)[1]
+
+    def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
+        """Compute the flags of `moving` and `holding`, once: all terms of a balance have the same `pump_volume`."""
         limits = self._rest_limits
         if limits is None:
-            return np.zeros_like(self.time_step)
-        if self._rests is None:  # computed once: all terms of a balance have the same `pump_volume`
-            pump = find_rests(pump_volume(self), self.rate, limits.pump)
-            self._rests = (pump | find_rests(self.step("x"), self.rate, limits.piston)).astype(float)
-        return self._rests
+            return np.ones_like(self.time_step), np.zeros_like(self.time_step)
+        if self._states is None:
+            pump_rests = find_rests(pump_volume(self), self.rate, limits.pump)
+            piston_rests = find_rests(self.step("x"), self.rate, limits.piston)
+            is_moving, is_holding = ~pump_rests & ~piston_rests, ~pump_rests & piston_rests
+            self._states = is_moving.astype(float), is_holding.astype(float)
+        return self._states
 
 
 def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_]:
@@ -275,9 +289,9 @@ class Equation(NamedTuple):
 LEAK, ORIFICE = "leak", "leak through an orifice"
 #: Free air in both chambers at once, instead of the coefficients of each chamber.
 AIR = "free air"
-#: The pump's leakage, driven by the pressures at its ports; and its leakage while it turns, if a valve cuts the pump
-#: off at rest.
-PUMP, TURNING = "pump leak", "pump leak while it turns"
+#: The pump's leakage, driven by the pressures at its ports. If a valve cuts the pump off at rest, its leakage driven by
+#: p_A - p_B while it moves the piston, and while it turns only to hold the load.
+PUMP, TURNING, HOLDING = "pump leak", "pump leak while it turns", "pump leak while it holds"
 #: Constant flow, as by an offset of a flow sensor; an offset of the pressure sensors changes it, too.
 BIAS = "bias"
 #: Suffix of the name of an external leak that a check valve compensates.
@@ -290,8 +304,9 @@ SPEED_LOSS = "loss over speed"
 CYLINDER, LOCKED = "cylinder", "locked"
 #: Decay of the speed loop's unknown initial state (time constant 19 s for the thesis's drive).
 START = "start"
-#: Columns of leakage and flow offset that are zero unless the pump or the piston stands still (`regimes`).
-RESTS = REST_LEAK, REST_BIAS = "leak at rest", "bias at rest"
+#: The constant flow while pump and piston move, and all columns that are zero in some states of the machine.
+MOVING_BIAS = "bias in motion"
+STATES = TURNING, HOLDING, MOVING_BIAS
 
 _PRESSURES = ("p_A", "p_B")
 
@@ -565,35 +580,51 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's volume balance with two more terms: leakage and flow offset while the pump or the piston rests.
+    """Return a pump's volume balance with three more terms, which tell rests of the pump or the piston from motion.
 
-    They are inserted before the terms of the leak.
+    They are the leakage while the pump moves the piston, that while it only holds the load, and the flow offset in
+    motion (`STATES`). They are inserted before the terms of the leak.
     """
     left = equation.left
-    return _insert_before_leaks(
-        equation,
-        _conductance_term(REST_LEAK, lambda s: s.at_rest(left) * s.pressure_difference * s.dt, "pump leak", ()),
-        Term(REST_BIAS, "m^3/s", lambda s: s.at_rest(left) * s.dt, "pump leak", driver="pressure"),
-    )
+    in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
+    return _insert_before_leaks(equation, *_pump_leakage_terms(left), in_motion)
 
 
 def shut_at_rest(equation: Equation) -> Equation:
     """Return a pump's volume balance for valves that cut the pump off from the cylinder while it rests.
 
-    The pump's leakage, as an additional term, and the flow offset count in motion only.
+    The pump's leakage has two terms of its own, one while it moves the piston and one while it only holds the load.
+    The flow offset counts in motion only.
     """
     left = equation.left
-
-    def leaked_volume(s: Signals) -> Array:
-        """Compute (p_A - p_B) dt [Pa s] in intervals of motion and 0 at rest, shape (n - 1,)."""
-        return (1.0 - s.at_rest(left)) * s.pressure_difference * s.dt
-
-    shut = _insert_before_leaks(equation, _conductance_term(TURNING, leaked_volume, "pump leak", drift="pump"))
+    shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
     return shut._replace(
         terms=tuple(
-            term._replace(increments=lambda s: (1.0 - s.at_rest(left)) * s.dt) if term.name == BIAS else term
+            term._replace(increments=lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
             for term in shut.terms
         )
+    )
+
+
+def _pump_leakage_terms(
+    pump_volume: Callable[[Signals], Array], drift: Coefficient | Literal[""] = ""
+) -> tuple[Term, Term]:
+    """Make the terms of a pump's leakage, driven by p_A - p_B, while it moves the piston and while it holds the load.
+
+    `pump_volume` computes the increments of the pump's volume [m^3]; `drift` is that of `Term`.
+    """
+
+    def turning(s: Signals) -> Array:
+        """Compute (p_A - p_B) dt [Pa s] in intervals of motion, else 0, shape (n - 1,)."""
+        return s.moving(pump_volume) * s.pressure_difference * s.dt
+
+    def holding(s: Signals) -> Array:
+        """Compute (p_A - p_B) dt [Pa s] in intervals in which the pump holds the load, else 0, shape (n - 1,)."""
+        return s.holding(pump_volume) * s.pressure_difference * s.dt
+
+    return (
+        _conductance_term(TURNING, turning, "pump leak", (), drift),
+        _conductance_term(HOLDING, holding, "pump leak", (), drift),
     )
 
 

@@ -21,7 +21,7 @@ from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.circuit.without_position import circulations
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.regimes import duplicate_leak_column
+from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.inference.scatter import (
     RecordingSums,
@@ -33,6 +33,7 @@ from sealscope.diagnosis.inference.scatter import (
 )
 from sealscope.diagnosis.inference.terms import (
     CYLINDER,
+    HOLDING,
     TURNING,
     circulation,
     equations,
@@ -256,7 +257,7 @@ class VolumeBalance:
         if balance is None or not self._is_held_by_valves(balance, summaries):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked or _are_valves_shut(summaries, "held_odds"))
-        names = [name for name in balance.columns[0].names if name != TURNING]
+        names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         return self._report(
             balance,
             [
@@ -356,11 +357,7 @@ def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = Fals
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:
-        sums = (
-            np.asarray(summary["shut_sums"])
-            if "shut_sums" in summary
-            else duplicate_leak_column(sums, summary["terms"])
-        )
+        sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
     held = np.asarray(summary["held"], dtype=float) if locked and "held" in summary else None
     drop = np.asarray(summary["viscous_drop"], dtype=float) if "viscous_drop" in summary else None
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
