@@ -79,9 +79,9 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 
     `states`: names of the columns of p_A - p_B in these states, such as `TURNING`; the others are as for `has_rests`.
     """
-    leak, *others = (roles.names.index(name) for name in (LEAK, *states))
+    leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
-    return float(1.0 - energies[others].sum() / max(energies[leak], np.finfo(float).tiny))
+    return float(1.0 - energies[columns].sum() / max(energies[leak], np.finfo(float).tiny))
 
 
 def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
