@@ -35,7 +35,7 @@ from numba import carray
 
 from sealscope.compiled import large_law, law, record_dtype, record_view
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, WITHIN_95
 from sealscope.diagnosis.inference.rows.row_weights import SUPPORT, Workspace, median, weigh_rows, workspace_shapes
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING, SPAN, STRIDE, stride_samples, test_function
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, MIN_ABSOLUTE_PRESSURE
@@ -222,7 +222,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
     size_error = choice.size_error
-    quantiles = tuple(float(stdtrit(freedom, 0.975)) for freedom in range(1, WINDOW))  # Student's t, 95 %
+    quantile_order = 0.5 + 0.5 * BOUND_PROBABILITY
+    quantiles = tuple(float(stdtrit(freedom, quantile_order)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the sensor's memory `y` to 0 at the start of a run.

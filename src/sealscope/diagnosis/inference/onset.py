@@ -45,6 +45,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +54,11 @@ from numpy.typing import NDArray
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Quantiles of the standard normal law for a 95 % interval and for a 95 % upper bound.
-WITHIN_95, UPPER_95 = 1.96, 1.645
+#: Probability with which a stated upper bound, or a stated interval, contains the true value.
+BOUND_PROBABILITY = 0.95
+#: Quantiles of the standard normal law for an interval and for an upper bound of this probability: 1.96 and 1.645.
+WITHIN_95 = round(NormalDist().inv_cdf(0.5 + 0.5 * BOUND_PROBABILITY), 2)
+UPPER_95 = round(NormalDist().inv_cdf(BOUND_PROBABILITY), 3)
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.
 MIN_BLOCKS = 5
 #: Number of possible onsets per block, and number of blocks at either end without an onset.
@@ -143,7 +147,7 @@ class StepTest:
         weights = np.exp(self.likelihood - self.likelihood.max())
         return np.asarray(weights / weights.sum())
 
-    def onset(self, probability: float = 0.95) -> Interval:
+    def onset(self, probability: float = BOUND_PROBABILITY) -> Interval:
         """Return the most likely onset of the step [s] and the interval that contains it with a probability.
 
         The interval is widened by half a block at both ends, since the rows within the block of the onset are
@@ -156,7 +160,7 @@ class StepTest:
         half_block = 0.5 * PARTS * spacing
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
-    def bound(self, probability: float = 0.95) -> float:
+    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute the upper bound of the step's size: its quantile at `probability`, given that the size is > 0."""
         return bound_steps(self.weights, self.size, self.deviation, probability)
 

@@ -36,6 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve, sum_blocks
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -210,14 +211,14 @@ class Rise(NamedTuple):
         log_weights = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
         return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
-    def bound(self, probability: float = 0.95) -> float:
+    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute the upper bound of the true rise of the leakage for a probability, in the unit of the estimate.
 
         A negative estimate counts as zero, so the bound is not below that of an estimate of zero.
         """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
-    def interval(self, probability: float = 0.95) -> tuple[float, float]:
+    def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
         """Compute the central interval (low, high) that contains the true rise of the leakage with a probability."""
         tail = 0.5 - 0.5 * probability
         high, low = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import Interval, bound_steps
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval, bound_steps
 from sealscope.diagnosis.live.rise import STEP, LiveRise
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
@@ -228,7 +228,7 @@ class StepDetector:
         interval = Interval(mean, float(onsets[order[low_index]]) - resolution, float(latest) + resolution)
         return LiveRise(STEP, 2.0 * log_e, interval, self._unit * size, self._unit * deviation)
 
-    def bound(self, probability: float = 0.95) -> float:
+    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
 
         The bound is the quantile, at `probability`, of the rise under the condition that it is positive. It is

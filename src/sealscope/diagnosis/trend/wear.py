@@ -37,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
@@ -482,7 +482,7 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
         # without a change, the rise that the levels allow bounds a leak
         rises = changes if is_changed else _Changes.enumerate(levels, 1)
         leak_draws = (draws if is_changed else _Draws.sample(levels, rises)).last_rises(rises)
-        leak, leak_upper_95 = _interval_of_draws(leak_draws), float(np.quantile(leak_draws, 0.95))
+        leak, leak_upper_95 = _interval_of_draws(leak_draws), float(np.quantile(leak_draws, BOUND_PROBABILITY))
     current_level = draws.mean_before + draws.last_rises(changes)
     is_growth = changes.grows[draws.change]
     growth, mostly_grows = np.where(is_growth, draws.amplitude, 0.0), float(np.mean(is_growth)) >= 0.5

@@ -18,7 +18,7 @@ from sealscope.diagnosis.inference.leak_law import (
     mixture_flow,
 )
 from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
-from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Interval, StepTest
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest
 from sealscope.diagnosis.inference.scatter import (
     Mixture,
     RecordingSums,
@@ -300,7 +300,7 @@ class BalanceLeak:
             weight=hold_probability * (1.0 - piston_probability),
         )
         parts = by_motion, past_piston, to_outside
-        return Mixture(*(np.concatenate(values) for values in zip(*parts, strict=True))).quantile(0.95)
+        return Mixture(*(np.concatenate(values) for values in zip(*parts, strict=True))).quantile(BOUND_PROBABILITY)
 
     @property
     def pump_flow(self) -> tuple[float, float]:
