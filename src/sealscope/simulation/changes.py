@@ -39,7 +39,8 @@ _POWERS = {
     "pump.C_st": (("c_slip", 1.0),),
     "pump.C_h": (("k_h", 1.0),),
 }
-#: Parameters that cannot drift, being geometry or conditions at the start.
+#: Parameters that `ParameterDrift` refuses, being geometry or conditions at the start. Rows of `faults.toml` are not
+#: checked against them.
 _CANNOT_DRIFT = {"cylinder.L", "cylinder.V", "fluid.p_charge", "makeup.V_gas"}
 #: Points at which the range of a drift's path is computed.
 _N_PATH_POINTS = 1001

@@ -1,11 +1,18 @@
 """The decision on a recording: from the reports of detectors to a verdict.
 
-The verdict is `leak` if the chance of a test is below its share of the false-alarm probability (`Case.alarms`), and
-leaks are more probable than all else that may explain the data of this test (`Case.leak_probability`). The chance is
-calibrated by healthy recordings; score and threshold are the same comparison, for display. Otherwise the verdict is
-`no leak` if the 95 % upper bound of a leak is small enough, and `cannot tell` if it is not, with the bound and the most
-probable other explanation. No other module states a verdict; `combination.combine` chooses among the decisions of
-several detectors.
+The verdict is `leak` if both conditions hold for one test of the leakage:
+
+- An alarm: `chance` < `probability` (`Case.alarms`). `chance` is the probability that a healthy recording scores as
+  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`, `[questions] within`
+  of `priors.toml`) of the allowed probability of a false alarm: that of the caller, or else `[false_alarm]
+  probability` of `verdict/priors.toml`. Score and threshold are the same comparison, for display.
+- No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above
+  `[explanation] leak` of `priors.toml`.
+
+Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
+share` of the pump's flow (`verdicts.bound_worth_stating`). It is `cannot tell` if the bound is larger, and the reason
+states the bound and the most probable other explanation. No other module states a verdict; `combination.combine`
+chooses among the decisions of several detectors.
 """
 
 from __future__ import annotations

@@ -255,11 +255,11 @@ class PressurePriors(PriorTable):
 
 
 class ZeroPriors(PriorTable):
-    """Offset of a pressure sensor's zero.
+    """Error of p_A - p_B at equal pressures, which the zeros of both pressure sensors cause together.
 
-    - `pressure` [Pa]: standard deviation of the offset between two usual sensors.
-    - `far` [Pa]: standard deviation of the offset of a faulty sensor.
-    - `odds`: probability that a sensor is faulty.
+    - `pressure` [Pa]: standard deviation of the error of two usual sensors.
+    - `far` [Pa]: standard deviation of the error if the sensors are far off.
+    - `odds`: probability that they are far off.
     """
 
     pressure: float
