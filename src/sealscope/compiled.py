@@ -262,7 +262,8 @@ def call_at(context: Any, address: Any, memory: Any, sample: Any) -> Any:
     def emit_call(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit the LLVM instructions that call the function at the address.
 
-        Numba passes the arguments; `values` are the addresses of the function, its memory and its sample.
+        Numba passes the arguments: `values` are the addresses of the function and of the two arrays that it takes,
+        `memory` and `sample`.
         """
         double = target.get_value_type(numba.float64)
         pointer = double.as_pointer()

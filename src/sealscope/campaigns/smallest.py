@@ -270,14 +270,16 @@ def plan_recording(
     held: float | None = None,
     progress: Callable[[str, float], None] = lambda label, fraction: None,
 ) -> RecordingPlan:
-    """Find the shortest recording that detects a leak of `find` [m^3/s] at the mean pressure under the usual duty.
+    """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
+
+    The flow is that at the mean |p_A - p_B| of the machine's usual duty, i.e. its usual command and load.
 
     If `find` is None, the recording of `COMPARISON_SECONDS` that detects the smallest leak is planned. `usual`: the
-    machine's usual duty, i.e. its command and load; `duties`: others to try, by default all combinations of `COMMANDS`
-    and `LOADS`; `false_alarm`: probability of an alarm without a leak; `detection`: probability of an alarm with it;
-    `held` [N]: force that the cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if
-    the rig has such valves; `progress`: called with a label and the completed fraction. Raises InputError if the usual
-    duty cannot be simulated or judged.
+    usual duty; `duties`: others to try, by default all combinations of `COMMANDS` and `LOADS`; `false_alarm`:
+    probability of an alarm without a leak; `detection`: probability of an alarm with it; `held` [N]: force that the
+    cylinder holds in a locked hold, with its valves shut, by default the last of `LOADS` if the rig has such valves;
+    `progress`: called with a label and the completed fraction. Raises InputError if the usual duty cannot be simulated
+    or judged.
     """
     choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]

@@ -487,7 +487,10 @@ def progress(noun: str = "") -> Iterator[Callable[[str, float], None]]:
         tasks: dict[str, Any] = {}
 
         def update(task: str, fraction: float) -> None:
-            """Show the completed fraction (0 to 1) of a task in its progress bar, or in the only bar."""
+            """Show the completed fraction (0 to 1) of a task in its progress bar.
+
+            With a `noun` all tasks share one bar.
+            """
             key = noun or task
             if key not in tasks:
                 tasks[key] = bar.add_task(task, total=1.0)

@@ -55,10 +55,11 @@ def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 
     """Compute the stability margins of the control loop of a rig and a controller, opened at the voltage.
 
     The rig is linearised over one sample of the controller, y(k+1) = A y(k) + B u(k), by finite differences of the
-    solver's steps. Its piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the
-    rig's own load. The controller's transfer functions C_j(z) are computed from its impulse responses to each
-    measurement j = x, p_A, p_B, theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the
-    row c_j picks measurement j from the state. Raises InputError for a speed that the drive cannot reach.
+    solver's steps. The result has the largest factor of the loop's gain, the phase margin [rad] and others (`Margins`).
+    The piston moves at `speed` [m/s] (0: standstill) under a force `load` [N] in addition to the rig's own load. The
+    controller's transfer functions C_j(z) are computed from its impulse responses to each measurement j = x, p_A, p_B,
+    theta. The open loop is L(z) = -z^-delay sum_j C_j(z) c_j (z I - A)^-1 B, where the row c_j picks measurement j from
+    the state. Raises InputError for a speed that the drive cannot reach.
 
     Examples
     --------

@@ -95,7 +95,10 @@ class Alarm:
         return level | (NEW_BIT if self.state == "new" and not self.shelved else 0)
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the alarm to plain values, with its diagnostic number and the state of the machine by NE 107."""
+        """Convert the alarm to plain values, with the state of the machine by NE 107.
+
+        The entry `diagnostic_number` is the code of the alarm's level for other systems (`DIAGNOSTIC_NUMBERS`).
+        """
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
         derived_values = {"diagnostic_number": DIAGNOSTIC_NUMBERS[self.level], "shelved": self.shelved}
         return {**vars(self), **derived_values, "machine_state": machine_state.as_dict()}

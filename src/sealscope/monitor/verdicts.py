@@ -139,8 +139,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or if the recording has no leak, the block has no leak either; its interval is then from 0
-        to the recording's bound, or None without a bound.
+        Before the onset, or if the recording has no leak, the block has no leak either. Its interval is then from 0 to
+        `bound_lpm`, the 95 % upper bound of a leak in the recording, or None without a bound.
         """
         lpm, interval = self.leak_lpm, self.leak_interval_lpm
         if not self.leaks or (self.onset_s is not None and block.t < self.onset_s):

@@ -25,7 +25,8 @@ def make_folder(folder: Path) -> None:
 def make_inner_folder(folder: Path, *names: str) -> Path:
     """Create the nested folders `names` within `folder`, one in the other, and return the innermost one.
 
-    `folder` may come from others. Raises InputError if a folder cannot be created, or is a link.
+    Other users may write to `folder`: a folder within it that is a link could lead elsewhere. Raises InputError if one
+    is a link or cannot be created.
     """
     make_folder(folder)
     for name in names:

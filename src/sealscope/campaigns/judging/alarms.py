@@ -48,7 +48,7 @@ class AlarmFractions:
 
     @property
     def leak(self) -> str:
-        """Size and law of the leak as text, such as "0.05 laminar", or "no leak"."""
+        """Mean flow [L/min] and law of the leak as text, such as "0.05 laminar", or "no leak"."""
         return f"{self.leak_lpm:g} {self.law}" if self.leak_lpm else "no leak"
 
     @property

@@ -203,7 +203,10 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key of the surprisals of a detector's step test of the leak, such as "volume balance: step".
+    """Return the key by which the distribution of a detector's step test is stored, such as "volume balance: step".
+
+    The test is that for a step of the leak within a recording; the distribution is that in healthy recordings
+    (`HealthyNull`).
 
     `provider`: name of the detector.
     """

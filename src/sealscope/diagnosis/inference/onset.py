@@ -478,7 +478,7 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, time: Array, vector: Array) -> _Whitened:
-        """Transform the estimates of a coefficient in K blocks to independent values, without its level and slope.
+        """Transform the estimates of a coefficient in K blocks to independent values, and project out level and slope.
 
         `time` (K,): middles of the blocks [s]; `vector` (K,): precision matrix times the estimates, as in
         `Information`.

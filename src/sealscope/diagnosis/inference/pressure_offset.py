@@ -40,9 +40,10 @@ N_GRID = 21
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    `columns`: roles of the columns (leak, motion, left side) in each equation. The offset is that of maximum a
-    posteriori probability; it is subtracted in the Gram matrices and added to `zero`. Return the blocks unchanged if
-    the volume balance has no flow offset, or too few blocks have information.
+    `columns`: indices of the columns of each equation's Gram matrix: the leak, the motion, and the left side of the
+    volume balance. The offset is that of maximum a posteriori probability. It is subtracted in the Gram matrices and
+    added to `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for
+    a constant flow, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -80,8 +81,9 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
     independent = min(1.0, INFERENCE.size.readings / len(z))
 
     def log_likelihood(position: float) -> float:
-        """Compute the log likelihood of an offset at the best onset and size of the leak's step, and random walk.
+        """Compute the log likelihood of a sensor offset, maximised over the leak's step and the random walk.
 
+        The step is maximised over onset and size, the random walk of the leak's coefficient over its variance.
         `position`: asinh of the offset in units of its usual standard deviation.
         """
         return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())

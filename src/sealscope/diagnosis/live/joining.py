@@ -142,10 +142,10 @@ class SampleJoiner:
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels to use from those of the samples.
+        """Choose the set of channels to use: the first of `ways` whose channels are all in the samples.
 
-        These are the best set that is recorded. A set in use is kept, unless a position is recorded for the first
-        time and sets may still be replaced.
+        A set in use is kept. Only if the samples contain the piston's position x for the first time, and `is_final` is
+        False, it is replaced. The result is empty if no set is complete.
         """
         recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
         has_new_position = "x" in recorded and "x" not in self.names and not self.is_final

@@ -49,11 +49,12 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 
 
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
-    """Compute the likelihood of the relative change g of the ringing's amplitude in each block of a recording.
+    """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
-    Noise is subtracted (`subtract_noise`), and the effect of the duty (how the machine is moved and loaded) eliminated.
-    Returns one `Information` (a normal likelihood over the blocks) for each column of `blocks.log_rms`, and the mean of
-    each column's fraction of energy that is not noise.
+    The ringing is the oscillation of the pressures, measured by the RMS of their wavelet details; g = log(RMS / mean
+    RMS) after the noise was subtracted (`subtract_noise`). The effect of the duty (how the machine is moved and loaded)
+    is eliminated. Returns one `Information` (a normal likelihood over the blocks) for each column of `blocks.log_rms`,
+    and the mean of each column's fraction of energy that is not noise.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference of two has twice the variance

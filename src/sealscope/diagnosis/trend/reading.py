@@ -246,9 +246,11 @@ def build_timeline(
     """Sort leakage readings by time and group those that can be compared with each other.
 
     Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    displacement to area, i.e. the same sensors. `every` is the time between readings [s], with which they are dated
-    in the order of their file names; None if their times are known. Returns (readings with their groups, texts). Each
-    text tells how one group differs from the first. Raises InputError if the time of a reading is unknown.
+    pump displacement to piston area. This ratio is a constant of the machine; it changes if the scale of the sensor of
+    position or angle changes, i.e. if a sensor was exchanged, or if the recording is of another machine. `every` is the
+    time between readings [s], with which they are dated in the order of their file names; None if their times are
+    known. Returns (readings with their groups, texts). Each text tells how one group differs from the first. Raises
+    InputError if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)

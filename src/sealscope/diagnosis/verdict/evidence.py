@@ -214,7 +214,10 @@ class Evidence:
 
     @property
     def odds(self) -> str | None:
-        """Fraction of healthy recordings that look like this one, as a sentence; None if it is not known."""
+        """The stated `chance` in words: how rarely a healthy recording scores this high, such as "1 in 50 ...".
+
+        None if the chance is unknown.
+        """
         if self.stated_chance is None:
             return None
         if self.stated_chance >= 0.2:

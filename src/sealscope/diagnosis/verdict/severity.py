@@ -118,7 +118,11 @@ class Severity:
         return "repair" if low > 1.0 else "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the severity as plain values for JSON: the level, and each figure with its `_interval`."""
+        """Return the severity as plain values for JSON: `level`, and two entries for each figure.
+
+        The figure has its name, such as `creep_mm_per_min`; its 95 % interval has this name with `_interval` at the
+        end. Both are None if unknown.
+        """
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)

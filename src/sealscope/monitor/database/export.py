@@ -51,7 +51,11 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     n_estimates = 0
 
     def estimates() -> Iterator[dict[str, Any]]:
-        """Yield the rows of `estimates.csv` with their labels, and count them on the way."""
+        """Yield the rows of `estimates.csv`, and count them.
+
+        An estimate within the interval of a marked alarm also has the columns `label` ("leak" or "healthy") and `alarm`
+        (the alarm's `id`).
+        """
         nonlocal n_estimates
         for n_estimates, row in enumerate(store.estimates(), 1):  # noqa: B007 (returned)
             labels = [labels for start, stop, labels in intervals[row["actuator"]] if start <= row["t"] <= stop]

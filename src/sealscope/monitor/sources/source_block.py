@@ -228,7 +228,11 @@ def _abbreviate(value: Any) -> str:
 
 
 def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
-    """Parse a message of JSON or CBOR after checking its limits; raise RefusedMessage if it is no mapping."""
+    """Parse a message of JSON or CBOR to a mapping.
+
+    Size, depth and number of entries are checked before (`message_limits`). Raises RefusedMessage if the message
+    exceeds a limit, cannot be parsed, or is no mapping.
+    """
     try:
         if payload.lstrip()[:1] == b"{":
             import orjson

@@ -109,11 +109,12 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
 
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Interpolate short gaps linearly in the channels that are not `needed`, except at the ends.
+    """Interpolate short gaps linearly in all channels except those in `needed`, and except at the ends.
 
-    A gap is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml` in other channels,
-    because a moving mass moves evenly over that time. A slow sensor leaves such gaps between its samples. Returns the
-    same recording if these channels have no missing values.
+    `needed`: channels that every sample must have, i.e. the chamber pressures and the command; their gaps are filled by
+    `bridge` instead. A gap is short up to `SPLINE` samples in a pressure, and up to `gaps.motion` [s] of `priors.toml`
+    in other channels, because a moving mass moves evenly over that time. A slow sensor leaves such gaps between its
+    samples. Returns the same recording if these channels have no missing values.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}

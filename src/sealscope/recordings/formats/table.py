@@ -512,8 +512,9 @@ class _LongTable:
     def make_series(self, number: int, label: Label, rows: NDArray[np.intp]) -> Series:
         """Make the series of one channel of the table, whose samples are read when they are needed.
 
-        `number`: number of the channel, the key of its clock; `label`: name and unit of the channel; `rows` (k,):
-        indices of its rows in the table.
+        `number`: number of the channel, which identifies its sampling times (`Clock.key`), as channels of such a table
+        are sampled at times of their own; `label`: name and unit of the channel; `rows` (k,): indices of the table's
+        rows that have a sample of this channel.
         """
         read_rows = cache(partial(self._read_rows, label, rows))
         clock = Clock(number, lambda: self._read_clock(read_rows(), rows))

@@ -131,9 +131,9 @@ def simulate_batch(
 
     All runs must have the same duration and sampling rate. Rigs, leaks (at most one per run, opening abruptly or
     linearly), drifts, faults of the machine and loads may differ. The solver's step of a run is its own `step` if
-    stated; otherwise one step is chosen for all runs with the same laws, command, load and error (their own, or
-    `error`). Results do not depend on the runs' order or number, nor on `threads`. The noise differs from that of
-    `simulate`.
+    stated; otherwise one step is chosen for all runs with the same laws (choices of the rig, such as the law of
+    friction), command, load and error (their own, or `error`). Results do not depend on the runs' order or number, nor
+    on `threads`. The noise differs from that of `simulate`.
 
     Parameters
     ----------

@@ -597,9 +597,11 @@ class SetRun:
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute each leak's mean |Q_L| (runs,) [m^3/s] while it is open, as if it were always fully open.
+        """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open.
 
-        The leaks have the coefficients `flow_coefficients`. The flow is 0 for a leak that never opens.
+        It is the sum of |Q_L| over the run, divided by the sum of the opening (0 to 1). An output at which the leak is
+        half open thus counts half. The leaks have the coefficients `flow_coefficients`. The flow is 0 for a leak that
+        never opens.
         """
         from sealscope.physics.vector.runs import FLOW, OPENING
 

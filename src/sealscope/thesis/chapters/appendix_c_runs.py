@@ -190,9 +190,10 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Read the simulated tests of Appendix C from another item, as a table and as a data sheet.
+    """Read the simulated tests of Appendix C, which another part of the reproduction wrote: table and data sheet.
 
-    `runs`: what changes at half time of the tests, "leak", "no-leak" or "drift".
+    `runs`: kind of the tests by what changes in the middle of each: "leak" (a leak begins), "drift" (parameters of the
+    rig step), or "no-leak" (nothing changes).
     """
     table = first_table(context, f"appendix-c-{runs}")
     return table, parse_sheet(table)

@@ -87,7 +87,13 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
     def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        """Format the rule, its printed rates and its false alarms in simulation for the claim's texts."""
+        """Make the values that fill the braces of the claim's texts.
+
+        `where`: place of the claim in the thesis; `name`: the details and chambers that the rule of Table 5.1 tests;
+        `rates`: success rates that the thesis prints for this rule [%]; `product`: a remark on one printed rate, "" for
+        all other rules; `controls`: how often the rule fires in simulations without a leak. `sheet`: data sheet of
+        Appendix C, from which the rates are counted again.
+        """
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (
             f"; the printed 65 is near the product of the two printed rates, 0.85 x 0.76 = {0.85 * 0.76:.3f} "

@@ -121,8 +121,9 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
 def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Observable) -> Iterator[Observable]:
     """Yield three alternative explanations of drifting pressures: by p_A alone, by p_B alone, and by both alike.
 
-    `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. A drift of both alike does
-    not explain that of their difference, so its chance is chance_A chance_B / chance_difference, at most 1.
+    `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. The `chance` of a test is the
+    probability that a healthy machine scores as high (its p-value). A drift of both alike does not explain that of the
+    difference, so the third explanation gets the p-value chance_A chance_B / chance_difference, at most 1.
     """
     yield drift_A
     yield drift_B

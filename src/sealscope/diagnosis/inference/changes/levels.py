@@ -100,7 +100,10 @@ def top_speed(motion: Array) -> float:
 
 
 def _central_difference(values: Array, half_length: int) -> Array:
-    """Compute the differences (n,) of values over 2 `half_length` samples, centred on each, shorter at the ends."""
+    """Compute the difference (n,) between the values `half_length` samples after and before each of n samples.
+
+    It is not divided by the distance. Beyond the ends the first and last values are repeated.
+    """
     padded = np.pad(values, half_length, mode="edge")
     return np.asarray(padded[2 * half_length :] - padded[: -2 * half_length])
 
