@@ -142,7 +142,7 @@ class _HoldDraws:
         return [draw_hold(self._rig, self._hold, 0.0, self._flow, seed) for seed in range(N_HEALTHY)]
 
     def detects(self, conductance: float) -> bool:
-        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the wanted fraction of the holds."""
+        """Return True if a leak of this conductance [m^3/(s Pa)] is found in the fraction `detection` of the holds."""
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
@@ -152,9 +152,9 @@ class _HoldDraws:
         return True
 
     def with_smallest_leak(self) -> PlannedHold:
-        """Find the smallest conductance that the hold detects by bisection; return the hold with that conductance.
+        """Find by bisection the smallest conductance of a leak that the hold detects; return the hold with it.
 
-        The conductance is inf if the hold detects no leak that is tried (`_TRIED_LOSSES`).
+        The conductance [m^3/(s Pa)] is inf if the hold detects no leak that is tried (`_TRIED_LOSSES`).
         """
         loss_per_conductance = _decay_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_LOSSES) / loss_per_conductance)  # logarithms of conductances
@@ -181,7 +181,8 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
 
     `conductance` [m^3/(s Pa)]: of the leak; `flow` [m^3/s]: mean flow of the pump under the usual command and load;
     `seed`: of the noise. Returns the summary of a recording with this hold. It has the leak measured in the hold, the
-    flow and the pressure difference; its Gram matrix is 0.
+    pump's flow and the pressure difference. Its Gram matrix, which would contain the data from the motion of the
+    piston, is 0.
     """
     random, cylinder, sensors = np.random.default_rng(seed), rig.cylinder, rig.sensors
     t = np.arange(round((BEFORE + hold.duration) * MAX_RATE)) / MAX_RATE

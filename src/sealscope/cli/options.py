@@ -143,8 +143,8 @@ class StatedMachine:
 
     `commissioned`: the machine of the option `--machine`, which determines everything else; None without this option.
     `channel_map`, `rate`: choice of columns and sampling rate [Hz] for reading files. `rig`: what is known or assumed
-    of the machine; `limit`: leak to be repaired, as text; `baseline`: leak-free recordings. What is not given
-    is None, {} or ().
+    of the machine; `limit`: leak from which the machine must be repaired, as text such as "5 mL/min"; `baseline`:
+    leak-free recordings. What is not given is None, {} or ().
     """
 
     commissioned: CommissionedMachine | None = None

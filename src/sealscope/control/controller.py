@@ -37,10 +37,10 @@ measured_at = record_view(record_dtype(*Measured._fields))
 class CompiledLaw(NamedTuple):
     """A controller's control law as machine code, with its memory at the start of a run.
 
-    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C
-    compiler, that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): its parameters and its
-    state, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN if
-    it reports none. `kept`: an object that must not be freed while the law is in use, or None.
+    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler,
+    that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): the parameters and the state of the
+    control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN
+    if it reports none. `kept`: an object that must not be freed while the law is in use, or None.
     """
 
     address: int

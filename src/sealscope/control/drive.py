@@ -35,9 +35,9 @@ DRIVE = record_dtype(
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
     """Compute the voltage u [V] at which a drive delivers a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    `m`: a record `DRIVE`, the parameters and the filter state of the drive. For a servo valve (Q_N > 0) the
-    equation of `ValveDrive` is solved for u, which is then increased to pass the overlap of the edges. For a pump
-    the equation of `Drive` gives the commanded speed u omega_per_volt. Its factor s/(s + corner) is a high-pass
+    `m`: a record `DRIVE`, the parameters and the filter state of the drive. For a servo valve (Q_N > 0) the equation of
+    `ValveDrive` is solved for u, which is then increased to pass the overlap of the edges. For a pump the equation of
+    `Drive` gives the commanded speed u omega_per_volt. The factor s/(s + corner) of this equation is a high-pass
     filter, which each call advances by one sample.
     """
     if m.Q_N > 0.0:  # a servo valve
@@ -166,7 +166,7 @@ class Drive(_Invertible):
     def steady_voltage(self, flow: float) -> float:
         """Compute the voltage [V] at which the pump delivers a constant `flow` [m^3/s].
 
-        The motor turns at its commanded speed.
+        The motor is assumed to turn at its commanded speed, whatever the load.
         """
         return flow / self.displacement / self.omega_per_volt
 
@@ -218,10 +218,10 @@ class ValveDrive(_Invertible):
         return self.inverse(1.0)(flow, 0.0)
 
     def unloaded_flow(self, u: float) -> float:
-        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""
+        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V], with p_A = p_B."""
         return u / self.steady_voltage(1.0)
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:
-    """Build the model of a rig's pump and drive, or of its servo valve."""
+    """Build a controller's model of what moves a rig's piston: its pump and motor, or its servo valve."""
     return Drive.from_rig(rig) if rig.circuit.pump_feeds_chambers else ValveDrive.from_rig(rig)

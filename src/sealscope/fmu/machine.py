@@ -93,10 +93,10 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 class RigChoice(NamedTuple):
     """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
 
-    `laws`: the rig's choices between equations and its optional ones, in the order of `physics.rig.CHOICES`;
+    `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional one is present;
     `exponent`, `literal_metering`: how the equations of the throttles are read (`throttle_flow_coefficients`);
-    `implicit`: True for the implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's
-    integral is computed by eq. (4.2) of the thesis.
+    `implicit`: True for the implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral
+    is computed by eq. (4.2) of the thesis.
     """
 
     laws: tuple[bool | tuple[bool, ...], ...]

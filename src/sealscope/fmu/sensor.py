@@ -149,10 +149,11 @@ class SensorChoice(NamedTuple):
 
 
 class _Lengths(NamedTuple):
-    """Lengths of the sensor's computations: samples in a stride, strides in a block, samples in half a difference.
+    """Numbers of samples and strides by which a soft sensor divides its measurements.
 
-    A new row of the weak form begins every stride; the direction of motion is found from a central difference of the
-    position over 2 `half_difference` samples.
+    A stride is the time from one row of the volume balance to the next: `stride_samples` long, `block_strides` of them
+    in a block; the direction of motion is found from a central difference of the position over 2 `half_difference`
+    samples.
     """
 
     stride_samples: int
@@ -442,9 +443,9 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    `m`: the sensor's memory. From the first motion on, `LEARNED` blocks wait until all of them can be fitted
-    together. After `N_WAKING` successive blocks with far larger motion than before, all is discarded and begins
-    again. The other arguments are those of `_append_conductance`.
+    `m`: the sensor's memory. The first `LEARNED` blocks with motion are stored until the coefficients can be fitted to
+    all of them together. After `N_WAKING` successive blocks with far larger motion than before, all estimates are
+    discarded, and this first fit is repeated. The other arguments are those of `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:

@@ -67,12 +67,12 @@ class AlarmEvent(NamedTuple):
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    `watch`: its detector; `judge`: its alarm; `pending`, `bytes`: number of blocks since the last checkpoint, and of
-    their bytes; `n_stored`: number of all blocks so far; `last`: the last estimate, with flows averaged over the
-    machine's cycles; `shown`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if
-    unknown; `judged_s` [s]: end of the last block that was judged; `verdict`: verdict on the last recording, None if
-    whole recordings are not judged; `alarm_samples`: the last samples during an alarm, which may become a healthy
-    recording in the machine's file.
+    `watch`: its detector; `judge`: its alarm; `pending`: number of blocks since the last checkpoint, at which the state
+    was stored; `bytes`: total size of these blocks [bytes]; `n_stored`: number of all blocks so far; `last`: the last
+    estimate, with flows averaged over the machine's cycles; `shown`: the summary that was stored last; `oil_celsius`
+    [deg C]: oil temperature, None if unknown; `judged_s` [s]: end of the last block that was judged; `verdict`: verdict
+    on the last recording, None if whole recordings are not judged; `alarm_samples`: the last samples during an alarm,
+    which may become a healthy recording in the machine's file.
     """
 
     settings: ActuatorSettings

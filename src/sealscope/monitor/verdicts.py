@@ -111,11 +111,11 @@ class RecordingVerdict:
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if a leak-free recording scores as high so seldom that the allowed false-alarm rate is kept.
+        """Return True if the allowed rate of false alarms is kept although this verdict raises an alarm.
 
-        The probability `chance` of this must not exceed the allowed rate times the length of the recording; the limit
-        is at least `rarest` of `priors.toml`, the smallest chance that can be known. Returns True if `chance` is
-        None.
+        The probability `chance` that a leak-free recording scores as high must not exceed the allowed rate times the
+        length of the recording; the limit is at least `rarest` of `priors.toml`, the smallest chance that can be known.
+        Returns True if `chance` is None.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)

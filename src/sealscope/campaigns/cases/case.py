@@ -58,8 +58,9 @@ class CaseInputs:
 class CampaignCase(CaseInputs):
     """One record to simulate and judge.
 
-    `id` and the seeds are computed from a hash of the record's inputs and of those that all records of the plan
-    share.
+    `machine_seed`: seed by which the record's machine is drawn from the plan's profile; `noise_seed`: seed of the
+    sensors' noise. `id` and the seeds are computed from a hash of the record's inputs and of those that all records of
+    the plan share.
     """
 
     machine_seed: int

@@ -32,9 +32,10 @@ Scores = Mapping[str, tuple[float | None, float | None]]
 class Statement:
     """The statement of a detector on a record: the fields of its evidence that the record's row stores.
 
-    `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: numbers that were compared; `onset_s` [s]:
-    time at which the leak began; `leak_lpm` [L/min]: flow of the leak; `onset_interval_s`, `leak_interval_lpm`:
-    confidence intervals of both; `cause`: named cause. A number is None if it is not stated or not finite.
+    `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: the detector's statistic, and the value above
+    which it reports a leak; `onset_s` [s]: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;
+    `onset_interval_s`, `leak_interval_lpm`: confidence intervals of both; `cause`: named cause. A number is None if it
+    is not stated or not finite.
     """
 
     verdict: Verdict

@@ -168,7 +168,7 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
 
 
 def _run_numbered(task: Callable[[Item], Result], numbered: tuple[int, Item]) -> Result:
-    """Run `task` on an item that is given as a pair (number, item), and return the result."""
+    """Run `task` on an item that is given as a pair (number, item), and return the task's result."""
     return task(numbered[1])
 
 

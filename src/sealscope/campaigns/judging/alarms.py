@@ -21,7 +21,7 @@ ALL, ANY_LAW = "all", "any"
 
 @dataclass(frozen=True)
 class AlarmFractions:
-    """Fractions of the records of one group on which one detector raised an alarm, stated no verdict, and similar.
+    """Fractions of alarms, missing verdicts and correct statements of one detector on a group of records.
 
     The group is defined by `leak_lpm` (0: no leak, nan: any size), `law`, `fault`, `family` and `levels`. `alarms`:
     fraction with the verdict `leak`; `cannot_tell`: fraction with the verdict `cannot tell`, which includes the
@@ -99,7 +99,8 @@ class Alarms:
     def by_cell(self) -> Iterator[AlarmFractions]:
         """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels.
 
-        Records with faults other than a leak are left out.
+        A factor is a condition that a plan varies, such as the load; its levels are the values that occur. Records with
+        faults other than a leak are left out.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))

@@ -48,9 +48,10 @@ class SizeRoc:
 
 
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield each detector's probability of detection over the size of the leak; skip it if no record has a leak.
+    """Yield each detector's probability of detection over the size of the leak.
 
-    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals.
+    A detector without a record that has a leak is left out. `verdicts`: by detector, its verdict on each record;
+    `confidence`: of the intervals.
     """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]

@@ -18,7 +18,7 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 
 @dataclass(frozen=True)
 class StatedErrors:
-    """Errors of one detector's estimates on the records with one size of leak.
+    """Errors (estimate minus true value) of one detector's estimates on the records with one size of leak.
 
     `leak_lpm`: size of the leak, 0 for leak-free records; `errors`: those of estimated onsets [s], over the records
     with an alarm, or those of estimated leak flows [L/min], over all records.

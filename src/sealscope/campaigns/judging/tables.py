@@ -63,12 +63,13 @@ def resolve_attribute(source: Any, path: str) -> Any:
 
 
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
-    """Build the cells that one entry of `tables.toml` gives for one row of a table, by name of the column.
+    """Build the cells of one row of a table that one entry of `tables.toml` describes, by name of the column.
 
-    `content`: flags, and the dotted path of the value in `row`, the object that fills the row. With the flag "share"
-    the value is a proportion, which fills five columns; with "stated" too, they are empty if the proportion counts no
-    records. With the flag "size" it is a size of leak, and nan becomes "any". The path "levels" fills a column for
-    each of the `factors`.
+    `column`: name of the entry; `content`: its text, which is flags followed by the dotted path of an attribute of
+    `row`, such as "share alarms". The flag "share" means that the attribute is a proportion, which fills five columns
+    (count, number, fraction and its interval). With the flag "stated" too, they are empty for a proportion of no
+    records. The flag "size" means a size of leak, for which nan is written as "any". The path "levels" fills one column
+    for each of the plan's `factors`.
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)

@@ -70,10 +70,11 @@ def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
 
 
 def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Compute the rig's parameters that close the throttles of both lines by `level`, such as 0.25 or '25 %'.
+    """Compute the rig's parameters that close the throttles of both lines by the fraction `level` of their area.
 
-    Returns them by name. At a level above 0 they include `line.orifices`, which gives the rig throttles. Raises
-    InputError for a level below 0, or of 100 % and more.
+    `level`: a number or a text, such as 0.25 or '25 %'. Returns the values by name of the parameter. At a level above 0
+    they include `line.orifices`, which gives the rig throttles. Raises InputError for a level below 0, or of 100 % and
+    more.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:

@@ -92,7 +92,7 @@ class MachineSummary:
     problems: list[str] = field(default_factory=list)
 
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
-        """Format the summary of a machine as a table of about ten lines.
+        """Format the summary of a machine as a table of about ten lines of text.
 
         `healthy` are the recordings that it summarises, and `rig` the stated sizes of the machine, None if there are
         none.

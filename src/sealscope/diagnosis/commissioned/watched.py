@@ -37,13 +37,13 @@ class WatchedMachine:
         Sizes of the machine. If only the areas are stated, the pump's displacement is measured from the healthy
         recordings.
     channel_map : mapping of str to str
-        Channel to column of its logs.
+        Column of the actuator's logs for each channel.
     rate : float or None
         Sampling rate [Hz] of logs without a time column.
     limit_lpm : float or None
         Leak at which the machine must be repaired [L/min], None if that needs a piston area that is not stated.
     machine : CommissionedMachine or None
-        Machine whose healthy recordings whole recordings are compared with, None if there are none.
+        Machine with the healthy recordings that a file of the actuator is compared with, None if there are none.
     healthy : HealthyLevel or None
         Leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
     """

@@ -31,8 +31,9 @@ class LeakTest(NamedTuple):
     """Result of a test for a leak.
 
     `name`: WITHIN, AGAINST or LEVEL, i.e. within the recording, against healthy recordings, or against the rig's file;
-    `chance`: probability of at least this `score` without a leak; `probability`: allowed probability of a false alarm,
-    i.e. that without a leak the score exceeds the `threshold`.
+    `score`: statistic of the test, which grows with the evidence of a leak; `chance`: probability of at least this
+    score without a leak; `probability`: allowed probability of a false alarm, i.e. that without a leak the score
+    exceeds the `threshold`.
     """
 
     name: str
@@ -103,7 +104,7 @@ class Case:
         return probability_of(self.explanations, *LEAK_EVENTS, data_kind=self._data_kind(alarm))
 
     def external_probability(self, alarm: LeakTest) -> float:
-        """Compute the probability that oil leaves the circuit, given the data that raised the alarm.
+        """Compute the probability that oil leaks out of the circuit, given the data that raised the alarm.
 
         It is 0 if other causes are not weighed (`weigh_rivals`).
         """
@@ -120,7 +121,7 @@ class Case:
     def tests(self) -> tuple[LeakTest, ...]:
         """The tests for a leak that the detector's report allows.
 
-        Their probabilities of a false alarm add up to the allowed one of the verdict.
+        Each test has its own allowed probability of a false alarm. Their sum is `false_alarm_probability`.
         """
         return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
 
@@ -139,8 +140,9 @@ class Case:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
         An older leak explains only the leakage above that of healthy recordings (the rise). One that began within the
-        recording explains a step, i.e. a sudden increase of the leakage, and the rise that this step causes. The
-        result is also true if there are no healthy recordings, or if holds date the leak within the recording.
+        recording explains a step, i.e. a sudden increase of the leakage, and the rise that this step causes. The result
+        is also true if there are no healthy recordings, or if the times in which valves hold the load show that the
+        leak began within the recording (`rise_onset`).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -152,7 +154,8 @@ class Case:
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The changes are tried from the rarest on, until one is not rarer than is allowed in a healthy recording.
+        The changes are tried in the order of their probability in a healthy recording, the least probable first. The
+        search ends at a change that is more probable than the allowed probability of naming an event by mistake.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {

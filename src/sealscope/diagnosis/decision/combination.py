@@ -38,9 +38,9 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if a detector could use the recording and decides on it.
+    """Return True if a detector could use the recording, and states a verdict or a cause or has raised an alarm.
 
-    A detector decides if it states a verdict or a cause, or if its score exceeds the threshold.
+    An alarm is a score above the threshold.
     """
     return evidence.usable and not evidence.abstains
 

@@ -188,7 +188,7 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the flow [m^3/s] of the smallest leak that would be detected if it began within the recording.
+    """Compute the mean flow [m^3/s] of the smallest leak that would be detected if it began within the recording.
 
     Return None if the recording was not tested for such a leak.
     """

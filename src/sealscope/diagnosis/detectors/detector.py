@@ -40,7 +40,7 @@ class Detector(Protocol):
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
-        """Estimate the detector's numbers (observables) in a recording that is `usable`, and test them for changes.
+        """Estimate the detector's quantities in a `usable` recording, test each for a change, and report both.
 
         `baseline` holds leak-free recordings of the same machine with any load cycle, none of them twice. If it is
         empty, only changes within the recording are tested.

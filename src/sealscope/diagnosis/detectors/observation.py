@@ -155,9 +155,10 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal -log(chance) of each observable that is tested for a change within the recording.
+    """Collect the largest surprisal of each observable that is tested for a change within the recording.
 
-    Returns surprisals by key (`null.null_key`). The test for a step of the leak has a key of its own.
+    A surprisal is -log of the p-value that the detector states. Returns surprisals by key (`null.null_key`). The test
+    for a step of the leak has a key of its own.
     """
     surprisals: dict[str, float] = {}
     for observable in report.observables:

@@ -63,9 +63,9 @@ def law_flows(blocks: Blocks) -> dict[float, Array]:
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each law of a leak's flow, in the order of its exponents `EXPONENTS`.
+    """Return the prior probability of each law of a leak's flow, |p_A - p_B|^e, in the order of `EXPONENTS`.
 
-    Laminar flow has the probability `size.laminar` of `priors.toml`; the other laws are equally probable.
+    Laminar flow, e = 1, has the probability `size.laminar` of `priors.toml`; the other exponents are equally probable.
     """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
@@ -73,7 +73,7 @@ def law_priors() -> Array:
 
 
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
-    """Test for a leak that begins within a recording, under each law of its flow.
+    """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
 
     The test of the law with the smallest chance is returned. Each law has the share of the false-alarm probability
     that its prior gives it. The step's size is the mean change of the conductance. `columns`: roles of the columns
@@ -107,7 +107,7 @@ def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
 
 
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
-    """Estimate the mean flow of a leak that begins within a recording, from its onset to the end.
+    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, averaged from its onset to the end.
 
     The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`:
     roles of the columns (leak, motion, left side) in each equation; `leak`: likelihood of the leak's coefficient in
@@ -131,7 +131,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 
 
 class LawWeight(NamedTuple):
-    """Weight of one law of the leak's flow, such as laminar.
+    """Weight of one law of a leak, i.e. of one exponent e in flow = C |p_A - p_B|^e.
 
     `flow`: mean flow [m^3/s] under this law if the leak's coefficient rises by 1 m^3/(s Pa); `log_weight`: logarithm
     of the law's probability, up to a constant.
@@ -144,7 +144,7 @@ class LawWeight(NamedTuple):
 def estimate_rise_flow(
     leak: Information, test: StepTest | None, value: float, deviation: float, laws: Sequence[LawWeight], max_flow: float
 ) -> Flow:
-    """Estimate the mean flow of a leak after its onset, from its rise over healthy recordings.
+    """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
     The value is that of the most probable law; the other laws contribute to its standard deviation.
 

@@ -119,7 +119,7 @@ class RiseTest(Protocol):
         """Probability that a healthy machine has at least this score."""
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with the probability `chance`."""
+        """Return the score of the test that a healthy machine exceeds with the probability `chance`."""
 
 
 class DatedTest(RiseTest, Protocol):
@@ -129,7 +129,10 @@ class DatedTest(RiseTest, Protocol):
         """Return the most likely onset of the leak [s] with its 95 % interval."""
 
     def detectable_step(self, chance: float) -> float:
-        """Return the smallest reliably detected step of the conductance, at a false-alarm probability `chance`."""
+        """Return the smallest step of the leak's conductance [m^3/(s Pa)] that is reliably detected.
+
+        A step is a sudden, lasting increase. `chance`: false-alarm probability of the test.
+        """
 
 
 class LeakMeasure(Protocol):
@@ -149,11 +152,15 @@ class LeakMeasure(Protocol):
 
     @property
     def step_flow(self) -> Flow:
-        """Mean flow of a leak that begins within the recording, from its onset to the end."""
+        """Mean flow [m^3/s] of a leak that begins within the recording, averaged from its onset to the end."""
 
     @property
     def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest factor by which the flow differs from the stated one, for another path or law."""
+        """Smallest and largest true flow of the leak over the stated flow.
+
+        They differ from 1 if the channels do not show on which path the oil leaks, or how its flow depends on the
+        pressure.
+        """
 
     @property
     def flow_per_conductance(self) -> float:
@@ -165,7 +172,10 @@ class LeakMeasure(Protocol):
 
     @property
     def rise_flow(self) -> Flow | None:
-        """Mean flow of the leakage above that of healthy recordings, or, without any, the total; None if unknown."""
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings, or of the total leakage if there are none.
+
+        None if it is unknown.
+        """
 
     @property
     def rise_onset(self) -> Interval | None:
@@ -173,7 +183,10 @@ class LeakMeasure(Protocol):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file, in standard deviations; None if no limit applies."""
+        """Total leakage minus the limit in the rig's file (`pump.G_healthy`), in standard deviations of the leakage.
+
+        None if no limit applies.
+        """
 
     @property
     def bound_flow(self) -> float:
@@ -192,7 +205,10 @@ class LeakMeasure(Protocol):
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from this detector's flows [m^3/s] to L/min; None if the machine's sizes are not stated."""
+        """Factor from this detector's flows, computed with assumed sizes [m^3/s], to the machine's flows [L/min].
+
+        The sizes are the piston's area and the pump's displacement. None if neither is stated.
+        """
 
     @property
     def size_deviation(self) -> float:
@@ -207,10 +223,13 @@ class LeakMeasure(Protocol):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks for the reader of the verdict, on sizes, sensor offsets and delays."""
+        """Remarks for the reader of the verdict, on stated sizes, offsets of the sensors and delays of channels."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Convert a leak's flow to a fraction of the pump's flow and a creep speed of the piston; None if unknown."""
+        """Convert a leak's flow [m^3/s] to a fraction of the pump's flow and a creep speed [m/s] of the piston.
+
+        None if both are unknown.
+        """
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
         """Return the total leakage in the recording, and the smallest detectable leak; None if neither is known.
@@ -227,7 +246,7 @@ class LeakMeasure(Protocol):
 
 
 class Ringing(NamedTuple):
-    """Precision of the pressures' ringing, for a recording without a measured leakage.
+    """Precision of the comparison of the pressures' ringing, for a recording whose leakage cannot be measured.
 
     The ringing is an oscillation, measured by the RMS of wavelet details. `bound`: 95 % upper bound of a change of the
     logarithm of this RMS; `rate`: sampling rate [Hz]; `healthy`: number of healthy recordings it was compared with;

@@ -97,7 +97,10 @@ class Interval(NamedTuple):
 
 
 class FittedStep(NamedTuple):
-    """Fitted `size` of a step of a coefficient, and its standard error `deviation`."""
+    """Fitted `size` of a step (a sudden lasting change) of a coefficient, and its standard error `deviation`.
+
+    Both are in the unit of the coefficient.
+    """
 
     size: float
     deviation: float
@@ -165,7 +168,10 @@ class StepTest:
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return the test with a `share` of the false-alarm probability, as one of several of which the best counts."""
+        """Return this test with the fraction `share` of the false alarms, as one of several of which the best counts.
+
+        Its `chance` is divided by this fraction.
+        """
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:

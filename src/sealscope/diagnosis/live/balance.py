@@ -87,7 +87,7 @@ class BlockConductance(NamedTuple):
 
     @property
     def lpm(self) -> float:
-        """Leakage flow of a unit conductance at the block's mean pressure difference [L/min per m^3/(s Pa)]."""
+        """Factor from a conductance to a flow at the block's mean |p_A - p_B| [L/min per m^3/(s Pa)]."""
         return self.pressure / LITRE_PER_MINUTE
 
     @property
@@ -229,7 +229,7 @@ class LiveBalance:
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
 
     def _make_stream(self) -> BlockStream:
-        """Build the object that cuts samples at the present sampling rate into blocks and keeps their samples."""
+        """Build the object that divides samples at the present sampling rate into blocks."""
 
         def store_samples(begin: float, samples: Mapping[str, Array]) -> None:
             self._closed_samples.append((begin, samples, self._rate))
@@ -279,7 +279,7 @@ class LiveBalance:
 
     @property
     def _half_stride(self) -> float:
-        """Half the time between two successive equations of the volume balance [s].
+        """Half the time [s] between the test functions of two successive rows (equations) of the volume balance.
 
         The samples of a block reach beyond its first and last equation by this much.
         """

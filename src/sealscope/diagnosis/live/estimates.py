@@ -105,13 +105,13 @@ class WatchedLeak:
 
     @property
     def estimate(self) -> LiveRise:
-        """The increase of the conductance with its onset and its test."""
+        """The increase of the leakage conductance [m^3/(s Pa)] with its onset, as the test that detected it."""
         onset = Onset(self.onset_s, *self.onset_interval_s)
         return LiveRise(self.test, self.score, onset, self.rise, self.rise_sd)
 
     @property
     def allowed(self) -> float:
-        """False-alarm probability for which the threshold of the test was set."""
+        """Allowed probability of a false alarm of one test, for which `threshold` was set."""
         return LiveRise(self.test, self.threshold).chance
 
     @property
@@ -244,7 +244,8 @@ class BaselineLearning:
     total : float
         Sum of their conductances [m^3/(s Pa)].
     flow : float
-        Sum of their flows of a unit conductance [L/min per m^3/(s Pa)].
+        Sum over the blocks of the factor from a conductance to a flow, at the block's mean pressure [L/min per
+    m^3/(s Pa)].
     duty_low, duty_high : tuple of float, or None
         Smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s].
     group : list of float
@@ -272,8 +273,8 @@ class BaselineLearning:
     def add(self, g: float, flow: float, duty: Duty) -> None:
         """Add a block to the sums from which the baseline is computed.
 
-        `g` is its conductance [m^3/(s Pa)], `flow` the flow of a unit conductance [L/min per m^3/(s Pa)], and `duty`
-        the logarithms of mean pressure difference and pump flow.
+        `g` is its conductance [m^3/(s Pa)], `flow` the factor from a conductance to a flow at the block's mean pressure
+        [L/min per m^3/(s Pa)], and `duty` the logarithms of mean pressure difference and pump flow.
         """
         self.blocks += 1
         self.total += g

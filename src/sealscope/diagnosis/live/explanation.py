@@ -69,9 +69,9 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
 
 
 def _coincides(observable: Observable, onset: Interval) -> bool:
-    """Return True if the 95 % interval of an observed change's onset overlaps the interval `onset`.
+    """Return True if a change may have begun in the interval `onset` [s], by the 95 % interval of the change's onset.
 
-    False if the change has no onset.
+    False if the onset of the change is unknown.
     """
     change = observable.onset
     return change is not None and change.low <= onset.high and change.high >= onset.low

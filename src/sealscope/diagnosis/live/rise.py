@@ -122,7 +122,7 @@ class LiveLeak:
         return self.test.interval
 
     def relative(self, flow: Flow) -> None:
-        """Return None, as no flow relative to the pump's is stated for a running machine."""
+        """Return None: for a running machine no leak is stated relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> None:
         """Return None, as the estimate of each block states the total leakage."""

@@ -173,7 +173,7 @@ class Watch:
 
     @property
     def why_no_litres(self) -> str:
-        """Reason why no L/min are stated; "" if they are."""
+        """Reason in words why leaks are not stated in L/min; "" if they are."""
         if self._estimator is None or self._estimator.litres:
             return ""
         return "L/min is not stated: areas and displacement of the machine are not, which its file states"
@@ -309,9 +309,9 @@ class Watch:
         return estimate
 
     def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
-        """Test a block against all earlier ones and estimate its leak.
+        """Test the conductance of a block against those of all earlier blocks, and estimate the leak in this block.
 
-        The block is added to the baseline while that is learned.
+        The block is added to the baseline, the healthy state, while that is being learned.
         """
         row = np.array([block], _BLOCK)
         is_finite = all(abs(number) < _MAX_NUMBER for number in block)
@@ -337,7 +337,10 @@ class Watch:
         return self._add_flows(estimate, estimator, blocks)
 
     def _has_known_duty(self, block: BlockConductance) -> bool:
-        """Return True if a block's pressure and flow are in the baseline's range, or if there is no baseline."""
+        """Return True if a block's mean |p_A - p_B| and pump flow are within the range of the baseline, with a margin.
+
+        Also True if there is no baseline yet.
+        """
         baseline = self.baseline
         return baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
 
@@ -360,7 +363,7 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline; freeze the baseline once the stated hours are over."""
+        """Add a block to the baseline, the healthy state; fix the baseline after `learn_hours` hours of operation."""
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
@@ -491,7 +494,10 @@ class Watch:
         self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
 
     def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
-        """Return the stored blocks after the latest possible onset of a leak, at least the last block."""
+        """Return the stored blocks that contain the whole leak: those after its latest possible onset.
+
+        It is the last block if there is none.
+        """
         is_after = self._compared["end"] - self.block_seconds >= leak.onset_interval_s[1]
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 

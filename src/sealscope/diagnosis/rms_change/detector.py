@@ -174,7 +174,7 @@ def compare_summaries(
 
 
 def _is_judged(column: str) -> bool:
-    """Return True if the wavelet detail in a column name, such as "d3 of p_A", is a judged one (`JUDGED`)."""
+    """Return True if an alarm may rest on the wavelet detail in a column name, such as "d3 of p_A" (`JUDGED`)."""
     return column.split(maxsplit=1)[0] in JUDGED
 
 

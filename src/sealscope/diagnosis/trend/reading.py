@@ -338,9 +338,9 @@ def _join_files(readings: Iterable[LeakReading]) -> str:
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute `scale` / `other` - 1; 0 if one of them is unknown.
+    """Compute `scale` / `other` - 1, where both are measured ratios of pump displacement to piston area.
 
-    Both are a machine's measured ratio of displacement to area, from two readings.
+    They are from two readings of one machine. The result is 0 if one of them is unknown.
     """
     return 0.0 if scale is None or other is None else scale / other - 1.0
 

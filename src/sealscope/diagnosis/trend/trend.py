@@ -428,9 +428,10 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Convert the repair limit to an increase of the leakage in the trend's unit; None if it cannot be converted.
+    """Convert the repair limit to the increase of the leakage at which a repair is due, in the trend's unit.
 
-    `trend_units_per_level` is the factor from the level of a reading to that unit.
+    `trend_units_per_level` is the factor from the level of a reading to that unit. None if the limit cannot be
+    converted.
     """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:

@@ -57,7 +57,7 @@ class TrendLeak:
 
     @property
     def step_flow(self) -> Flow:
-        """A flow of 0 with infinite error, as no step within a recording is tested."""
+        """A flow of 0 with infinite standard error, as no step within a recording is tested."""
         return Flow(0.0, np.inf)
 
     @property

@@ -106,7 +106,7 @@ class Levels:
 
     @property
     def interval(self) -> float:
-        """Typical time between two recordings [days]; 1 if unknown."""
+        """Typical time between two successive recordings [days]; 1 if there is only one."""
         steps = np.diff(self.t)
         return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 

@@ -76,8 +76,8 @@ def do_nothing() -> None:
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     """Raised if a message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: their first bytes, which are
-    stored; `bytes`: number of these; `done`: function called when they are stored.
+    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: the first bytes, which are
+    stored; `bytes`: number of the stored bytes; `done`: function called when they are stored.
     """
 
     def __init__(

@@ -50,17 +50,17 @@ class HealthyLevels:
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a recording by friction, drifts and spectra, for comparison with other recordings.
 
-        The summary maps names to numbers, and those of `PAIRS` to arrays of the fields of `Octaves`, (4, k), without
-        what the channels or too little motion do not allow. It is None if nothing can be estimated, and is computed
-        only once for a recording.
+        The summary maps names to numbers, such as "friction_pressure" [Pa] or "drift_A" [Pa/s]. The names of `PAIRS`,
+        pairs of channels, are mapped to spectra: arrays (4, k) with the fields of `Octaves` in k octaves. Entries that
+        the recorded channels do not allow, or for which the piston moves too little, are missing. The result is None if
+        nothing can be estimated. It is computed only once for a recording.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
-        """Compare friction, drifts and spectra of a recording with those of healthy ones; yield the observables.
+        """Compare friction, drifts and spectra of a recording with those of healthy ones; yield one test for each.
 
-        Each observable is the test of one difference. Numbers that the recording, or too many of the healthy ones in
-        `baseline`, do not have are left out.
+        Quantities that the recording, or too many of the healthy ones in `baseline`, do not have are left out.
         """
         summaries, judged = healthy_summaries(self, baseline), self.learn(recording)
         if judged is None:
@@ -97,10 +97,11 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
 
 
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
-    """Compare the logarithm of the friction with that of healthy recordings.
+    """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    Friction resists the motion: its sign is that of most healthy recordings, and a value that is not clearly of that
-    sign says nothing. Return None if the recording, or too many of the healthy ones, have no such value.
+    The logarithms are compared. The sign of the friction is that of most healthy recordings. A value that does not
+    exceed its standard error with this sign is not used. Return None if the recording, or too many of the healthy ones,
+    have no usable value.
     """
     keys, prior = ("friction_pressure", "friction_error"), CHANGES.healthy
     pressures = [tuple(float(summary[key]) for key in keys) for summary in healthy if set(keys) <= set(summary)]

@@ -50,17 +50,23 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
 
 
 class PressureLevels(NamedTuple):
-    """Estimates in K blocks: `time` (K,) [s] and `values` (K, 4) [Pa], level_A, level_B, half_A and half_B."""
+    """Levels of both chamber pressures in K blocks of a recording, at the times `time` (K,) [s].
+
+    `values` (K, 4) [Pa] has the columns level_A and level_B, the mean of each pressure over both directions of motion,
+    and half_A and half_B, half its difference between the directions.
+    """
 
     time: Array
     values: Array
 
 
 class LevelChange(NamedTuple):
-    """Test of a step of the pressure levels in one pattern.
+    """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
-    `score`: twice the log likelihood ratio, n log(1 + sum_j F_j), and its `chance`; `rank`: the score less a penalty of
-    log n for each further coefficient, by which patterns are compared; `onset` and length of a `block` [s].
+    `name`: cause that changes these levels, such as "friction"; `score`: twice the log likelihood ratio of a step to
+    none; `chance`: probability that a healthy recording scores as high; `rank`: the score less a penalty of log(blocks)
+    for each coefficient of the pattern after the first, by which patterns are compared; `onset`: time of the step [s];
+    `block`: length of a block [s].
     """
 
     name: str

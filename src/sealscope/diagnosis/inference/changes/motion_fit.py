@@ -130,9 +130,10 @@ def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Ar
 
 
 class DifferenceFit(NamedTuple):
-    """Fit of p_A - p_B by friction, which reverses with the motion, and a viscous drop.
+    """Fit of p_A - p_B by friction, which reverses with the motion, and a drop proportional to the speed.
 
-    `friction` [Pa] and `drop` [Pa over the unit of the speed], each with its standard error.
+    `friction` [Pa]: half the difference between the directions of motion; `drop`: pressure drop at the highest speed of
+    the recording [Pa]; `friction_error`, `drop_error`: standard errors of both.
     """
 
     friction: float

@@ -73,7 +73,7 @@ class Octaves(NamedTuple):
 
 
 def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
-    """Compute the spectra of a `pair` of channels of a recording in octaves, and their phase.
+    """Compute the RMS of each channel of a `pair` in octaves of frequency, and the phase between them.
 
     Return None without both channels, or if the recording is too short or has too few octaves.
     """

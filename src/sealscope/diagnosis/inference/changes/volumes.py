@@ -52,12 +52,13 @@ def volume_observables(
 ) -> tuple[Observable, ...]:
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
-    Leaks are also tested under other laws of flow, the motion by its scale. `blocks`: sums of the balance without the
-    sensor offset of p_A - p_B, for the tests of leaks; `plain`: sums with the pressures as recorded, for all other
-    terms. `columns`: roles of the columns (leak, motion, left side) in each equation; `oil_loss`: tests for an
-    external leak by the oil that the accumulator lost, by the name of the term; `volume_ratio`: measured over assumed
-    ratio of area to displacement; `charge`: trend of the charge pressure, None if it is unknown; `flow_scale`: true
-    flow over the flow of the balance.
+    A leak is also tested for flows that are proportional to another power of p_A - p_B than 1, and the motion of the
+    piston for a change of its scale by one factor. `blocks`: sums of the balance without the sensor offset of p_A -
+    p_B, for the tests of leaks; `plain`: sums with the pressures as recorded, for all other terms. `balances`,
+    `columns`: the equations, and for each the indices of its columns by role (leak, motion, left side); `oil_loss`:
+    tests for an external leak by the oil that the accumulator lost, by the name of the term; `volume_ratio`: measured
+    over assumed ratio of area to displacement; `charge`: trend of the charge pressure, None if it is unknown;
+    `flow_scale`: true flow over the flow of the balance.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -188,8 +189,8 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
     """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
 
-    The coefficient of this column is the relative change of the motion's scale. `columns`: roles of the columns
-    (leak, motion, left side) in each equation.
+    A relative change of the scale of position or speed changes the coefficient of this column by as much. `columns`:
+    roles of the columns (leak, motion, left side) in each equation.
     """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -46,7 +46,7 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 
 
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
-    """Test a recording with a position for an external leak of either side that begins within it.
+    """Test a recording with a position for an external leak of chamber A or B that begins within it.
 
     The tests use the volume of oil in the accumulator, and are returned by the name of the leak (`oil_loss_tests`).
     `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod, in whose circuit check valves let
@@ -61,7 +61,7 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 
 
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
-    """Test for an external leak of either side that begins within a recording, by the volume of the accumulator.
+    """Test for an external leak of chamber A or B that begins within a recording, by the volume of the accumulator.
 
     `signals`: both pressures and, if recorded, the position; `cycle`: duration of a cycle of the machine [s], None if
     there is none; `begin`: time of the first sample [s]. The result maps "external leak A" and "external leak B" to

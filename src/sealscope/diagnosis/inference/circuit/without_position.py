@@ -45,10 +45,11 @@ _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
 
 class CycleBalance(NamedTuple):
-    """Volume balance of a recording without a position or without the flow, over whole cycles or over holds.
+    """Volume balance of a recording without position or flow, over whole cycles or times of standstill (holds).
 
-    `blocks`: sums of the balance; `equation`, `columns`: the balance and the roles of its columns; `oil_loss`: tests
-    for an external leak of either side by the volume that the accumulator loses, by the name of the term.
+    `blocks`: the recording, reduced to Gram matrices of the balance's columns; `equation`: the balance; `columns`:
+    indices of its columns by role (leak, left side and others); `oil_loss`: tests for an external leak of either side
+    by the volume that the accumulator loses, by the name of the term.
     """
 
     blocks: Blocks

@@ -37,7 +37,10 @@ class PressureResponse:
         return find_unmet_requirement(recording, self.rig)
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
-        """Measure the leakage of a recording; None if the model of the response does not describe it."""
+        """Measure the leakage of a recording by the response of its pressures to the command.
+
+        None if no parameters of the model describe the response.
+        """
         return response.measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:

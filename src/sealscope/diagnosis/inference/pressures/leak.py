@@ -106,7 +106,10 @@ class ResponseLeak:
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Amount by which the mean conductance exceeds that of the healthy recordings; None if there are none."""
+        """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings, with its distribution.
+
+        None if there are no healthy recordings.
+        """
         healthy, count = self.healthy, len(self.healthy)
         if not count:
             return None
@@ -141,14 +144,20 @@ class ResponseLeak:
         return LeakRise(self.rise, self.rise.log_ratio(mean_step))
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean conductance that lies after a step's onset."""
+        """Compute the weight of the blocks after a step's onset in the mean conductance of the recording, 0 to 1.
+
+        A block has the weight of its precision.
+        """
         weights = self.information.precision.sum(axis=0)
         is_after = self.information.time >= step.onset().value
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow [m^3/s] to L/min; None if the machine's sizes are not stated."""
+        """Factor from a flow [m^3/s] to L/min; None if the rig's file does not state mass, areas and others.
+
+        The sizes are those that `states_flow` lists.
+        """
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:

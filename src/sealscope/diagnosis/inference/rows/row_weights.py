@@ -33,7 +33,10 @@ _Indices = NDArray[np.intp]
 
 
 class Workspace(NamedTuple):
-    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, including the left side, s of them slow.
+    """Scratch arrays of `weigh_rows`, for r rows of K blocks with c columns, of which s are slow.
+
+    The left side is one of the c columns. A slow column has one coefficient for all blocks, a fast one a coefficient in
+    each block.
 
     `weights` and `residual` (r,) of the rows; `ordered` (r,), the magnitudes of the residuals, which the median
     reorders; `reduced` (K, c, c), Gram matrices after elimination of the fast coefficients; `fit` (K, c - 1),
@@ -135,7 +138,7 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 
 @large_law
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
-    """Compute Huber's weights of the rows from the residuals of the current fit; return True if they have converged.
+    """Compute Huber's weights of the rows from the residuals of the current fit; return True if these have converged.
 
     `values` (r, m): rows; `ends`: index past the last row of each block; `column_order`: indices of the fitted
     columns, the left side last; `workspace`: a `Workspace` with the fit and with the weights, which are replaced.
