@@ -34,7 +34,7 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm of an actuator; times are on the clock of the samples [s], intervals have 95 % confidence.
+    """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
 
     `id`: name of the actuator with a running number; `level`: "warning" or "error"; `raised_s`, `updated_s`: times at
     which it was raised and last changed; `onset_s`: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;

@@ -28,7 +28,7 @@ _FALSE_ALARM = VERDICT.false_alarm
 
 @dataclass(frozen=True)
 class RecordingVerdict:
-    """The verdict on one recording, as plain values for the database; times are on the clock of the monitor [s].
+    """The verdict on one recording, as plain values for the database; times are in seconds since 1970.
 
     `file`: name of the file; `summary`, `size`, `odds`: texts for the verdict, for the size or bound of the leak, and
     for the fraction of healthy recordings that look like this one; `reason`, `cause`: as in a Diagnosis; `state`: of
@@ -61,10 +61,10 @@ class RecordingVerdict:
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:
-        """Convert a diagnosis, whose times are those of the recording, to a verdict on the clock of the monitor.
+        """Convert a diagnosis, whose times are those of the recording, to a verdict with times in seconds since 1970.
 
-        `start_s`, `end_s` [s]: times of the first and last sample on the monitor's clock; `shift` [s]: added to the
-        times in the diagnosis.
+        `start_s`, `end_s` [s since 1970]: times of the first and last sample; `shift` [s]: added to the times in the
+        diagnosis.
         """
         plain = diagnosis.as_dict()  # has None for numbers that are not finite
         onset, onset_ends = plain["onset_s"], _parse_interval(plain["onset_interval_s"])
@@ -158,8 +158,8 @@ def judge_recording(
 ) -> RecordingVerdict:
     """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
-    `file`: name of its file; `shift` [s]: added to the recording's times to give the clock of the monitor;
-    `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in the machine's file.
+    `file`: name of its file; `shift` [s]: added to the recording's times to give seconds since 1970; `limit_lpm`
+    [L/min]: leak that calls for a repair, None for the limit in the machine's file.
     """
     if limit_lpm is not None:
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")

@@ -6,7 +6,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class ClockPriors(PriorTable):
-    """Assumptions on the clock of a data logger.
+    """Assumptions on the sampling times of a data logger.
 
     - `regular` [sampling steps]: intervals between these numbers are regular; a longer one is a gap.
     - `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular.

@@ -31,7 +31,7 @@ NODES = 64
 
 @dataclass(frozen=True, eq=False)
 class HealthyNull:
-    """Distribution of observables in healthy recordings of a machine, with which their chances are calibrated.
+    """Distribution of p-values in healthy recordings of a machine, by which the p-values of detectors are calibrated.
 
     `surprisals`: -log(chance) of each observable in each healthy recording, by the key of the observable
     (`null_key`).
@@ -43,21 +43,22 @@ class HealthyNull:
     def chance(self, observable: Observable) -> float:
         """Compute the probability that a healthy recording has at least this score of an observable.
 
-        The chance that the detector states is calibrated by healthy recordings of the machine.
+        It is the p-value that the detector states, corrected by those of healthy recordings of the machine
+        (`calibrate`).
         """
         weights, inflations = self._inflation(null_key(observable))
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Correct the `chance` that a detector states for a test by those that it stated for healthy recordings.
+        """Correct the p-value `chance` that a detector states for a test by those that it stated for healthy machines.
 
-        `key`: key of the test in `surprisals`.
+        These are the `surprisals` of healthy recordings under the `key` of the test.
         """
         weights, inflations = self._inflation(key)
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
-        """Compute the chance that a detector must state for the calibrated chance to be `chance`.
+        """Compute the p-value that a detector must state so that the calibrated one is `chance`.
 
         It is the inverse of `calibrate`; `key`: key of the test in `surprisals`.
         """

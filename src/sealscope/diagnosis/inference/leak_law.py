@@ -43,7 +43,7 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 
     It is the regression coefficient of this flow on p_A - p_B: 1 for laminar flow, and from the Gram matrices for an
     orifice; between the two its logarithm is interpolated. The result maps each exponent e of `EXPONENTS` to an array
-    (K,). `columns`: roles of the columns (leak, motion, left side) in each equation.
+    (K,). `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -75,10 +75,10 @@ def law_priors() -> Array:
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
 
-    The test of the law with the smallest chance is returned. Each law has the share of the false-alarm probability
-    that its prior gives it. The step's size is the mean change of the conductance. `columns`: roles of the columns
-    (leak, motion, left side) in each equation; `leak`: likelihood of the leak's coefficient in the blocks. Return
-    None if too few blocks have information.
+    The test of the law with the smallest p-value (`chance`) is returned. The prior probability of a law is its fraction
+    of the false-alarm probability. The step's size is the mean change of the conductance. `columns`: for each equation
+    the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
+    blocks. Return None if too few blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)
     tests = []
@@ -109,9 +109,9 @@ def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, averaged from its onset to the end.
 
-    The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`:
-    roles of the columns (leak, motion, left side) in each equation; `leak`: likelihood of the leak's coefficient in
-    the blocks; `test`: test for a step of it.
+    The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`: for
+    each equation the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's
+    coefficient in the blocks; `test`: test for a step of it.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)

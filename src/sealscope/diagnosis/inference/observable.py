@@ -273,7 +273,7 @@ class Observed:
     leak : LeakMeasure, optional
         The leakage, if the detector measures it.
     ringing : Ringing, optional
-        Precision of the ringing, if the detector compares that instead.
+        Precision of the comparison of the ringing, the oscillation of the pressures, if the detector makes one.
     lack : str
         Reason for an empty report, else "".
     share : float

@@ -115,10 +115,10 @@ class _WhitenedSteps(NamedTuple):
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Whiten the residuals of leak and constant flow in blocks, and their changes by unit steps of both.
 
-    `roles`: roles of the columns (leak, motion, left side) of the first equation. With the precision P of leak and
-    constant flow in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2) converts
-    changes of the coefficients to changes of z. Slow changes are projected out: level and slope of the leak, and a
-    quadratic drift of the constant flow (F and B of the module). Return None if the blocks have too little
+    `roles`: indices of the columns of the first equation by role (leak, motion, left side). With the precision P of
+    leak and constant flow in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2)
+    converts changes of the coefficients to changes of z. Slow changes are projected out: level and slope of the leak,
+    and a quadratic drift of the constant flow (F and B of the module). Return None if the blocks have too little
     information.
     """
     count = len(blocks)

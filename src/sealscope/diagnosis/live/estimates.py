@@ -116,7 +116,7 @@ class WatchedLeak:
 
     @property
     def rarity(self) -> float:
-        """Chance of the test's score in a healthy machine, divided by the allowed false-alarm probability.
+        """Probability that a healthy machine scores as high, divided by the allowed probability of a false alarm.
 
         The result is limited to 1e-9 to 1.
         """

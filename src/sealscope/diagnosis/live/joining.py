@@ -56,7 +56,7 @@ def are_successive(steps: Any, rate: float) -> Any:
 
 
 def is_same_rate(rate: float, rate_before: float) -> bool:
-    """Test whether two sampling rates [Hz] are equal to within the error of clocks."""
+    """Test whether two sampling rates [Hz] are equal to within the usual error of a logger's rate."""
     return abs(rate / rate_before - 1.0) < _MAX_RATE_ERROR
 
 
@@ -179,11 +179,14 @@ class SampleJoiner:
                 indices = indices[n_samples:]
 
     def state(self) -> dict[str, Any]:
-        """Return channels in use, clock and counters as plain values for JSON, which `load_state` restores."""
+        """Return the channels in use, the time of the newest sample and the counters as plain values for JSON.
+
+        `load_state` restores them.
+        """
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore channels, clock and counters saved by `state`; raise InputError if they do not fit."""
+        """Restore channels, newest time and counters saved by `state`; raise InputError if they do not fit."""
         restore_attributes(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
         if self.names not in ((), *self.ways):
             raise InputError(f"saved state's names must be {format_ways(self.ways)}, got {', '.join(self.names)}")

@@ -11,7 +11,7 @@ class DriftPriors(PriorTable):
     - `motion`: coefficients of the motion, such as displacement over area.
     - `compliance`: compressed oil.
     - `air`: free air in the oil.
-    - `bias`: constant flow, such as the zero of a tachometer.
+    - `bias`: constant flow, such as a tachometer shows at standstill because of its offset.
     - `leak`: leakage past the piston.
     - `pump`: leakage of the pump.
     - `outside`: leakage to the outside.
@@ -130,12 +130,12 @@ class OilPriors(PriorTable):
 
 
 class SizePriors(PriorTable):
-    """Uncertainty of a machine's sizes, as relative standard deviations, and the law of its leak.
+    """Uncertainty of the sizes that convert a leak to L/min, as relative standard deviations, and the leak's law.
 
     - `displacement`: displacement of the pump.
-    - `law`: mean flow of a leak of unknown law, which may be laminar, an orifice or between the two.
+    - `law`: mean flow of a leak if its law is unknown: laminar, an orifice, or between the two.
     - `laminar`: prior probability of a laminar leak.
-    - `readings`: number of independent readings of the leak's law in a recording.
+    - `readings`: number of independent values by which a recording tells the leak's law.
     - `meter`: scale of a flow meter.
     - `area`: piston area.
     """
@@ -165,7 +165,7 @@ class GrowthPriors(PriorTable):
     """Growth of a leak after its onset within a recording.
 
     - `steady`: probability that it does not grow.
-    - `most`: largest growth until the end of the recording, over the size at the onset.
+    - `most`: largest increase of the leak's flow until the end of the recording, over the flow at the onset.
     """
 
     steady: float
@@ -188,7 +188,7 @@ class SensePriors(PriorTable):
     """Probabilities that a sign of the recorded flow looks wrong for another reason than wrong wiring.
 
     - `work`: the load gives back more work than it takes.
-    - `leak`: zeros, compliance and losses of the pump look like a negative leak.
+    - `leak`: offsets of sensors, compressed oil and losses of the pump look like a negative leak.
     - `sides`: the sides A and B are exchanged in the log.
     """
 
@@ -202,11 +202,13 @@ class HeldOilPriors(PriorTable):
 
     - `compressibility` [1/Pa], `deviation`: relative compression per pressure, and the standard deviation of its
       logarithm.
-    - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and the same of it.
-    - `unlike`: largest ratio of the areas of both sides.
-    - `right`: probability that the holds are right about a leak's size if they disagree with the whole recording.
+    - `dead`, `dead_deviation`: dead volume over the recorded stroke's volume, and the standard deviation of its
+      logarithm.
+    - `unlike`: largest ratio of the two piston areas.
+    - `right`: probability that the holds are right about a leak's flow if they disagree with the whole recording.
     - `agrees`: standard deviation of the logarithm of the ratio of the conductances from holds and whole recording.
-    - `rare`: chance in a healthy machine below which a rise of the leakage in the holds is used to size the leak.
+    - `rare`: p-value (probability in a healthy machine) of a rise of the leakage in the holds, below which the rise
+      is used to estimate the flow of the leak.
     - `settles` [s]: time in which valves shut.
     - `shortest` [s]: shortest hold.
     - `equalises` [s]: time in which a leak equalises the pressures of a hold.
@@ -311,7 +313,7 @@ class RestPriors(PriorTable):
     - `least` [s]: shortest rest.
     - `share`: largest averaged flow at rest.
     - `holding`: mean flow of a pump that holds a load.
-    - `moves`: smallest mean flow in a block of motion.
+    - `moves`: smallest mean flow of the pump in a block that counts as motion.
     - `shut`: leakage at rest over that in motion if valves cut the pump off, a standard deviation.
     - `open`: relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation.
     - `most`: limit of the log odds, from a healthy recording, that valves cut the pump off.

@@ -100,7 +100,7 @@ class RiseExplanationPriors(PriorTable):
 
     - `window` [blocks]: number of blocks that are stored.
     - `shows` [blocks]: number of blocks since the onset before a cause is looked for.
-    - `rare`: a change shows in the blocks if its chance in a healthy machine is at most this one.
+    - `rare`: largest p-value (probability in a healthy machine) of a change that shows in the blocks.
     - `start` [blocks]: time after a pause within which an increase is due to the start of the machine.
     - `settles` [blocks]: number of blocks since the onset after which the explanation is final.
     """

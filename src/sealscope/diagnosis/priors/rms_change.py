@@ -79,10 +79,10 @@ class RmsBlockPriors(PriorTable):
 
 
 class RingingRates(PriorTable):
-    """Lowest sampling rates at which the ringing of the pressures is recorded.
+    """Lowest sampling rates at which a recording contains the ringing, an oscillation of the pressures.
 
-    - `ringing` [Hz]: ringing of the machine.
-    - `slowest` [Hz]: ringing of a hydraulic line.
+    - `ringing` [Hz]: for the oscillation of the piston's mass on the oil.
+    - `slowest` [Hz]: for the oscillation of the oil in a hydraulic line; lower rates are not used.
     """
 
     ringing: float

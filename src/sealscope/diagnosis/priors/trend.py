@@ -7,7 +7,7 @@ class LevelDeviation(PriorTable):
     """Scatter of the leakage level between recordings of one machine.
 
     - `volume_balance`: standard deviation over the usual level, for the volume balance.
-    - `ringing`: standard deviation of the logarithm of the pressures' ringing.
+    - `ringing`: standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing).
     - `nodes`: number of standard deviations that are tried.
     - `freedom`: degrees of freedom of the prior.
     - `lasts`: fractions of the variance that are correlated over time, each equally likely.
@@ -25,7 +25,7 @@ class LevelDeviation(PriorTable):
 class LevelError(PriorTable):
     """Errors of the leakage level of a single recording.
 
-    - `ringing`: standard error of the logarithm of the pressures' ringing.
+    - `ringing`: standard error of the logarithm of the RMS of the pressures' wavelet details (their ringing).
     - `scale`: largest relative difference of the ratio of displacement to area between recordings that are compared.
     """
 

@@ -311,7 +311,7 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 
 
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
-    """List the findings on a trend: errors of the clock, recordings left out, and groups that cannot be compared.
+    """List the findings on a trend: wrong times, recordings left out, and groups that cannot be compared.
 
     `points` are the recordings in the order of time, and `differences` a text for each group on its difference from
     the first. Recordings left out for reasons that differ only in numbers share one finding.

@@ -214,7 +214,7 @@ class WatchedFolder:
     ) -> RecordingVerdict | None:
         """Judge a whole recording; if that raises an error, log it and return None: only its blocks are then watched.
 
-        `shift` [s]: added to the recording's times to give the clock of the monitor.
+        `shift` [s]: added to the recording's times to give seconds since 1970.
         """
         try:
             return judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)

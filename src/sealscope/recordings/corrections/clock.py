@@ -24,11 +24,11 @@ MAX_GAP_FRACTION, MAX_LATE_FRACTION = _PRIORS.lost, _PRIORS.late
 
 
 def resample_evenly(recording: Recording) -> Recording:
-    """Resample a recording to an even clock, with NaN in rows that the logger has lost.
+    """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    An even recording is returned unchanged. Rows without a time are dropped, and so are rows that are not later than
-    all rows before. If the clock steps back or leaps because the file contains several recordings, only the longest
-    recording is used.
+    A recording with even spacing is returned unchanged. Rows without a time are dropped, and so are rows that are not
+    later than all rows before. If the times step back or leap because the file contains several recordings, only the
+    longest recording is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -91,7 +91,7 @@ def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArr
 
 
 def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
-    """Interpolate the rows with the indices `rows` linearly to an even clock with the recording's rate."""
+    """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the recording's sampling rate."""
     t = recording.t[rows]
     even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
     channels = {}

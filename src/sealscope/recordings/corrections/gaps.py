@@ -77,8 +77,8 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
     A gap is a run of rows in which a needed channel has no value. It is filled by a spline if it is short, else from
     another cycle of the motion or by a straight line. In its rows the missing values of all channels are filled;
-    recorded values stay. Returns the same recording if there is nothing to fill. The clock must be even
-    (`clock.resample_evenly`).
+    recorded values stay. Returns the same recording if there is nothing to fill. The sampling times must be evenly
+    spaced (`clock.resample_evenly`).
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():

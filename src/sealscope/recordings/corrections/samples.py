@@ -35,8 +35,8 @@ from sealscope.recordings.recording import Recording
 class CorrectedSamples(NamedTuple):
     """A recording after the correction of its samples.
 
-    - `recording`: the samples on an even clock, from the first to the last row with all chamber pressures and the
-      command.
+    - `recording`: the samples at evenly spaced times, from the first to the last row with all chamber pressures and
+      the command.
     - `findings`: the corrections made.
     - `stuck`: names of chamber pressures that repeat one value for too long to be used.
     - `used_fraction`: fraction of the original samples within the time span of `recording`.
@@ -52,7 +52,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, and report each correction as a finding.
 
     The defects are treated in this order: impossible values, dropouts, rows and pressures that repeat one value for a
-    long time, spikes, repeated samples, an uneven clock, speeds without a sign, gaps.
+    long time, spikes, repeated samples, uneven sampling times, speeds without a sign, gaps.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
@@ -110,8 +110,8 @@ def remove_holes(recording: Recording) -> Recording:
 
 
 def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to an even clock (`resample_evenly`), in the form of the other corrections.
+    """Resample a recording to evenly spaced times (`resample_evenly`); also return findings, of which there are none.
 
-    Also returns a list of findings, which is empty.
+    The signature is that of the other corrections.
     """
     return resample_evenly(recording), []

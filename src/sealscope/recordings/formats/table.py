@@ -295,7 +295,7 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 
 
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
-    """Give each series without a clock the times of the time series in its group.
+    """Give each series without sampling times those of the time series (a column of times) in its group.
 
     Returns the series without these time series. If the file has only one of them, it stays, as a column. A series
     with a name such as `data` or `value` that is alone in its group gets the name of the group.
@@ -400,11 +400,11 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 
 
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-    """Resample the columns to read to one clock, that of the chamber pressures.
+    """Resample the columns to read to common sampling times, those of the chamber pressures.
 
-    Without these, the clock is that of the pressures at the pump, or of the longest series. `used`: column -> series.
-    Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no series has a
-    clock, or if one without has another number of samples.
+    Without chamber pressures these are the times of the pressures at the pump, or of the longest series. `used`: column
+    -> series. Returns column -> values (n,), including the time, and lines for the history. Raises InputError if no
+    series has sampling times, or if one without them has another number of samples.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -439,9 +439,9 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after `start`.
 
-    Also returns a note for the history, which is empty if the clocks are equal. Slower series are interpolated,
-    except over long intervals, and faster ones are averaged. Raises InputError if the times of the series do not
-    increase.
+    Also returns a note for the history, which is empty if the series is sampled at these times already. Slower series
+    are interpolated, except over long intervals, and faster ones are averaged. Raises InputError if the times of the
+    series do not increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()

@@ -22,7 +22,8 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 def read_tdms(path: Path, request: Request) -> RecordingFields:
     """Read the requested channels of a TDMS file to the fields of a recording.
 
-    Channels that state a waveform interval (``wf_increment``) have a clock. Raises MissingExtra without npTDMS.
+    Channels that state a waveform interval (``wf_increment``) have sampling times of their own. Raises MissingExtra
+    without npTDMS.
     """
     nptdms = import_library("nptdms", "TDMS", "npTDMS")
     # no warnings on a truncated last segment
@@ -46,7 +47,10 @@ def read_tdms(path: Path, request: Request) -> RecordingFields:
 
 
 def _waveform_clock(properties: Mapping[str, Any], count: int) -> Clock | None:
-    """Build the clock of a channel of `count` samples from its waveform properties; None without an interval."""
+    """Build the sampling times (`Clock`) of a channel of `count` samples from its waveform properties.
+
+    None if these state no interval between samples.
+    """
     step = properties.get("wf_increment")
     if not isinstance(step, float | int) or not step > 0:
         return None

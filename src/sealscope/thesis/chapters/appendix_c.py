@@ -25,7 +25,7 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 
     A detail has six columns: RMS without the leak, RMS with it, and the change [%], simulated and then measured.
     `sheet`: the simulated data sheet; `measured`: the measured one, None if not given, for which the cells are empty;
-    `chamber`: "p_A" or "p_B"; `item`: item of the reproduction to which the table belongs.
+    `chamber`: "p_A" or "p_B"; `item`: entry of `items.toml` for which the table is made.
     """
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
     columns: list[list[float] | list[None]] = []
@@ -86,7 +86,8 @@ def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
 
     The points are the measured change, the simulated change, and the change simulated without a leak. One panel shows
-    it in the unit of the RMS, the other in %. The item names chamber and detail.
+    it in the unit of the RMS, the other in %. `item.inputs` has the chamber, the detail and the direction in which the
+    detail should change.
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

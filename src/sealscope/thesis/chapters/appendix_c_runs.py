@@ -38,11 +38,11 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw random steps of the rig's parameters at half time, for a test that simulates drift.
+    """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
 
-    Each entry `drifts` of `cases.toml` lists parameters and a range of relative sizes. One size is drawn uniformly
-    from this range, with a random sign, and all parameters of the entry step by it. `number`: number of the test;
-    `half`: half time [s]; `draw`: index of the draw. Number and index are part of the seed.
+    Each entry `drifts` of `cases.toml` lists parameters and a range of relative sizes. One size is drawn uniformly from
+    this range, with a random sign, and all parameters of the entry step by it. `number`: number of the test; `half`:
+    time of the step, half the duration [s]; `draw`: index of the draw. Number and index are part of the seed.
     """
     rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
@@ -76,9 +76,9 @@ def leak_test(
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
     """Build the experiments of all tests of Appendix C, as pairs (inputs of the test, experiment).
 
-    `kind`: what changes at half time, "leak" (the leak opens), "no-leak" (nothing) or "drift" (parameters of the rig
-    step, without a leak); `half`: half the duration [s]. With drift each test occurs twice, with two random draws of
-    the steps, or once if `quick`.
+    `kind`: what changes in the middle of each test, "leak" (the leak opens), "no-leak" (nothing) or "drift" (parameters
+    of the rig step, without a leak); `half`: half the duration [s]. With drift each test occurs twice, with two random
+    draws of the steps, or once if `quick`.
     """
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
@@ -89,10 +89,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe what changes at half time of an experiment.
-
-    The text is "leak opened", the drifting parameters with their factors, or "nothing".
-    """
+    """Describe what changes in the middle of a test: "leak opened", drifting parameters with factors, or "nothing"."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -140,9 +137,9 @@ def make_row(
 ) -> tuple[Cell, ...]:
     """Build the row of a test in a table with the columns `COLUMNS`.
 
-    `condition`: inputs of the test; `change`: description of what changes at half time; `mean_leak_lpm`: mean leak
-    [L/min]; `ranges_MPa`: range of p_A and of p_B without a leak; `rms`: RMS of each wavelet detail before and after
-    half time, by chamber and detail.
+    `condition`: inputs of the test; `change`: description of what changes in the middle of the test; `mean_leak_lpm`:
+    mean leak [L/min]; `ranges_MPa`: range of p_A and of p_B without a leak [MPa]; `rms`: RMS of each wavelet detail in
+    the first and in the second half, by chamber and detail.
     """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
@@ -161,11 +158,11 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 
 
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details before and after half time.
+    """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details in both halves.
 
-    The item names what changes at half time: the leak opens, nothing, or parameters of the rig step (drift). With the
-    leak, the first test of each operating condition is repeated with half the solver's step, except in a quick
-    reproduction.
+    `item.inputs` states what changes in the middle of a test: the leak opens, nothing, or parameters of the rig step
+    (drift). With the leak, the first test of each operating condition is repeated with half the solver's step, except
+    in a quick reproduction.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows, proved = [], dict[tuple[str, float], bool | None]()  # condition -> whether its proved run is resolved

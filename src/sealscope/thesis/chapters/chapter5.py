@@ -77,7 +77,7 @@ TESTS: dict[str, PrintedTest] = {row[0]: PrintedTest(*row) for row in load_texts
 
 
 def make_test_experiment(test: PrintedTest) -> Experiment:
-    """Build the experiment of a test on the rig fitted to Appendix C, with the leak from half time on."""
+    """Build the experiment of a test on the rig fitted to Appendix C, with the leak open in the second half."""
     return leak_test(test.condition, test.half, test.condition.number)
 
 
@@ -237,7 +237,10 @@ def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
 
 
 def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one of Figs. 5.1 to 5.89: a view of a test over an interval of time, which the item's inputs name."""
+    """Draw one of Figs. 5.1 to 5.89: one view of one test over an interval of time.
+
+    `item.inputs` has the test, the view, such as "details", the chamber and the interval [s].
+    """
     test, span = TESTS[item.inputs["test"]], (item.inputs["from_s"], item.inputs["to_s"])
     view = FigureView(context.run(make_test_experiment(test)), test, span, item.inputs["chamber"])
     _, draw = _VIEWS[item.inputs["view"]]

@@ -39,7 +39,7 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Find the tests of a data sheet in which the rule fires; return a mask (tests,)."""
+        """Find the tests of a data sheet in which the rule fires, i.e. indicates a leak; return a mask (tests,)."""
         moves = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
         return np.asarray(np.all(moves, axis=0))
 
@@ -92,7 +92,7 @@ THRESHOLDS = (
 
 
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count in how many tests each rule of Table 5.1 fires, as rows with the columns `RATES`.
+    """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
     The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
     leak but with drifting parameters. Two more rows are for a rule that always fires and one that never does.

@@ -53,8 +53,8 @@ class ClaimEvidence:
 def gather_evidence(context: Context) -> ClaimEvidence:
     """Gather the data by which the claims on detection are judged.
 
-    The simulated sheets of Appendix C are read from other items; the ten tests of chapter 5 are simulated and
-    measured.
+    The simulated sheets of Appendix C are products of other entries of `items.toml`; the ten tests of chapter 5 are
+    simulated and measured here.
     """
     leak_table, leak_sheet = simulated_sheet(context, "leak")
     return ClaimEvidence(
@@ -108,7 +108,10 @@ class SheetClaim:
 
 
 def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
-    """Format the rate at which a rule fires on a data sheet, such as "35/41 = 85.4 % (71 to 94 %)"."""
+    """Format the fraction of the tests of a data sheet in which a rule fires, such as "35/41 = 85.4 % (71 to 94 %)".
+
+    A rule of Table 5.1 fires if the RMS of its wavelet details move as a leak should move them (`Rule`).
+    """
     return format_rate(rule.fires(sheet))
 
 

@@ -119,7 +119,7 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 5.7.6: a fall of the RMS of d3 of p_A indicates a leak.
 
-    The rule must fire rarely without a leak, and rarely if parameters drift without a leak.
+    Without a leak d3 of p_A must fall in few tests, also if parameters drift.
     """
     d3_rule = CLAIMED[0]
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}

@@ -63,7 +63,11 @@ def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 
 
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
-    """Format how often a rule fires in simulations without a leak, with constant and with drifting parameters."""
+    """Format how often a rule of Table 5.1 fires in simulations without a leak, i.e. its false alarms.
+
+    The two simulations have constant and drifting parameters. A rule fires if the RMS of its wavelet details move as a
+    leak should move them (`Rule`).
+    """
     return (
         f"In simulation the rule fires in {format_rule_rate(evidence.no_leak_sheet, rule)} with no leak and in "
         f"{format_rule_rate(evidence.drift_sheet, rule)} with drift alone"
@@ -123,7 +127,7 @@ def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.1: each rule of Table 5.1 fires in more than 80 % of the tests."""
+    """Test claim 5.6.1: each rule of Table 5.1 detects the leak in more than 80 % of the tests."""
     for rule in CLAIMED:
         yield f"{rule.name} {format_rule_rate(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
 
@@ -137,10 +141,13 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _smallest_leak_test(rules: tuple[Rule, ...]) -> SheetTest:
-    """Build the function that tests whether each of `rules` fires in the test with the smallest mean leak."""
+    """Build the function that tests whether each of some rules of Table 5.1 detects the smallest leak.
+
+    That is the test of Appendix C with the smallest mean leak; a rule detects it if it fires (`Rule`).
+    """
 
     def test_smallest(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that each rule fires in the test with the smallest mean leak."""
+        """Test that each rule fires, i.e. detects the leak, in the test with the smallest mean leak."""
         row = int(np.argmin(mean_leaks()))
         for rule in rules:
             changes = (log_change_to_percent(sheet.log_change(c, name)[row]) for c, name in rule.details)

@@ -83,7 +83,7 @@ def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observ
     """Convert step tests of sensor features, such as noise and hum, to observables.
 
     `tests`: pairs of a feature's name and its test (`sensor_tests`). Each test is the better of a rise and a fall, so
-    its chance is doubled.
+    its p-value is doubled.
     """
     for name, test in tests:
         data = name.split()[0]
@@ -98,9 +98,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """Convert tests for steps of the pressure levels to observables.
 
     `changes`: one test for each pattern, the highest rank first. The rank is twice the log likelihood ratio, less
-    log(blocks) for each coefficient after the first. The chance is chance_k = min(1, chance_1 exp(rank_1 - rank_k)).
-    Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the other half
-    is a prior against descriptions that need further coefficients.
+    log(blocks) for each coefficient after the first. The p-value of change k is chance_k = min(1, chance_1 exp(rank_1 -
+    rank_k)). Half of the exponent is the log Bayes factor of the first over change k (Schwarz's approximation); the
+    other half is a prior against descriptions that need further coefficients.
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)

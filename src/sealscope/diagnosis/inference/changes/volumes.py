@@ -53,12 +53,12 @@ def volume_observables(
     """Test the coefficients of a volume balance for a step up or down, or only up for leaks; highest score first.
 
     A leak is also tested for flows that are proportional to another power of p_A - p_B than 1, and the motion of the
-    piston for a change of its scale by one factor. `blocks`: sums of the balance without the sensor offset of p_A -
-    p_B, for the tests of leaks; `plain`: sums with the pressures as recorded, for all other terms. `balances`,
-    `columns`: the equations, and for each the indices of its columns by role (leak, motion, left side); `oil_loss`:
-    tests for an external leak by the oil that the accumulator lost, by the name of the term; `volume_ratio`: measured
-    over assumed ratio of area to displacement; `charge`: trend of the charge pressure, None if it is unknown;
-    `flow_scale`: true flow over the flow of the balance.
+    piston for a change of its scale by one factor. `blocks`: Gram matrices of the columns in blocks of the recording,
+    without the sensor offset of p_A - p_B, for the tests of leaks; `plain`: the same with the pressures as recorded,
+    for all other terms. `balances`, `columns`: the equations, and for each the indices of its columns by role (leak,
+    motion, left side); `oil_loss`: tests for an external leak by the oil that the accumulator lost, by the name of the
+    term; `volume_ratio`: measured over assumed ratio of area to displacement; `charge`: trend of the charge pressure,
+    None if it is unknown; `flow_scale`: true flow over the flow of the balance.
     """
     centred, recorded = (series.merge(INFERENCE.blocks.coarse) for series in (blocks, plain))
     leak_disadvantage = offset_cost(estimate_offset(blocks, columns))
@@ -117,9 +117,10 @@ def _step_hypotheses(
 ) -> Iterator[_Hypothesis]:
     """Yield the steps to test: of each term's coefficient, of leaks under other laws, and of the motion's scale.
 
-    `centred`: sums of the volume balance without the sensor offset of p_A - p_B, for leaks; `recorded`: sums with the
-    pressures as recorded; `terms`, `columns`: the balance's terms, and the roles of its columns (leak, motion, left
-    side); `has_accumulator`: True if the accumulator's volume shows external leaks.
+    `centred`: Gram matrices of the columns in blocks of the recording, without the sensor offset of p_A - p_B, for
+    leaks; `recorded`: the same with the pressures as recorded; `terms`: the balance's terms; `columns`: for each
+    equation the indices of its columns by role (leak, motion, left side); `has_accumulator`: True if the accumulator's
+    volume shows external leaks.
     """
     first = columns[0]
     for index, term in enumerate(terms):
@@ -139,8 +140,8 @@ def _step_hypotheses(
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    It is not if the coefficient changes only together with others, is zero within a recording, or is covered by
-    another test. `roles`: roles of the balance's columns (leak, motion, left side); `has_accumulator`: True if the
+    It is not if the coefficient changes only together with others, is zero within a recording, or is covered by another
+    test. `roles`: indices of the balance's columns by role (leak, motion, left side); `has_accumulator`: True if the
     recording shows the volume of an accumulator.
     """
     if term.name.startswith("motion"):
@@ -190,7 +191,7 @@ def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> B
     """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
 
     A relative change of the scale of position or speed changes the coefficient of this column by as much. `columns`:
-    roles of the columns (leak, motion, left side) in each equation.
+    for each equation the indices of its columns by role (leak, motion, left side).
     """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

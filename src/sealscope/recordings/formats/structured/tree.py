@@ -212,7 +212,7 @@ def _iter_columns(
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
-    """Yield the columns of a table as series of the `group`; the row times of a timetable are their clock."""
+    """Yield the columns of a table as series of the `group`, sampled at the row times if it is a timetable."""
     units = [str(unit) for unit in frame.attrs.get("VariableUnits", frame.attrs.get("varUnits", ()))]
     clock, index = None, np.asarray(frame.index)
     if index.dtype.kind in "mM" and index.size:

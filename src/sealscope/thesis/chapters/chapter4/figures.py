@@ -60,15 +60,15 @@ _VOLUMES, _QUICK_VOLUMES = (10.0, 20.0, 44.0, 100.0, 234.0, 500.0), (10.0, 44.0,
 
 
 def item_reading(item: Item) -> Reading:
-    """Return the interpretation of the throttles' equations that an item names, the default one if it names none."""
+    """Return the interpretation of the throttles' equations in `item.inputs`, the default one if there is none."""
     return Reading(**item.inputs.get("reading", {}))
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
     """Simulate a case of Table 4.2 or 4.3 with the thesis's solver and with a converged one.
 
-    The item names the case, and may name an interpretation of the throttles' equations. Returns the runs by solver, and
-    the notes for the figure or table.
+    `item.inputs` has the case, and may have an interpretation of the throttles' equations. Returns the runs by solver,
+    and the notes for the figure or table.
     """
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
@@ -152,7 +152,10 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the quantities that the item names over time, each with the thesis's solver and with a converged one."""
+    """Draw some quantities of a case over time, each with the thesis's solver and with a converged one.
+
+    `item.inputs` has the case and the names of the quantities.
+    """
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
     t = runs["converged"].t
@@ -222,7 +225,7 @@ def _sweep_curves(
 def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw one pressure with orifices that are 25, 50 and 75 % closed, and its range over the closing.
 
-    Both are drawn with the thesis's solver and with a converged one; the item names the pressure.
+    Both are drawn with the thesis's solver and with a converged one; `item.inputs` has the pressure's name.
     """
     name, reading = item.inputs["quantity"], item_reading(item)
     sweep = {closed: run_both_solvers(context, COMMAND, closed, reading) for closed in CLOSINGS}
