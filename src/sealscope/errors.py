@@ -33,7 +33,7 @@ class SealscopeError(Exception):
 
 
 class InputError(SealscopeError, ValueError):
-    """A value, an option or a file from outside breaks a rule."""
+    """A value, an option or a file that the caller gave breaks a rule, which the message states."""
 
 
 class UnreadableFile(InputError):  # noqa: N818 (says what happened)

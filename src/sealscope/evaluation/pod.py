@@ -121,9 +121,10 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
 
 
 def _is_separated(n: Array, k: Array) -> bool:
-    """Return True if hits and misses overlap in at most one size, so that the likelihood has no finite maximum.
+    """Return True if all leaks above one size are hits and all below it are misses, or the reverse.
 
-    `n` and `k` (m,) are trials and hits at rising sizes.
+    At this size there may be both. The likelihood of the logistic curve then has no finite maximum. `n` and `k` (m,)
+    are trials and hits at rising sizes.
     """
     hit_fraction = k / n
     n_mixed_sizes = np.count_nonzero((hit_fraction > 0.0) & (hit_fraction < 1.0))

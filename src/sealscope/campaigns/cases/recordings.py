@@ -31,7 +31,7 @@ ProgressCallback = Callable[[int, int, int], None]
 
 
 def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
-    """Yield each file of a plan of recordings, with the set to which it belongs.
+    """Yield each file of a plan of recordings, with the entry of the plan (a set of recordings) to which it belongs.
 
     `folder`: folder in which the files are searched. Raises InputError if a set has no files.
     """

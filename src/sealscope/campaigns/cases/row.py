@@ -69,7 +69,7 @@ def expected_cause(fault: str) -> str:
 
 
 def duty_label(levels: Mapping[str, str | float]) -> str:
-    """Format the duty of a record: its command and its direction of stroke, if `levels` has them.
+    """Format the duty of a record, i.e. its command and its direction of stroke, as far as `levels` has them.
 
     Scores are compared with a threshold from records of the same duty only.
     """

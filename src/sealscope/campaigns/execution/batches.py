@@ -45,9 +45,9 @@ N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the samples of the two parts of a record, before and after the onset, that scorers compare.
+    """Compute the ranges of samples before and after the onset of the leak that scorers compare.
 
-    Returns an array (2, 2) with [begin, end) of each part.
+    A scorer computes a score from wavelet details. Returns an array (2, 2) with [begin, end) of each range.
     """
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))

@@ -80,9 +80,10 @@ class Alarms:
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
         """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        Records with other faults are left out. Two reference detectors, which always or never raise an alarm, come
-        last. `hours`: operating time of a record, None to omit false alarms per hour. If there are no records with a
-        leak, each detector has one result of size 0, with alarms in 0 of 0 records.
+        The size is the planned mean flow, in the unit of the plan. Records with other faults are left out. Two
+        reference detectors, which always or never raise an alarm, come last. `hours`: operating time of a record, None
+        to omit false alarms per hour. If there are no records with a leak, each detector has one result of size 0, with
+        alarms in 0 of 0 records.
         """
         for name, records in drop_other_faults(self._with_references()).items():
             leak_free = [record for record in records if not record.size]
@@ -121,9 +122,10 @@ class Alarms:
     def by_family(self) -> Iterator[AlarmFractions]:
         """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-        The results of all families together come first. A size that occurs with several laws also has a result for
-        all of them together. Records with faults other than a leak are left out. If the records have no families,
-        nothing is yielded.
+        A family is a group of machines that a plan's profile defines; the size of a leak is its planned mean flow, its
+        law the relation of flow and pressure. The results of all families together come first. A size that occurs with
+        several laws also has a result for all of them together. Records with faults other than a leak are left out. If
+        the records have no families, nothing is yielded.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)

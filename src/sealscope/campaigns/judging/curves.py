@@ -14,7 +14,7 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 
 @dataclass(frozen=True)
 class DetectorPod:
-    """One detector's probability of detection (POD) over the size of the leak.
+    """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
     `sizes`: detections at each size; `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted;
     `why`: reason why there is no curve. `proven`: smallest size from which on counted detections alone prove a
@@ -50,8 +50,8 @@ class SizeRoc:
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield each detector's probability of detection over the size of the leak.
 
-    A detector without a record that has a leak is left out. `verdicts`: by detector, its verdict on each record;
-    `confidence`: of the intervals.
+    The size is the planned mean flow, in the unit of the plan. A detector without a record that has a leak is left out.
+    `verdicts`: by detector, its verdict on each record; `confidence`: of the intervals.
     """
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
@@ -68,10 +68,10 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 
 
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
-    """Yield ROC curves of each detector that has scores: for all sizes of leak together, and for each size.
+    """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
     A record without a score counts as lower than all others. A curve needs two records with a leak and two without.
-    `confidence`: that of their intervals.
+    `confidence`: that of the curves' intervals.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -112,9 +112,9 @@ def judge(
 
 
 def _achieved_flows(rows: Sequence[CaseRow]) -> dict[float, tuple[float, float]]:
-    """Compute the mean and the standard deviation of the simulated leak flows [L/min], by planned size of the leak.
+    """Compute mean and standard deviation of the simulated leak flows [L/min], by the flow that was planned [L/min].
 
-    The standard deviation is nan for a single record. Sizes without a simulated flow are left out.
+    The standard deviation is nan for a single record. Planned flows without a simulated one are left out.
     """
     achieved = {}
     for size, group in group_by((row for row in rows if row.leak_lpm > 0), lambda row: row.leak_lpm).items():

@@ -20,8 +20,8 @@ from sealscope.evaluation.table import CANNOT_TELL, Confusion, confusion_matrix
 class StatedErrors:
     """Errors (estimate minus true value) of one detector's estimates on the records with one size of leak.
 
-    `leak_lpm`: size of the leak, 0 for leak-free records; `errors`: those of estimated onsets [s], over the records
-    with an alarm, or those of estimated leak flows [L/min], over all records.
+    `leak_lpm`: size of the leak, i.e. its planned mean flow [L/min], 0 for leak-free records; `errors`: those of
+    estimated onsets [s], over the records with an alarm, or those of estimated leak flows [L/min], over all records.
     """
 
     detector: str
@@ -43,7 +43,7 @@ class NamedCauses:
 
 
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the estimated onsets for each detector and size of leak.
+    """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
     Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `onset_s` [s]: true onset
     of all leaks. `confidence`: that of the errors' intervals.
@@ -62,7 +62,7 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the estimated leak flows [L/min] for each detector and size of leak.
+    """Yield the errors of the estimated leak flows [L/min] for each detector and each planned mean flow.
 
     Detectors that estimate no flow are skipped. `confidence`: that of the errors' intervals.
     """
@@ -82,10 +82,10 @@ def _iter_errors(
     stated: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of one detector's estimates at one size of leak, or nothing if all estimates are missing.
+    """Yield the errors of one detector's estimates on the records of one planned mean flow `leak_lpm` [L/min].
 
-    `stated`: for each record (estimate, true value, interval), with None for a missing estimate or interval.
-    `confidence`: that of the errors' intervals.
+    `stated`: for each record (estimate, true value, interval), with None for a missing estimate or interval. Nothing is
+    yielded if all estimates are missing. `confidence`: that of the errors' intervals.
     """
     estimates = [math.nan if value is None else value for value, _, _ in stated]
     if np.isfinite(estimates).any():

@@ -29,12 +29,12 @@ class JudgedRow(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Planned size of the true leak in the unit of the plan, 0 for none."""
+        """Planned mean flow of the true leak in the unit of the plan, 0 for none."""
         return self.row.leak_lpm
 
     @property
     def flow_lpm(self) -> float:
-        """Simulated mean flow [L/min] of the true leak, or its planned size if there is no simulated one."""
+        """Simulated mean flow [L/min] of the true leak while open, or the planned one if it was not simulated."""
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property

@@ -213,7 +213,7 @@ class SimulatedPlan(_JudgedPlan):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingSet(_TomlTable):
-    """A set of recordings with the same size of leak.
+    """A set of recordings with a leak of the same size, such as the same mean flow.
 
     `files`: pattern of their file names; the files are ordered by the numbers in their names, and only those from
     number `first` to `end` - 1, counted from 1, belong to the set. `use`: `calibrate` for healthy recordings from

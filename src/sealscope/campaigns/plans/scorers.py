@@ -91,7 +91,7 @@ class SplitRms:
         return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
 
     def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return the change of a wavelet detail's log RMS at the split of the record, or its level over both parts.
+        """Return the change of a wavelet detail's log RMS from the first to the second part, or its value over both.
 
         `chamber`: "p_A" or "p_B"; `quantity`: "d1" to "d4" or "d3d4"; `statistic`: "change" or "level". Returns None
         if the chamber is missing or the number is not finite.

@@ -148,11 +148,11 @@ def _check_sums(summary: Any) -> Any:
 
 
 def _check_levels(summary: Any) -> Any:
-    """Return the summary of a recording's ringing if its `levels` and `duty` are valid; raise ValueError otherwise.
+    """Return a recording's summary of wavelet details if its `levels` and `duty` are valid; else raise ValueError.
 
-    `levels` describe the pressures' wavelet details, `duty` how the machine is moved and loaded (`RmsBlocks`). The
-    length of `levels` must match the number of chambers, and that of `duty` the number of its quantities. Their numbers
-    are logarithms and must be below 750 in magnitude.
+    `levels` are logarithms of the RMS of the pressures' wavelet details, `duty` describes how the machine is moved and
+    loaded (`RmsBlocks`). The length of `levels` must match the number of chambers, and that of `duty` the number of its
+    quantities. Their numbers are logarithms and must be below 750 in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):

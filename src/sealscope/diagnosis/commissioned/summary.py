@@ -140,7 +140,10 @@ class MachineSummary:
 
 
 def _describe_rig(rig: Rig | None) -> str:
-    """Describe the stated sizes of the machine in one line; None stands for a machine of unknown sizes."""
+    """Describe in one line what is stated of the machine: its rig, or else piston areas and pump displacement.
+
+    `rig`: None stands for a machine of which nothing is stated.
+    """
     rig = rig or unstated_rig()
     if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
         return rig.title or rig.name

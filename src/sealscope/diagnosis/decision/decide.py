@@ -98,7 +98,7 @@ def _evidence_without_leak(case: Case) -> Evidence:
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
-    """Make the verdict `leak`, with cause, onset and size of the leak.
+    """Make the verdict `leak`, with cause, onset and flow of the leak.
 
     `alarm`: test that detected the leak.
     """
@@ -136,11 +136,11 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 
 
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Compute the fields of `Evidence` that state a leak's size, by their names.
+    """Compute the fields of `Evidence` that state how large a leak is, by their names.
 
-    `flow`: mean flow of the leak, None if unknown (no fields); `leak`: measured leakage, which converts it. The size is
-    a fraction of the pump's mean flow (`relative`) and, if the sizes of the machine are stated, a flow in L/min with a
-    95 % interval; otherwise the field `refuses` says that L/min are not stated.
+    `flow`: mean flow of the leak, None if unknown (no fields); `leak`: measured leakage, whose factors convert it. The
+    flow is stated as a fraction of the pump's mean flow (`relative`) and, if the machine's areas or displacement are
+    stated, in L/min with a 95 % interval; otherwise the field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}

@@ -31,9 +31,9 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if the probability of the event depends on the sizes of its changes, through a prior on them.
+        """True if large or small changes by the event are less probable than usual ones, by a prior on their sizes.
 
-        It does so for events that a verdict may name, i.e. that have a cause. The prior is in `Observable.advantage`.
+        This is so for events that a verdict may name, i.e. that have a cause. The prior is in `Observable.advantage`.
         """
         return self.cause is not None
 

@@ -112,7 +112,11 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe in words a change of the pressures' ringing, and the probability that a leak caused it."""
+    """Describe in words a change of the pressures' ringing, and the probability that a leak caused it.
+
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. `ringing`: precision
+    with which it was compared.
+    """
     rarest = case.rarest_observable
     percent = 100.0 * abs(np.expm1(rarest.size))
     where = _onset_text(rarest) or _against_text(ringing)
@@ -121,7 +125,10 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State the number of healthy recordings that the ringing was compared with; "" if there are none."""
+    """State in words how many healthy recordings the pressures' oscillation (ringing) was compared with.
+
+    "" if there are none.
+    """
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)

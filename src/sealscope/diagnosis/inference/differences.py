@@ -191,7 +191,7 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
 
 
 def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
-    """Compute the penalty on an improbable size of a step: -2 log of its prior density relative to the maximum.
+    """Compute how improbable the size of a step is: -2 log(prior density / largest density).
 
     The prior is normal in log(abs(`step`)) about log(`prior.size`), with the standard deviation `prior.spread`. With
     `above`, only steps larger than `prior.size` are penalised.

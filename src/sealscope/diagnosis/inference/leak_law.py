@@ -200,7 +200,7 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
-    """Average k alternative estimates of a flow, or of another size of a leak, by their weights.
+    """Average k alternative estimates of a leak's flow [m^3/s], or of another quantity, by their weights.
 
     `weights`, `flows` and their standard `deviations`: (k,) each; the sum of the weights need not be 1. The result is
     the mean and the standard deviation of the mixture.

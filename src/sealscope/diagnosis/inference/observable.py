@@ -83,7 +83,10 @@ class Observable:
 
 
 class Flow(NamedTuple):
-    """A leakage flow and its standard error [m^3/s], which excludes the uncertainty of the machine's sizes."""
+    """A leakage flow and its standard error [m^3/s].
+
+    The error excludes that of the piston's area and the pump's displacement, which scale all flows.
+    """
 
     value: float
     deviation: float
@@ -136,7 +139,7 @@ class DatedTest(RiseTest, Protocol):
 
 
 class LeakMeasure(Protocol):
-    """Interface of the leakage that one detector measures in a recording: tests, flows and sizes, but no verdict."""
+    """Interface of the leakage that one detector measures in a recording: tests, flows and factors, but no verdict."""
 
     @property
     def provider(self) -> str:

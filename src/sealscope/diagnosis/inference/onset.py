@@ -164,7 +164,10 @@ class StepTest:
         return Interval(best, min(float(low), best) - half_block, max(float(high), best) + half_block)
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the upper bound of the step's size: its quantile at `probability`, given that the size is > 0."""
+        """Compute the upper bound of the step: the quantile of its size at `probability`, given that the size is > 0.
+
+        The size is in the unit of the coefficient.
+        """
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def share_alarms(self, share: float) -> StepTest:
@@ -175,9 +178,9 @@ class StepTest:
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
-        """Compute the size of a step that is detected with probability `power` at a false-alarm probability `chance`.
+        """Compute the step that is detected with the probability `power`, at a false-alarm probability `chance`.
 
-        The size is in the unit of the coefficient.
+        The result is in the unit of the coefficient.
         """
         from scipy.special import ndtri
 
@@ -196,7 +199,7 @@ class StepTest:
 
 
 def bound_steps(weights: Array, size: Array, deviation: Array, probability: float) -> float:
-    """Compute the upper bound of a step's size: its quantile at `probability`, given that the size is > 0.
+    """Compute the upper bound of a step: the quantile of its size at `probability`, given that the size is > 0.
 
     `weights`, `size`, `deviation` (k,): for each of k onsets its probability, and the size of the step there with its
     standard error.
@@ -380,7 +383,7 @@ def step_sizes(information: Information, onsets: NDArray[np.intp], shape: Array,
 
 
 class _StepFits(NamedTuple):
-    """Least-squares fits of a step up to whitened readings z (n,), for each of o onsets and w random walks.
+    """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w random walks.
 
     The walks have the variances `WALKS`. `weight` (w, n): variance of the noise over that of each z; `total` (w,):
     weighted sum of squares of z; `moments` and `energies` (w, o): weighted products of the steps with z and with
@@ -394,7 +397,7 @@ class _StepFits(NamedTuple):
     residual_squares: Array
 
     def upside_down(self) -> _StepFits:
-        """Return the fits of a step down instead of a step up, i.e. those to the readings -z."""
+        """Return the fits of a step down instead of a step up, i.e. those to the values -z."""
         return self._replace(
             moments=-self.moments, residual_squares=_residual_squares(self.total, -self.moments, self.energies)
         )
@@ -403,9 +406,8 @@ class _StepFits(NamedTuple):
 def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit a step up by least squares at each of o onsets, for each variance of the random walk in `WALKS`.
 
-    `z` (n,): whitened readings of the coefficient; `steps` (n, o): unit steps, whitened in the same way; `eigen`
-    (n,): eigenvalues of the walk's covariance (`_Whitened`). Only steps up count: a step down does not reduce the
-    residual.
+    `z` (n,): whitened values of the coefficient; `steps` (n, o): unit steps, whitened in the same way; `eigen` (n,):
+    eigenvalues of the walk's covariance (`_Whitened`). Only steps up count: a step down does not reduce the residual.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -417,13 +419,15 @@ def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
     """Compute the residual sum of squares after the fit of a step up, for w random walks and o onsets, shape (w, o).
 
     `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
-    readings and with themselves.
+    whitened values and with themselves.
     """
     return np.asarray(np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, 1e-12 * total[:, None]))
 
 
 class _Whitened(NamedTuple):
-    """Readings z (n,) of a coefficient with unit noise, without level and slope, along the eigenvectors of the walk.
+    """Whitened values z (n,) of a coefficient, i.e. with independent noise of variance 1, without level and slope.
+
+    They are along the eigenvectors of the random walk's covariance.
 
     `transform` (n, K): matrix from the coefficient in K blocks to z; `eigen` (n,): eigenvalues of the random walk's
     covariance, times the scale `unit`; `positions` (o,): possible onsets, counted in blocks; `onsets` (o,): their
@@ -465,7 +469,7 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 
 
 class _Whitening(NamedTuple):
-    """Matrices that whiten the readings of a coefficient in K blocks; they depend on the precision only.
+    """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`); they depend on the precision only.
 
     `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their
     eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 if a prior on the
@@ -503,7 +507,7 @@ class _Whitening(NamedTuple):
 
 
 def _whiten_blocks(information: Information) -> _Whitened | None:
-    """Transform the readings of a coefficient in blocks to independent ones (whitening), without its level and slope.
+    """Transform the estimates of a coefficient in blocks to independent values of variance 1, without level and slope.
 
     Return None if too few blocks have information, or if the precision is not finite.
     """
@@ -519,7 +523,7 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
 
 @lru_cache(maxsize=16)
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the matrices that whiten `count` blocks with independent readings of unit variance; None if too few.
+    """Build the matrices that whiten `count` blocks with independent estimates of variance 1; None if too few.
 
     `slope`, `walk`: scales of the priors, as in `Information`. The result is cached, since many tests share it.
     """
@@ -596,9 +600,9 @@ def _onset_times(time: Array, positions: Array) -> Array:
 
 
 def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTest:
-    """Test the readings of a coefficient for a step up at any of o onsets, by the likelihood ratio to no step.
+    """Test whitened values of a coefficient for a step up at any of o onsets, by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps; `fits`: their fits to the readings z, or to -z to test for a step down. Both
+    `steps` (n, o): whitened unit steps; `fits`: their fits to the values z, or to -z to test for a step down. Both
     likelihoods are maximised over the variances of walk and noise, with the prior on the walk.
     """
     n, walk_log_priors, unit = len(whitened.z), whitened.walk_log_priors, whitened.unit

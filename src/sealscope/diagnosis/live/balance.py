@@ -205,7 +205,7 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Test whether a rig states the sizes that are needed to give a leak in L/min."""
+        """Test whether a rig states the piston areas or the pump displacement that L/min need."""
         return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
@@ -394,7 +394,7 @@ def _split(blocks: Blocks) -> list[Blocks]:
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of flows that is due to the uncertain sizes of the machine."""
+    """Return the relative standard error of flows that is due to the uncertain piston area or pump displacement."""
     return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 

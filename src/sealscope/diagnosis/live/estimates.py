@@ -223,10 +223,10 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether a duty lies between the limits `low` and `high`, extended by a margin.
+    """Test whether the pressure difference and the pump flow of a block are in a known range, extended by a margin.
 
-    A duty consists of the logarithms of the mean pressure difference [Pa] and of the mean pump flow [m^3/s]. The margin
-    towards low pressures is larger, because a leak lowers the pressure difference.
+    A duty is the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]; `low` and `high` limit the
+    range. The margin towards low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
     min_duty = (low[0] - LIVE.watch.damped, low[1] - margin)

@@ -97,7 +97,10 @@ class LiveLeak:
 
     @property
     def step(self) -> LiveRise | None:
-        """Test for a step within the stream; None if the increase was found by the test of the level."""
+        """Test for a step (sudden lasting change) within the stream.
+
+        None if the increase was found by comparison with the healthy machine's mean instead.
+        """
         return self.test if self.test.test == STEP else None
 
     @property

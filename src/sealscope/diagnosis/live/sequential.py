@@ -205,7 +205,7 @@ class StepDetector:
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate the onset and the size of a rise of the coefficient.
+        """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
         Both are averages over the random walks, the onsets and the prior sizes, weighted by their probabilities.
         """

@@ -502,7 +502,7 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows of the last block's estimate by means over more blocks, to cover whole duty cycles.
+        """Replace the flows in the last block's estimate by means over more blocks, which cover whole machine cycles.
 
         The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
         """

@@ -27,7 +27,7 @@ class ResponseBlocks(PriorTable):
 
 
 class MachineScale(PriorTable):
-    """Uncertainty of the rig's sizes, as relative standard deviations.
+    """Uncertainty of the rig's mass and area, as relative standard deviations.
 
     - `mass`: moving mass.
     - `area`: piston area.

@@ -4,7 +4,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class LevelDeviation(PriorTable):
-    """Scatter of the leakage level between recordings of one machine.
+    """Scatter between recordings of one machine of its leakage level, a conductance or the log RMS of details.
 
     - `volume_balance`: standard deviation over the usual level, for the volume balance.
     - `ringing`: standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing).
@@ -23,7 +23,7 @@ class LevelDeviation(PriorTable):
 
 
 class LevelError(PriorTable):
-    """Errors of the leakage level of a single recording.
+    """Errors of the leakage level (conductance or log RMS of wavelet details) of a single recording.
 
     - `ringing`: standard error of the logarithm of the RMS of the pressures' wavelet details (their ringing).
     - `scale`: largest relative difference of the ratio of displacement to area between recordings that are compared.

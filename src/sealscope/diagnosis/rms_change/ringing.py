@@ -79,7 +79,9 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
 def estimate_rises(
     log_rms: Array, duty: Array, healthy: Array, healthy_duty: Array, times: Array | None = None
 ) -> tuple[list[Rise], Array]:
-    """Estimate the change g of the ringing's amplitude relative to n leak-free recordings, corrected for the duty.
+    """Estimate the change g of the log RMS of wavelet details (ringing) relative to n leak-free recordings.
+
+    The effect of the duty, i.e. how the machine is moved and loaded, is corrected.
 
     `log_rms` (5 per chamber,) and `duty` (4,) are those of the judged recording, `healthy` (n, 5 per chamber) and
     `healthy_duty` (n, 4) those of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free

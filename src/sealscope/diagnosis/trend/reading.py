@@ -175,9 +175,9 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
 
 
 def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
-    """Collect the level, its error and other fields of `LeakReading` from a solved volume balance, by their names.
+    """Collect the leakage conductance, its error and other fields of `LeakReading` from a solved volume balance.
 
-    `machine`: assumed sizes, of which only the piston area is taken.
+    Returns them by name. `machine`: assumed sizes, of which only the piston area is taken.
     """
     size, total = solution.size, solution.conductance
     return {
@@ -195,7 +195,7 @@ def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[s
 
 
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
-    """Make the prior on the standard deviation of a leakage level between recordings of one machine.
+    """Make the prior on the standard deviation of the leakage level (`LeakReading.level`) between recordings.
 
     `basis` is the method by which the levels were estimated, and `usual` the typical level. For the volume balance,
     the standard deviation is proportional to it.
@@ -272,10 +272,10 @@ def build_timeline(
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort leakage readings by time.
+    """Sort estimates of the leakage in single recordings by time.
 
     If `every` [s] is given, they are dated at equal intervals in the order of their file names. Raises InputError if
-    the time of a reading is unknown.
+    the time of one is unknown.
     """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
@@ -333,7 +333,7 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
 
 
 def _join_files(readings: Iterable[LeakReading]) -> str:
-    """Join the file names of readings to a text for messages, which contains at most three names."""
+    """Join the file names of recordings to a text for messages, which contains at most three names."""
     return join_names((reading.file for reading in readings), 3)
 
 

@@ -392,7 +392,7 @@ def _count_healthy(trend: Trend) -> int:
 
 
 class _ConvertedLevels(NamedTuple):
-    """Leakage levels in the trend's unit, and the factor by which a reading's level was multiplied."""
+    """Leakage of each recording in the trend's unit, and the factor from `LeakReading.level` to this unit."""
 
     levels: Levels
     trend_units_per_level: float

@@ -175,7 +175,7 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Compute the present leakage [L/min], with an interval that includes the error of the machine's sizes.
+    """Compute the present leakage [L/min], with an interval that includes the error of area and displacement.
 
     `total`: leakage with the 95 % interval of its estimate [L/min]; `size_deviation`: relative standard error due to
     these sizes (displacement, area), which scale all flows; `pressure`: pressure difference at which the flow is stated

@@ -56,7 +56,7 @@ _MAX_FREEDOM = 20
 
 
 class ScatterPrior(NamedTuple):
-    """Prior on the standard deviation of the leakage level between recordings.
+    """Prior on the standard deviation of a machine's leakage between recordings, in the unit of the levels.
 
     It is a scaled inverse chi-square distribution. `scale` is the typical standard deviation, and `freedom` the
     degrees of freedom.
@@ -75,7 +75,7 @@ class Levels:
     t : ndarray, shape (n,)
         Times [days].
     value : ndarray, shape (n,)
-        The levels.
+        Leakage in each recording, in any unit that is common to all.
     error : ndarray, shape (n,)
         Standard error that each recording states for its level.
     group : ndarray, shape (n,)
@@ -145,12 +145,12 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute the part of each leakage level that is ignored as an outlier.
+    """Compute how far each leakage level is beyond the limit of outliers; this excess is ignored.
 
-    This excess is the signed distance of a level from the median of the up to three levels before it, less `outlier`
+    The excess is the signed distance of a level from the median of the up to three levels before it, less `outlier`
     standard deviations (`priors.toml`). It is 0 if the level before lies as far out on the same side. Returns two
-    variants, each (n,). The first treats each level as the latest one. The second is also 0 for the last level, and
-    for a level whose successor lies as far out on the same side.
+    variants, each (n,). The first treats each level as the latest one. The second is also 0 for the last level, and for
+    a level whose successor lies as far out on the same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):

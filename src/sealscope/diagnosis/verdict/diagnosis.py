@@ -117,7 +117,7 @@ class Diagnosis(Evidence):
 
     @property
     def severity(self) -> Severity | None:
-        """Severity of the leak; None if there is no leak or its size is unknown."""
+        """Severity of the leak relative to the repair limit; None if there is no leak or its flow is unknown."""
         return severity(self, self.limit)
 
     @property

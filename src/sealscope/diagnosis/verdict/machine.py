@@ -59,7 +59,7 @@ class AssumedMachine:
         return self.area_stated and self.displacement_stated
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the assumed sizes of the machine, and their sources, as plain values for JSON."""
+        """Return the assumed areas and displacement of the machine, and who stated them, as plain values for JSON."""
         return {
             "name": self.rig,
             "stated_by": self.stated_by,
@@ -73,7 +73,7 @@ class AssumedMachine:
 
 
 def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) -> tuple[Rig, AssumedMachine]:
-    """Choose the rig that detectors assume for a recording, and summarise which of its sizes are stated.
+    """Choose the rig that detectors assume for a recording, and tell if its areas and displacement are stated.
 
     If `rig` is None, the thesis's rig is used. It counts as stated if the recording's provenance names a rig of the
     same areas and displacement; otherwise all its values are marked as assumptions (`Rig.states`). Raises InputError

@@ -115,7 +115,7 @@ def _central_difference(values: Array, half_length: int) -> Array:
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate the level of each chamber pressure in blocks, and half its difference between directions of motion.
+    """Estimate in blocks the mean of each chamber pressure over both directions of motion, and half the difference.
 
     The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
     half difference are free in each block; the slopes b, c and d on speed, acceleration and position are common to
@@ -165,7 +165,7 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit the level of p_A and p_B, and half its difference between directions of motion, in each of K blocks.
+    """Fit the mean of p_A and p_B over both directions of motion, and half their difference, in each of K blocks.
 
     The result (K, 4) contains level_A, level_B, half_A and half_B [Pa]. It is None if a block has too few samples of
     one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`: samples in a block;
@@ -188,7 +188,7 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test the pressure levels of a recording for a step in each of several patterns, the most likely pattern first.
+    """Test the mean pressures in both directions of motion for a step in several patterns, the most likely first.
 
     A pattern is the combination of levels that one cause changes, such as friction or a sensor's offset. The result
     is empty if the levels cannot be estimated.

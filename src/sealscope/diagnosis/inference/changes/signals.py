@@ -22,9 +22,9 @@ SIGNALS = "signals"
 
 
 def observe_signals(recording: Recording) -> Observed:
-    """Test duty, sensors and pressure levels of a recording for steps that a leak does not cause.
+    """Test duty, sensors and mean pressures of a recording for sudden lasting changes that a leak does not cause.
 
-    The report is computed only once for a recording.
+    The duty is how the machine is moved and loaded. The report is computed only once for a recording.
     """
     return compute_once(recording, (SIGNALS,), _test_signals)
 

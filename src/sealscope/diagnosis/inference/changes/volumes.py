@@ -87,7 +87,7 @@ def volume_observables(
 
 
 def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, volume_ratio: float) -> float:
-    """Compute -2 log of the prior density of a step's size, relative to its maximum, for the term `name`.
+    """Compute how improbable the size of a step of the term `name` is: -2 log(prior density / largest density).
 
     `size`: size of the step, in the unit of the coefficient; `volume_ratio`: measured over assumed ratio of area to
     displacement. The result is 0 for a term without a prior on the size.
@@ -104,7 +104,11 @@ def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, vo
 
 
 class _Hypothesis(NamedTuple):
-    """A step of one coefficient, up or down by `signs`; `shape` (K,): its size in each block, None if constant."""
+    """A step (sudden lasting change) of one coefficient of the volume balance, to be tested.
+
+    `name`: name of the observable; `signs`: 1 to test for a step up, -1 for a step down; `coefficient`: likelihood of
+    the coefficient in K blocks; `shape` (K,): change of the coefficient in each block by a unit step, None for 1.
+    """
 
     name: str
     signs: Sequence[float]

@@ -35,7 +35,10 @@ def conductance_scale_error() -> float:
 
 
 def states_flow(rig: Rig) -> bool:
-    """Return True if the rig's file states the sizes that are needed to convert a conductance to L/min."""
+    """Return True if the rig's file states the piston areas and the moving mass.
+
+    They are needed to convert a conductance fitted to the pressures to a flow in L/min.
+    """
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
@@ -154,10 +157,7 @@ class ResponseLeak:
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow [m^3/s] to L/min; None if the rig's file does not state mass, areas and others.
-
-        The sizes are those that `states_flow` lists.
-        """
+        """Factor from a flow [m^3/s] to L/min; None if the rig's file does not state piston areas and moving mass."""
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
