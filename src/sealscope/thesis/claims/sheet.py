@@ -83,7 +83,12 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that a rule's rate is within one percentage point of a printed rate, and higher than by chance."""
+        """Test that a rule's success rate is within one point of a printed one, and higher than by chance.
+
+        Yields one finding with two results. The printed rates are the thesis's [%]; the success rate is the fraction of
+        the tests in which the rule detects the leak. Chance: the rate is tested against `chance`, at a p-value below
+        0.005.
+        """
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
         as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
