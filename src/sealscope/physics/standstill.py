@@ -54,7 +54,9 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
 @law
 def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
-    """Set the zero state `y` (14,) to standstill of a pump-controlled rig; return 0, or a code if this is impossible.
+    """Set the state `y` (14,) to standstill of a pump-controlled rig; return 0, or a code if this is impossible.
+
+    All elements of `y` are 0 before the call.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
     (4.5). The integral of the speed controller that gives this current is R_c i/K_i, eq. (4.3), or 0 if K_i = 0.
@@ -139,7 +141,9 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 
 
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
-    """Fill the zero state `y` (14,) with the equilibrium of a rig whose servo valve is centred, and return it.
+    """Set the state `y` (14,) to the equilibrium of a rig whose servo valve is centred, and return it.
+
+    All elements of `y` are 0 before the call.
 
     `x` [m]: position of the piston; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the
     force, or if the drive cannot hold the supply.

@@ -225,7 +225,7 @@ def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[A
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
     def reconstruct_level(index: int) -> Array:
-        """Compute the part of the signal that comes from one level, (n,).
+        """Compute the part of the signal that comes from one level of the wavelet transform, (n,).
 
         The transform is inverted with all coefficients set to zero except those at `index` of the list.
         """

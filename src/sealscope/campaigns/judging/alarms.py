@@ -98,10 +98,10 @@ class Alarms:
                 yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
     def by_cell(self) -> Iterator[AlarmFractions]:
-        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels.
+        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' values.
 
-        A factor is a condition that a plan varies, such as the load; its levels are the values that occur. Records with
-        faults other than a leak are left out.
+        The size of a leak is its planned mean flow. A factor is a condition that a plan varies, such as the load; the
+        values that occur are called its levels. Records with faults other than a leak are left out.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))

@@ -56,10 +56,11 @@ def compute_thresholds(
 ) -> Thresholds:
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free rows.
 
-    The duty of a row is its command and stroke direction (`duty_label`). A row without a score cannot raise an alarm,
-    so it counts as the lowest score. `false_alarm`: wanted false-alarm probability. With the `promise` "average" it
-    is kept on average over sets of leak-free rows, with "bound" with the probability `confidence`. Returns thresholds
-    by (detector, duty). Raises InputError if no duty has enough rows for `false_alarm`.
+    The duty of a row is its command and stroke direction (`duty_label`). A row without a score (a record that could not
+    be scored) cannot raise an alarm, so it counts as the lowest score. `false_alarm`: wanted false-alarm probability.
+    With the `promise` "average" it is kept on average over sets of leak-free rows, with "bound" with the probability
+    `confidence`. Returns thresholds by (detector, duty). Raises InputError if no duty has enough rows for
+    `false_alarm`.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}

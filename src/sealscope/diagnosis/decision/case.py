@@ -86,7 +86,11 @@ class Case:
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
-        """Sets of events that explain the results of the tests, with their probabilities, the most probable first."""
+        """Sets of events that explain the test results of the recording, each with its posterior probability.
+
+        The most probable set comes first. An event is a change of the machine, its sensors or its motion, such as a
+        leak.
+        """
         return explain(self.observables, self.null.chance, None if self.leak is None else self.leak.step_rise)
 
     def leak_probability(self, alarm: LeakTest) -> float:
@@ -127,7 +131,7 @@ class Case:
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests that raise an alarm, i.e. whose chance is below their allowed false-alarm probability.
+        """Tests that raise an alarm, i.e. whose p-value is below their allowed false-alarm probability.
 
         The test for a leak that began within the recording comes first, unless the leak seems older than the
         recording.

@@ -64,7 +64,7 @@ def _thread_pools(n_modules: int) -> Any:
 
 
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
-    """Test a recording for changes of duty, noise, mains hum and pressure levels, which may be mistaken for a leak.
+    """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
     The duty is how the machine is moved and loaded. The changes are tested within the recording and, if `baseline` is
     not empty, against its healthy recordings. `distrust` is the reason why the pressures cannot be judged, in which
@@ -198,8 +198,8 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
     """Compare the ringing of each healthy recording with that of all others; yield the tests (observables) of each.
 
-    The ringing is the RMS of the pressures' wavelet details. Nothing is yielded for fewer than three recordings of the
-    same chambers and sampling rate.
+    The ringing is an oscillation of the pressures, measured by the RMS of their wavelet details. Nothing is yielded for
+    fewer than three recordings of the same chambers and sampling rate.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]

@@ -208,14 +208,15 @@ class LeakMeasure(Protocol):
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from this detector's flows, computed with assumed sizes [m^3/s], to the machine's flows [L/min].
+        """Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min].
 
-        The sizes are the piston's area and the pump's displacement. None if neither is stated.
+        A detector assumes what the rig's file does not state, such as the piston's area or the pump's displacement.
+        None if the true flows cannot be known without it.
         """
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's sizes (displacement, piston area), which scale all flows."""
+        """Relative standard deviation of the pump's displacement or the piston's area, whichever scales all flows."""
 
     @property
     def ratio(self) -> Interval | None:
@@ -226,7 +227,7 @@ class LeakMeasure(Protocol):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks for the reader of the verdict, on stated sizes, offsets of the sensors and delays of channels."""
+        """Remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of channels."""
 
     def relative(self, flow: Flow) -> RelativeLeak | None:
         """Convert a leak's flow [m^3/s] to a fraction of the pump's flow and a creep speed [m/s] of the piston.

@@ -4,12 +4,12 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class NullPriors(PriorTable):
-    """Prior on the error of the chances that a detector states for the scores of healthy recordings.
+    """Prior on the error of the p-values that a detector states for the scores of healthy recordings.
 
-    A surprisal is -log(chance), with a mean of 1 if the chances are right. If they are not, its mean is larger by a
+    A surprisal is -log(p-value), with a mean of 1 if the p-values are right. If they are not, its mean is larger by a
     factor.
 
-    - `fails`: fraction of machines on which the chances of a statistic are wrong.
+    - `fails`: fraction of machines on which the p-values of a statistic are wrong.
     - `inflation`: exponential scale of the logarithm of the factor.
     - `largest`: largest factor.
     """

@@ -40,7 +40,7 @@ class DifferencePriors(DriftPriors):
 
 
 class LevelPriors(PriorTable):
-    """Standard deviations of constant flows in a volume balance, whose mean is zero.
+    """Standard deviations of constant flows in a volume balance; the prior mean of each flow is zero.
 
     - `outside` [m^3/s]: constant leakage to the outside.
     - `gas` [m^3/s]: flow from an accumulator whose gas changes its temperature.

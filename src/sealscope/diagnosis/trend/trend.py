@@ -343,7 +343,7 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Complete a trend by its levels, the periods between repairs and the decision.
+    """Complete a trend by the leakage of each recording, the episodes between repairs, and the decision on a leak.
 
     The trend must have at least one recording that can be compared.
     """

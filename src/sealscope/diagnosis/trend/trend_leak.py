@@ -188,8 +188,8 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing since the last repair, in the form of a detector's observations.
 
-    The ringing is the RMS of their wavelet details. `chance` is the probability of such a decrease in a healthy
-    machine. The ringing gives no upper bound of a leak.
+    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. `chance` is the probability of
+    such a decrease in a healthy machine. The ringing gives no upper bound of a leak.
     """
     size = -wear.leak.value / 100.0  # change of the logarithm, from %
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
@@ -232,8 +232,9 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
     """Test the pressures' ringing of the last recording for a change since the onset of the leak.
 
-    The ringing is the RMS of their wavelet details. It is compared with the recordings before the onset that have the
-    same channels and sampling rate. The result contains no observations if there are none.
+    The ringing is an oscillation, measured by the RMS of the pressures' wavelet details. It is compared with the
+    recordings before the onset that have the same channels and sampling rate. The result contains no observations if
+    there are none.
     """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":

@@ -56,10 +56,10 @@ _MAX_FREEDOM = 20
 
 
 class ScatterPrior(NamedTuple):
-    """Prior on the standard deviation of a machine's leakage between recordings, in the unit of the levels.
+    """Prior on the standard deviation of a healthy machine's leakage level between recordings (`Levels`).
 
-    It is a scaled inverse chi-square distribution. `scale` is the typical standard deviation, and `freedom` the
-    degrees of freedom.
+    It is a scaled inverse chi-square distribution. `scale` is the typical standard deviation, in the unit of the
+    levels, and `freedom` the degrees of freedom.
     """
 
     scale: float
@@ -508,7 +508,9 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
 
 
 def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
-    """Compute the days (d,) until each `level` (d,) reaches the limit if it grows by its `growth` (d,) per month.
+    """Compute the days until each of d leakage levels reaches the limit, shape (d,).
+
+    `level`, `growth` (d,): present level and growth per month, in the unit of the limit.
 
     The result is 0 for a level that has reached the limit, and infinite for one that never will.
     """

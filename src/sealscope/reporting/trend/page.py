@@ -55,11 +55,11 @@ def level_pictures(
     format_day: Callable[[float], str],
     draw: Callable[[Picture], None],
 ) -> dict[str, Picture]:
-    """Draw levels of leakage over time, as a picture for each of the `SIZES`, "wide" and "narrow".
+    """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
-    `days`: times of the first and last recording [d]; `levels`: ends of the axis of levels; `limit`: repair limit,
-    which is drawn if it is on the axis, None for none; `format_day`: function that formats a time [d] on the axis;
-    `draw`: function that draws the recordings into a picture.
+    `days`: times of the first and last recording [d]; `levels`: ends of the axis of leakage, in the unit in which it is
+    drawn; `limit`: repair limit, which is drawn if it is on the axis, None for none; `format_day`: function that
+    formats a time [d] on the axis; `draw`: function that draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5
     first, last = days[0] - margin, days[1] + margin
@@ -113,7 +113,7 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:
-    """Compute the limits (low, high) of the axis of levels, in the trend's unit.
+    """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit.
 
     They include all intervals of recordings and healthy ranges, and zero for levels in L/min. The repair limit is
     included if it is below 2.5 times the largest of these.

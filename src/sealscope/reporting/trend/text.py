@@ -19,7 +19,7 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of the present level in a trend.
+    """Return the label, "total" or "now", of the present leakage level in a trend.
 
     It is "total" for the leakage of pump and piston, and "now" if the level is the damping of the pressures' ringing
     (the RMS of their wavelet details).

@@ -213,7 +213,9 @@ def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> G
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make one item and write its files; return the result to be stored, with the error if an exception was raised.
+    """Make one item (a figure, table or claims) and write its files; return the result to be stored.
+
+    An exception is not raised, but its text is stored as the error of the result.
 
     `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the products as
     files, None to write none; `folder`: folder of the results; `runs`: folder of simulated runs; `job`: the item, the

@@ -41,7 +41,7 @@ class Item:
 
     @property
     def reads_sheet(self) -> bool:
-        """True if the item uses or needs the measured data sheet."""
+        """True if the item uses the measured data sheet, or cannot be made without it."""
         return self.uses_sheet or self.needs_sheet
 
     def figure(
@@ -79,7 +79,10 @@ _FIELDS = {declared.name for declared in fields(Item)}
 
 @cache
 def load_items() -> tuple[Item, ...]:
-    """Read the list of all items from `items.toml`, in its order."""
+    """Read the list of all items from `items.toml`, in the order of the file.
+
+    An item is a figure, a table or the claims of a chapter that can be reproduced.
+    """
     return tuple(
         item for chapter, rows in load_texts("items.toml").items() for name, row in rows.items()
         for item in _iter_row_items(name, int(chapter), row)
@@ -87,7 +90,7 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the items that a row of `items.toml` describes.
+    """Yield the items (figures, tables, claims) that a row of `items.toml` describes.
 
     It is one item, or several if the row's entry `each` names a function that lists them. `name`: the row's key.
     """
@@ -110,7 +113,7 @@ def _import_function(name: str) -> Any:
 
 
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
-    """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
+    """Select items (figures, tables, claims) by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
 
     The selected items keep the order of the list `items`. Raises InputError, with the closest ids, if a pattern
     matches nothing.
@@ -137,7 +140,10 @@ def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, 
 
 
 def add_needed_items(items: Sequence[Item], selected: Iterable[Item]) -> tuple[Item, ...]:
-    """Return the selected items and all items that they need, directly or indirectly, in the order of the list."""
+    """Return the selected items and all items whose products they need, directly or indirectly.
+
+    An item is a figure, a table or the claims of a chapter. The result has the order of the list `items`.
+    """
     by_id, ids = {item.id: item for item in items}, {item.id for item in selected}
     while missing := {needed for name in ids for needed in by_id[name].needs} - ids:
         ids |= missing
