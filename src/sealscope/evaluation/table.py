@@ -72,8 +72,8 @@ def confusion_matrix(
     """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
     `truth` and `verdicts` are the true fault and the verdict of each record. `faults` are the names of all faults,
-    including that for no fault, in the order of rows and columns. Raises InputError for a name that is not in
-    `faults`, or if "cannot tell" is among the faults.
+    including that for no fault, in the order of rows and columns; `confidence` is that of the intervals. Raises
+    InputError for a name that is not in `faults`, or if "cannot tell" is among the faults.
     """
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")

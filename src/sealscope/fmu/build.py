@@ -170,7 +170,10 @@ class MockUp(NamedTuple):
                     archive.write(source, f"sources/{source.relative_to(source_folder).as_posix()}")
 
     def _write_sources(self, folder: Path, version: Version) -> list[Path]:
-        """Write the FMU's sources (C, LLVM code and headers) to a folder; return the paths of the files."""
+        """Write the FMU's sources (C, LLVM code and headers) to a folder; return the paths of the files.
+
+        `version`: version of FMI, 2 or 3.
+        """
         interface = files("sealscope.fmu") / "c"
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
         present = [int(k in value_indices) for k in range(len(self.values))]  # 1: a parameter is a variable of the unit
@@ -187,7 +190,7 @@ class MockUp(NamedTuple):
     def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
         """Compile the FMU's shared library for one platform from the sources in `folder`; return the library's bytes.
 
-        `system`: name in `PLATFORMS`. Raises InputError if the compiler fails.
+        `system`: name in `PLATFORMS`; `version`: version of FMI, 2 or 3. Raises InputError if the compiler fails.
         """
         platform, compiler = PLATFORMS[system], find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]

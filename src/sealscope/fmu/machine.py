@@ -230,7 +230,10 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
 @lru_cache(maxsize=8)
 def rig_code(choice: RigChoice) -> Mapping[str, str]:
-    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name."""
+    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name.
+
+    `choice`: the rig's equations and solver.
+    """
     return unit_code(build_functions(choice))
 
 

@@ -170,7 +170,7 @@ class _Lengths(NamedTuple):
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory.
+    """Build the layout of a soft sensor's memory, as numpy's type of the record.
 
     The memory is a record of doubles with the scalars `_SCALARS` and the following arrays.
 

@@ -22,7 +22,8 @@ _STATED = "stated when this file was written: replace by drawing or data sheet"
 def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[float, float]:
     """Compute the piston areas [m^2] of sides A and B from the diameters of bore and rod [m].
 
-    A single rod is on side B. Raises InputError if the rod is not thinner than the bore.
+    With `double_rod` the rod is on both sides, otherwise on side B only. Raises InputError if the rod is not thinner
+    than the bore.
     """
     if not (math.isfinite(bore) and 0.0 <= rod < bore):
         raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")

@@ -17,7 +17,7 @@ from sealscope.physics.restrictors import orifice_flow
 
 @contracted
 def pump_flow(omega: float, dp: float, q_b: float, G_pump: float) -> float:
-    """Compute the pump's flow into port 1, Q_1 = q_b omega/(2 pi) - G_pump (p_1 - p_2) [m^3/s], eq. (4.1).
+    """Compute the pump's delivery at port 1, Q_1 = q_b omega/(2 pi) - G_pump (p_1 - p_2) [m^3/s], eq. (4.1).
 
     `omega` [rad/s], `dp` = p_1 - p_2 [Pa], displacement `q_b` [m^3/rev]; internal leakage `G_pump` [m^3/(s Pa)] is 0 in
     the thesis.
@@ -67,5 +67,8 @@ def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float,
 
 
 def hydraulic_power(Q_1: Any, dp: Any) -> Any:
-    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump delivers to the oil."""
+    """Compute the hydraulic power Q_1 (p_1 - p_2) [W] that the pump delivers to the oil.
+
+    `Q_1` [m^3/s]: flow out of port 1; `dp` [Pa]: pressure difference p_1 - p_2 of the ports.
+    """
     return Q_1 * dp

@@ -32,9 +32,9 @@ _series_coefficient = law(series_coefficient)
 
 @law
 def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
-    """Compute the flow coefficient of a throttle and a shut-off valve in series in compiled code.
+    """Compute the flow coefficient [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve, in compiled code.
 
-    The formula is that of `series_coefficient`; a fully open valve gives exactly `c`.
+    Formula and arguments are those of `series_coefficient`; a fully open valve gives exactly `c`.
     """
     return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
@@ -118,11 +118,11 @@ def filtered_flow(
 ) -> float:
     """Compute the flow Q [m^3/s] of a throttle and a filter in series at the end of an implicit stage of the solver.
 
-    The equation is d + g Q(d) + dp_f(Q) = total, with d, g and `total` as in `implicit_orifice_flow`. The filter
-    has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass` [m^3/(s Pa)] that opens at the
-    drop `p_bypass` [Pa]. The filter's drop dp_f is R Q while the valve is shut, and follows from Q = dp_f/R +
-    G_bypass (dp_f - p_bypass) while it is open. In both cases dp_f is linear in Q, so that `implicit_orifice_flow`
-    solves the equation.
+    The equation is d + g Q(d) + dp_f(Q) = total, with d, g, `total` and the throttle's coefficients as in
+    `implicit_orifice_flow`. The filter has the resistance `R` [Pa s/m^3], and a bypass valve of conductance `G_bypass`
+    [m^3/(s Pa)] that opens at the drop `p_bypass` [Pa]. The filter's drop dp_f is R Q while the valve is shut, and
+    follows from Q = dp_f/R + G_bypass (dp_f - p_bypass) while it is open. In both cases dp_f is linear in Q, so that
+    `implicit_orifice_flow` solves the equation.
     """
     filter_flow = implicit_orifice_flow(total, g + R, c_forward, c_reverse, dp_0)
     filter_fraction = 1.0 / (1.0 + G_bypass * R)  # of additional flow while the valve is open

@@ -114,7 +114,7 @@ else:  # numba takes a named tuple apart; its fields are those of the models
 
 @law
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
-    """Compute the flow coefficients of the throttles for both directions: (c_A_in, c_A_out, c_B_in, c_B_out).
+    """Compute the flow coefficients of the throttles in lines A and B: (c_A_in, c_A_out, c_B_in, c_B_out).
 
     They are in m^3/(s Pa^0.5), eqs. (4.7)-(4.12); "in" is the flow towards the cylinder. Each throttle is in series
     with a shut-off valve (`series_coefficient`).

@@ -118,18 +118,21 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from x = `begin` to `end` and from y = `low` to `high`; None means the end of the frame."""
+        """Draw a box from x = `begin` to `end` and from y = `low` to `high`; None means the end of the frame.
+
+        `style`: name of the style in the style sheet.
+        """
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)
         self.draw(style, f"M{left:.1f} {top:.1f}H{right:.1f}V{bottom:.1f}H{left:.1f}z")
 
     def mark(self, style: str, x: float) -> None:
-        """Draw a vertical line at `x` over the whole height of the frame."""
+        """Draw a vertical line at `x` over the whole height of the frame; `style`: its name in the style sheet."""
         self.draw(style, f"M{self.x(x):.1f} 0V{self.height:g}")
 
     def level(self, style: str, y: float) -> None:
-        """Draw a horizontal line at `y` over the whole width of the frame."""
+        """Draw a horizontal line at `y` over the whole width of the frame; `style`: its name in the style sheet."""
         self.draw(style, f"M0 {self.y(y):.1f}H{self.width:g}")
 
     def symbol(self, style: str, x: float, down: float, title: str = "") -> None:
@@ -141,7 +144,10 @@ class Picture:
         self.draw(style, f"M{self.x(x):.1f} {down:.1f}{SYMBOLS[style.split(maxsplit=1)[0]]}", title)
 
     def point(self, style: str, x: float, y: float, ends: tuple[float, float], title: str = "") -> None:
-        """Draw a point, and a vertical line over its interval `ends` of y."""
+        """Draw a point at (`x`, `y`), and a vertical line over its interval `ends` of y.
+
+        `style`: name of the point's style in the style sheet; `title`: tooltip, "" for none.
+        """
         self.draw("whisker", f"M{self.x(x):.1f} {self.y(ends[0]):.1f}V{self.y(ends[1]):.1f}")
         self.symbol(style, x, float(self.y(y)), title)
 

@@ -106,7 +106,7 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute the length of the shortest signal that has a sample independent of padding in each level.
+    """Compute the length of the shortest signal [samples] that has a sample independent of padding in each level.
 
     It is 226 for db8 to level 4.
     """

@@ -236,7 +236,7 @@ def run_with_sized_leaks(
     is_first_run = True
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate the leaks with `coefficients` (n,), and measure each leak's mean flow per unit coefficient (n,).
+        """Simulate the leaks with `coefficients` (n,); measure their mean flows [m^3/s] for coefficients of 1 (n,).
 
         Also returns a pair of the leaks with these coefficients and the trajectory.
         """

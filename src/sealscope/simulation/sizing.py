@@ -74,9 +74,10 @@ def size_leaks(
 ) -> tuple[Array, T]:
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
-    `coefficients`: values to start from; they stay for leaks without a stated mean. `measure(coefficients)`
-    simulates the rig and returns each leak's mean flow per unit coefficient (n,), and any other result of the run.
-    Returns the coefficients, and this other result for them.
+    A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: values to
+    start from; they stay for leaks without a stated mean. `measure(coefficients)` simulates the rig and returns each
+    leak's mean flow [m^3/s] for a coefficient of 1 (n,), and any other result of the run. Returns the coefficients, and
+    this other result for them.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less, and its coefficient is found step by step (`next_coefficient`). Raises SimulationFailed

@@ -30,7 +30,7 @@ Scores = Mapping[str, tuple[float | None, float | None]]
 
 @dataclass(frozen=True)
 class Statement:
-    """The statement of a detector on a record: the fields of its evidence that the record's row stores.
+    """The statement of a detector on a record, i.e. the fields of `Evidence` that are stored with the record.
 
     `verdict`: `leak`, `no leak` or `cannot tell`; `score`, `threshold`: the detector's statistic, and the value above
     which it reports a leak; `onset_s` [s]: time at which the leak began; `leak_lpm` [L/min]: flow of the leak;

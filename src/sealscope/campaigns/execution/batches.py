@@ -116,8 +116,8 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
 def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experiment]], threads: int) -> list[CaseRow]:
     """Simulate and score one batch of cases, given with their experiments, and return their rows.
 
-    If the batch fails, each half of it is run alone, and so on. In the end only the cases that fail by themselves
-    have a row with an error.
+    `pairs`: the cases, each with its experiment. If the batch fails, each half of it is run alone, and so on. In the
+    end only the cases that fail by themselves have a row with an error.
     """
     if not pairs:
         return []

@@ -70,8 +70,8 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
-    A record without a score counts as lower than all others. A curve needs two records with a leak and two without.
-    `confidence`: that of the curves' intervals.
+    `verdicts`: by detector, its verdict on each record. A record without a score counts as lower than all others. A
+    curve needs two records with a leak and two without. `confidence`: that of the curves' intervals.
     """
     for name, records in verdicts.items():
         scores = [record.row.score(name) if record.row.error is None else None for record in records]

@@ -45,8 +45,8 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
-    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `onset_s` [s]: true onset
-    of all leaks. `confidence`: that of the errors' intervals.
+    Only records with a leak and an alarm count; detectors that estimate no onset are skipped. `verdicts`: by detector,
+    its verdict on each record; `onset_s` [s]: true onset of all leaks. `confidence`: that of the errors' intervals.
     """
     for name, records in verdicts.items():
         for size, group in group_by(
@@ -64,7 +64,8 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the estimated leak flows [L/min] for each detector and each planned mean flow.
 
-    Detectors that estimate no flow are skipped. `confidence`: that of the errors' intervals.
+    `verdicts`: by detector, its verdict on each record. Detectors that estimate no flow are skipped. `confidence`: that
+    of the errors' intervals.
     """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():
@@ -99,8 +100,9 @@ def _iter_errors(
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
-    Nothing is yielded if no record has a fault other than a leak. A record with both has two true causes and is left
-    out; a record without a result counts as `cannot tell`. `confidence`: that of the fractions' intervals.
+    `verdicts`: by detector, its verdict on each record. Nothing is yielded if no record has a fault other than a leak.
+    A record with both has two true causes and is left out; a record without a result counts as `cannot tell`.
+    `confidence`: that of the fractions' intervals.
     """
     for name, records in verdicts.items():
         single_cause_records = [record for record in records if not (record.size > 0 and record.row.fault)]

@@ -109,7 +109,11 @@ def collect_verdicts(
 
 
 def drop_other_faults(verdicts: Verdicts) -> Verdicts:
-    """Remove the records that have a fault other than a piston leak."""
+    """Remove the records that have a fault other than a piston leak.
+
+    `verdicts`: by detector, its verdict on each record. Records with such a fault are removed even if they also have a
+    leak.
+    """
     return {name: [record for record in records if not record.row.fault] for name, records in verdicts.items()}
 
 

@@ -135,8 +135,8 @@ class Scorer:
     def score(self, split_rms: SplitRms) -> float | None:
         """Compute the score of a record, which is high if there is a leak.
 
-        Returns None if the record is too short, if it lacks a chamber, or if a constant reading makes a logarithm
-        infinite.
+        `split_rms`: log RMS of the wavelet details in the two parts of the record. Returns None if the record is too
+        short, if it lacks a chamber, or if a constant reading makes a logarithm infinite.
         """
         scores = []
         for quantity, chamber, direction in self.parts:

@@ -196,7 +196,8 @@ class CommissionedMachine:
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
         """Return a copy of the machine with one more healthy recording, without testing it for a leak.
 
-        Raises InputError if the recording cannot be used or is a copy of a known one.
+        `file`, `checksum`: name and hash of the log. Raises InputError if the recording cannot be used or is a copy of
+        a known one.
         """
         summarised = summarise_healthy(recording, assumed_rig(self.rig, recording)[0], file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
@@ -306,7 +307,10 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
 
 
 def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
-    """Compute the summaries of a healthy recording as `summarise_healthy` does, by any number of threads."""
+    """Compute the summaries of a healthy recording for `summarise_healthy`, without a limit on the number of threads.
+
+    Arguments and errors are those of `summarise_healthy`.
+    """
     from sealscope.diagnosis.commissioned.summary import describe_recording
 
     inspection = inspect_recording(recording)

@@ -169,7 +169,8 @@ def _display_unit(healthy: Sequence[SummarisedRecording], name: str, unit: str) 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
     """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
 
-    Unknown quantities are left out. The flow is known only if the machine's sizes are stated.
+    Unknown quantities are left out. The flow is known only if it can be stated in L/min, i.e. if displacement or piston
+    areas are stated or a flow meter is recorded. `pressure_unit`: unit in which the difference is displayed.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
@@ -264,10 +265,10 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 
 
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients of a volume balance by least squares, from the products of its columns.
+    """Fit the coefficients of a volume balance by least squares, from the Gram matrix of the columns.
 
-    `gram` (m, m) holds these products, and `roles` tells which column is the left side. `columns` are the indices of
-    the c columns to fit. Returns the coefficients (c,).
+    `gram` (m, m): products of the columns with each other, summed over the rows; `roles`: tells which column is the
+    left side; `columns`: indices of the c columns to fit. Returns the coefficients (c,).
     """
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
@@ -283,7 +284,11 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     from scipy.special import ndtri
 
     def smallest_rise(n_repeats: int) -> float:
-        """Estimate the smallest detectable rise of the conductance, given `n_repeats` times as many healthy days."""
+        """Estimate the smallest detectable rise of the conductance [m^3/(s Pa)], after more days of healthy recordings.
+
+        `n_repeats`: multiple of the present number of healthy days. The rise is detected with the probability `power`
+        of `priors.toml`.
+        """
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 

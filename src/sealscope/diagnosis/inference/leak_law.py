@@ -53,10 +53,10 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
-    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e.
+    """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient.
 
     Its logarithm is interpolated between e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of
-    `EXPONENTS` to an array (K,).
+    `EXPONENTS` to an array (K,) of flows over the coefficient [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}

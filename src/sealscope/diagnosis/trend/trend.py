@@ -392,7 +392,10 @@ def _count_healthy(trend: Trend) -> int:
 
 
 class _ConvertedLevels(NamedTuple):
-    """Leakage of each recording in the trend's unit, and the factor from `LeakReading.level` to this unit."""
+    """Leakage of each recording in the trend's unit, which is L/min or % (`_convert_levels`).
+
+    `trend_units_per_level`: factor from `LeakReading.level` to this unit.
+    """
 
     levels: Levels
     trend_units_per_level: float

@@ -340,6 +340,7 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
+    R [days] is the sum of the likelihood ratios of all possible changes, each times its waiting time (see the module).
     The first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
     `may_grow`, an even growth since the first recording does not count as a change.
     """
@@ -362,8 +363,8 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
 def _draw_normal(random: np.random.Generator, mean: Array, sd: Array, *, positive: bool) -> Array:
     """Draw one number from each of d normal distributions.
 
-    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` they are cut off below 0. Uses
-    the inverse distribution function.
+    `mean` (d,) and `sd` (d,) are their means and standard deviations. With `positive` they are cut off below 0.
+    `random`: source of random numbers. Uses the inverse distribution function.
     """
     from scipy.special import ndtr, ndtri
 

@@ -299,9 +299,9 @@ class MonitorStore:
         return n_before
 
     def end_decoding(self, reader: str, digest: str) -> None:
-        """Delete the record that a message is being decoded (`begin_decoding`), as its reader has finished with it.
+        """Delete the record that a message is being decoded (`begin_decoding`), after the decoding has ended.
 
-        `digest`: hash of the message.
+        `reader`: id of the MQTT client that decoded the message; `digest`: hash of the message.
         """
         columns = tables.decodings.c
         with self._begin_relaxed_transaction() as connection:

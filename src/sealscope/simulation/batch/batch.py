@@ -255,7 +255,8 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
     """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks.
 
-    The search starts from `coefficients`; those of leaks without a stated mean flow stay.
+    The search starts from `coefficients`; those of leaks without a stated mean flow stay. `step` [s]: longest step of
+    the solver if the set states none.
     """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])

@@ -96,12 +96,18 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
 
 
 def motion_scales(motion: Array) -> Array:
-    """Compute the 99 % quantiles (m,) of the magnitudes of speed, acceleration and position of a motion (n, m)."""
+    """Compute the 99 % quantiles (m,) of the magnitudes of the columns of a motion (n, m).
+
+    The columns are speed, acceleration and, if m = 3, position (`motion_columns`), whose units the quantiles have.
+    """
     return np.asarray(np.maximum(np.nanpercentile(np.abs(motion), 99.0, axis=0), _TINY))
 
 
 def top_speed(motion: Array) -> float:
-    """Compute the 99 % quantile of the magnitude of the speed, the first column of a motion (n, m)."""
+    """Compute the 99 % quantile of the magnitude of the speed in a motion (n, m), whose first column it is.
+
+    It has the unit of that column (`motion_columns`).
+    """
     return float(motion_scales(motion[:, :1])[0])
 
 
