@@ -77,7 +77,7 @@ def volume_observables(
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
-            unit_flow = 1.0 if name == OUTSIDE else _mean_increment(recorded, columns[0], name.removesuffix(MADE_UP))
+            unit_flow = 1.0 if name == OUTSIDE else _driving_pressure(recorded, columns[0], name.removesuffix(MADE_UP))
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
@@ -99,7 +99,7 @@ def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, vo
     if name == OUTSIDE:
         return size_penalty(INFERENCE.outside, size, above=True)
     if name.startswith("external leak"):
-        return size_penalty(INFERENCE.outside, size * _mean_increment(blocks, roles, name), above=True)
+        return size_penalty(INFERENCE.outside, size * _driving_pressure(blocks, roles, name), above=True)
     return 0.0
 
 
@@ -167,7 +167,7 @@ def _observable_name(term: Term) -> str:
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
 
 
-def _mean_increment(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
+def _driving_pressure(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
     """Compute the root mean square of the pressure [Pa] that drives the term `name` of a volume balance.
 
     It follows from the sums of squares of the term's column and of the flow offset's. If the balance has no flow
