@@ -37,10 +37,11 @@ from sealscope.units import LITRE_PER_MINUTE
 
 
 class _HoldLaws(NamedTuple):
-    """Leak past the piston as fitted to the holds of a load, under each of k laws with the exponents `EXPONENTS`.
+    """Leak past the piston as fitted to the times in which shut valves hold the load, under k laws of flow.
 
-    All have the shape (k,). `weights`: relative likelihood of each law, with the sum 1; `units`: mean flow for a
-    coefficient of 1; `flows`: fitted mean flows and their standard `deviations` [m^3/s].
+    The exponents of the laws are `EXPONENTS` (1 laminar, 0.5 orifice). All fields have the shape (k,). `weights`:
+    relative likelihood of each law, with the sum 1; `units`: mean flow [m^3/s] for a coefficient of 1; `flows`: fitted
+    mean flows and their standard `deviations` [m^3/s].
     """
 
     weights: Array
@@ -60,7 +61,7 @@ class BalanceLeak:
     balance : RecordedBalance
         Volume balance of the recording.
     healthy : sequence of RecordingSums
-        Sums of the healthy recordings of the machine with the same terms.
+        Summaries of the healthy recordings of the machine whose volume balance has the same terms.
     """
 
     provider: str
@@ -94,8 +95,8 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        It is averaged over the laws, growths and onsets of the leak, and mixed with the flow that holds show. Without
-        a step test it is 0 with an infinite standard error.
+        It is averaged over the laws, growths and onsets of the leak, and mixed with the flow that shows while shut
+        valves hold the load (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -111,31 +112,34 @@ class BalanceLeak:
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
         """Add to a flow's standard error the uncertainty of the leak's law and of averaged pressures.
 
-        The law of the flow lies between laminar flow and an orifice.
+        The law lies between laminar flow and an orifice. The uncertainty is the fraction `size.law` (`priors.toml`) of
+        the flow.
         """
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Amount by which the mean leakage exceeds that of the healthy recordings; None if there are none.
+        """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None if there are none.
 
-        It is measured in holds of the load if these are precise enough, else over the whole recording.
+        It is measured while shut valves hold the load if that is precise enough or shows a leak, else over the whole
+        recording.
         """
         return self._motion_rise if self._hold_rise is None else self._hold_rise
 
     @cached_property
     def _motion_rise(self) -> Rise | None:
-        """Rise of the leakage in the whole recording over the healthy recordings; None if there are none."""
+        """Rise [m^3/(s Pa)] of the leakage in the whole recording over healthy recordings; None if there are none."""
         if not self.healthy:
             return None
         return rise(self.balance.recording_sums, self.healthy, self.balance.columns)
 
     @cached_property
     def _hold_rise(self) -> Rise | None:
-        """Rise of the leakage over healthy recordings, from holds of the load behind shut valves.
+        """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None without such holds, or if it is too imprecise to replace the rise from the whole recording.
+        None without such times (holds), or if it neither is precise enough to replace the rise from the whole recording
+        nor shows a leak.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -149,9 +153,9 @@ class BalanceLeak:
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the leakage above that of healthy recordings, from its onset to the end.
+        """Mean flow [m^3/s] of the leakage above that of healthy recordings, from the onset of the leak to the end.
 
-        Without healthy recordings it is the total leakage.
+        Without healthy recordings it is the mean of the total leakage over the recording.
         """
         balance = self.balance
         if self.rise is None:
@@ -171,9 +175,10 @@ class BalanceLeak:
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 
     def _mix_with_holds(self, flow: Flow) -> Flow:
-        """Mix the flow of a leak over the whole recording with the one that holds of the load show, if they show any.
+        """Combine the flow of a leak over the whole recording with the one during holds, if these show a leak.
 
-        Where the two disagree, holds are right with the probability `held_oil.right` of `priors.toml`.
+        A hold is a time in which shut valves hold the load. Where the two disagree, holds are right with the
+        probability `held_oil.right` of `priors.toml`.
         """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
@@ -183,9 +188,9 @@ class BalanceLeak:
 
     @property
     def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above that of healthy recordings, as dated by holds of the load.
+        """Onset [s] of the leakage above that of healthy recordings, from the times in which shut valves hold the load.
 
-        None if holds do not clearly show the leakage, or if it may have been there from the start.
+        None if these times (holds) do not clearly show the leakage, or if it may have been there from the start.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
         if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
@@ -193,17 +198,20 @@ class BalanceLeak:
         return chambers.piston_onset
 
     def _hold_flow(self, rise: Rise) -> Flow:
-        """Estimate the mean flow of the leak that holds show, averaged over its laws by their likelihoods.
+        """Estimate the mean flow of the leak that shows while shut valves hold the load.
 
-        `rise`: rise of the leakage over healthy recordings during holds, whose uncertainty is added to that of the
-        fits.
+        It is averaged over the laws of the leak, weighted by their likelihoods. `rise`: rise of the leakage over
+        healthy recordings in these times, whose uncertainty is added to that of the fits.
         """
         laws, (low, high) = self._hold_laws(), rise.interval()
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
         return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
 
     def _hold_laws(self) -> _HoldLaws:
-        """Fit a leak past the piston to the holds of the load, under each law of flow in `EXPONENTS`."""
+        """Fit a leak past the piston to the times in which shut valves hold the load, for each exponent of `EXPONENTS`.
+
+        The flow is the coefficient times abs(p_A - p_B)^exponent: 1 laminar, 0.5 orifice.
+        """
         balance, chambers = self.balance, self.balance.chambers
         assert chambers is not None
         recording, (onset, offset) = balance.recording, chambers.piston_fit
@@ -223,8 +231,8 @@ class BalanceLeak:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one reading),
 
-        with N independent readings in a recording. If the laws cannot be compared, each has the laminar flow and the
-        log weight 0.
+        where a recording counts as N = `size.readings` (`priors.toml`) independent readings. If the laws cannot be
+        compared, each has the laminar flow and the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -241,10 +249,10 @@ class BalanceLeak:
 
     @property
     def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file, in standard deviations of the leakage.
+        """Total leakage minus the limit in the rig's file, over the standard deviation of the leakage (no unit).
 
-        None if the file states no limit or no size, behind a servo valve, if no channel measures the flow, or if
-        healthy recordings are compared instead.
+        None if the file states no limit, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
+        channel measures the flow, or if healthy recordings are compared instead.
         """
         balance = self.balance
         limit = healthy_leakage(balance.rig)
@@ -258,11 +266,13 @@ class BalanceLeak:
 
     @property
     def bound_flow(self) -> float:
-        """95 % upper bound of the leak's mean flow [m^3/s]; infinite if nothing was tested.
+        """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it bounds the leakage above theirs, also by holds of the load if there are any.
-        Otherwise it bounds a leak that begins within the recording. It covers the uncertainty of the machine's sizes
-        and of the leak's law.
+        With healthy recordings it bounds the leakage above theirs. A hold is a time in which shut valves hold the load.
+        If holds replace the rise from the whole recording (`rise`), the bound is that of `_hold_bound`, which combines
+        both. Without healthy recordings it bounds a leak that begins within the recording. It is widened by the
+        uncertainty of the scale of the flows (displacement, area or flow meter) and of the leak's law (laminar or
+        orifice).
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -273,8 +283,9 @@ class BalanceLeak:
     def _hold_bound(self) -> float:
         """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
-        It is a quantile of a mixture of three hypotheses: the holds say nothing about the leak, and the whole
-        recording counts; they show a leak past the piston; or the leak that they show goes to the outside.
+        A hold is a time in which shut valves hold the load. The bound is a quantile of a mixture of three hypotheses:
+        the holds say nothing about the leak, and the whole recording counts; they show a leak past the piston; or the
+        leak that they show goes to the outside.
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
@@ -304,16 +315,16 @@ class BalanceLeak:
 
     @property
     def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers."""
+        """Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers (`moving_flow`)."""
         return self.balance.mean_flow, self.balance.blocks.moving_flow
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
 
-        The evidence (`step_log_ratio`) compares the rise that the step would cause with no rise. Holds after the
-        step's onset show the whole step. Without such holds, the mean over the recording shows a part of it. None
-        without healthy recordings.
+        The evidence (`step_log_ratio`) is the log likelihood ratio of the rise that the step would cause to no rise.
+        Holds after the step's onset, in which shut valves hold the load, show the whole step. Without such holds, the
+        mean over the recording shows a part of it. None without healthy recordings.
         """
         step, rise, motion_rise = self.step, self.rise, self._motion_rise
         if rise is None or motion_rise is None or step is None:
@@ -326,41 +337,48 @@ class BalanceLeak:
         return LeakRise(rise, rise_after._replace(may_be_partial=False).log_ratio(step.fitted.size, agrees))
 
     def _hold_rise_since(self, onset: float) -> Rise | None:
-        """Estimate the rise of the leakage in the holds after an onset [s].
+        """Estimate the rise of the leakage [m^3/(s Pa)] over healthy recordings in the holds after an onset [s].
 
-        Return None without such holds, or if too few healthy recordings have holds to compare with.
+        In a hold shut valves hold the load. Return None without such holds, or if too few healthy recordings have holds
+        to compare with.
         """
         chambers = self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(onset)
         return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction of the information on the mean leakage that lies after a step's onset."""
+        """Compute the fraction (0 to 1) of the information on the mean leakage from blocks after a step's onset.
+
+        The information of a block is the sum of its row of the precision matrix (`onset.Information`).
+        """
         is_after = self.balance.running_blocks.time >= step.onset().value
         weights = self.balance.leak.precision.sum(axis=0)
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a computed flow [m^3/s] to the machine's flow [L/min]; None if its sizes are not stated."""
+        """Factor from a flow computed with the machine's assumed sizes [m^3/s] to the true flow [L/min].
+
+        None if no flow can be stated in L/min (`Size.stated`).
+        """
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None
 
     @property
     def size_deviation(self) -> float:
-        """Relative standard deviation of the machine's sizes (displacement, piston area), which scale all flows."""
+        """Relative standard deviation of the scale of all flows, from displacement, area or flow meter."""
         return self.balance.size.deviation
 
     @property
     def ratio(self) -> Interval | None:
-        """Measured ratio of the pump's displacement to the piston's area, relative to the assumed ratio.
+        """Measured over assumed ratio of the pump's displacement to the piston's area, with 95 % interval (no unit).
 
         None if it is not measured.
         """
         return self.balance.size.ratio
 
     def relative(self, flow: Flow) -> RelativeLeak:
-        """Convert a flow to a fraction of the pump's mean flow, and to the speed at which it makes the piston creep.
+        """Convert a leak's flow to a fraction of the pump's mean flow, and to the speed [m/s] of a creeping piston.
 
         Both have 95 % intervals. The fraction is None if the pump's flow is zero, the speed if the piston's area is
         unknown.
@@ -401,7 +419,7 @@ class BalanceLeak:
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over time [L/min] with its 95 % interval; None if the machine's sizes are not stated.
+        """Return the leakage over time [L/min] with its 95 % interval; None if L/min cannot be stated (`Size.stated`).
 
         With an onset `onset_s` [s] it is the growth of the leakage since then, without one (None) the total leakage.
         """
@@ -421,7 +439,7 @@ class BalanceLeak:
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks on contradicting sizes, sensor offsets, a delay of the position, and unusual conditions."""
+        """Remarks on contradicting sizes, sensor offsets of p_A - p_B, a delay of x, and unusual conditions."""
         balance = self.balance
         size, offset, delay = balance.size, balance.pressure_offset, balance.position_delay
         remarks = list[Remark]()
@@ -447,11 +465,12 @@ class BalanceLeak:
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
-    """Compute the distribution of a leak's mean flow from the rise of its coefficient, for use in a larger mixture.
+    """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient, scaled by a weight.
 
-    `rise`: rise over healthy recordings, whose errors are used; `value`: its size, where a negative one counts as 0;
-    `unit`: mean flow of a unit coefficient; `weight`: sum of the resulting weights; `oil_deviation`: additional
-    standard deviation of the coefficient due to the uncertain properties of the oil.
+    The result is normal distributions whose weights sum to `weight`, as parts of a larger mixture. `rise`: rise over
+    healthy recordings, whose errors are used; `value`: the rise itself, where a negative one counts as 0; `unit`: mean
+    flow [m^3/s] for a coefficient of 1; `oil_deviation`: additional standard deviation of the coefficient due to the
+    uncertain properties of the oil.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

@@ -82,8 +82,9 @@ class VolumeBalance:
 
     It needs both chamber pressures, and the pump's angle, its speed, a flow meter or the command; the piston's
     position, or a loop that brings the piston back or holds it (`without_position`). Behind a servo valve it needs
-    position, command, both chambers, supply and return. Without supply and return it measures leaks during holds. A
-    recorded position without any flow or command is enough if the held load creeps in the healthy recordings.
+    position, command, both chamber pressures and the pressures of supply and return. Without supply and return it
+    measures leaks while shut valves hold the load. A recorded position without any flow or command is enough if the
+    held load creeps in the healthy recordings.
     """
 
     name = VOLUME_BALANCE
@@ -164,10 +165,11 @@ class VolumeBalance:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
 
         The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
-        and `scale`, the factor from the rig's flows to the machine's, 0 if the machine's sizes are not stated. If the
-        machine rests, it also contains `shut_sums`, the sums for a pump that is cut off at rest, and `shut_odds`, the
-        log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks during holds, and
-        `held_odds`, the log odds from these. Of a load that valves hold: `creep_odds`, the log odds that it creeps.
+        and `scale`, the factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`). If the
+        machine rests, it also contains `shut_sums`, the Gram matrices if the pump is cut off at rest, and `shut_odds`,
+        the log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks while shut
+        valves hold the load, and `held_odds`, the log odds from these. If no pump's flow is recorded (`is_creep`):
+        `creep_odds`, the log odds that the load creeps by leakage.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
@@ -188,8 +190,8 @@ class VolumeBalance:
         """Predict the rise that a healthy recording of a later day will show, and its uncertainty.
 
         The rise is the leakage above that of the healthy recordings with the given `summaries` (`learn`). `channels`:
-        names of their channels; `repeated`: number of times that these recordings count, each time as further
-        sessions.
+        names of their channels; `repeated`: number of times that these recordings count, each time as further sessions.
+        The rise is in m^3/(s Pa).
         """
         shut = _are_valves_shut(summaries, "shut_odds") or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -203,9 +205,10 @@ class VolumeBalance:
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        If the pump is cut off, the leakage under that assumption scatters less between recordings. With at least
-        `MIN_FOR_SCATTER` recordings the log odds are therefore (n - 1) log(scatter if connected / scatter if cut
-        off). With fewer recordings they are the sum of the limited log odds of each.
+        If the pump is cut off, the leakage scatters less between recordings if it is estimated for a pump that is cut
+        off than for a connected one. With at least `MIN_FOR_SCATTER` recordings the log odds are therefore (n - 1)
+        log(scatter if connected / scatter if cut off). With fewer recordings they are the sum of the limited log odds
+        of each.
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         if len(with_rests) < MIN_FOR_SCATTER:
@@ -233,7 +236,7 @@ class VolumeBalance:
         return float(healthy.sum()) > 0.0
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Make the column roles of each volume balance, i.e. which column is the leak, the left side and so on.
+        """Return for each volume balance the indices of its columns by role: leak, left side, motion and so on.
 
         `channels`: names of the recorded channels, which determine the balances; `shut`: True if valves cut the pump
         off at rest.
@@ -283,10 +286,11 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Make the report of a volume balance: tests, leakage, and the fraction of the recording that is judged.
+        """Make the report of a volume balance: tests, leakage, and how much of the recording is judged.
 
-        `healthy`: sums of the healthy recordings. The report contains only a reason if the leakage can be tested
-        neither for a step nor against healthy recordings.
+        `healthy`: summaries of the healthy recordings, empty without any. `Observed.share` is the fraction of the
+        samples that count, `Observed.judged_until` the fraction of the time after which none does. The report contains
+        only a reason if the leakage can be tested neither for a step nor against healthy recordings.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
@@ -306,16 +310,17 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Test whether the piston's motion takes another flow than in healthy recordings.
+    """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
 
     Yields one observable, or none if there are too few healthy recordings. A change means another machine or another
     scale of a sensor. Load and speed outside of the range of the healthy recordings make the comparison less certain.
-    `roles`: roles of the columns in the volume balance (leak, motion, left side).
+    `judged_sums`, `healthy`: summaries of the recording and of the healthy ones; `roles`: indices of the columns of the
+    volume balance by role (leak, motion, left side).
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate the log ratio of the flow of motion in a recording to that in the healthy ones."""
+        """Estimate the log of the ratio of the flow of motion in a recording to that in the healthy ones."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
@@ -333,27 +338,28 @@ def compare_motion(
 def _are_valves_shut(summaries: Sequence[Summary], odds_key: str) -> bool:
     """Return True if the healthy recordings show that valves cut the pump off at rest.
 
-    Their mean log odds must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries with these
-    odds, "shut_odds" (from all rests) or "held_odds" (from holds of a load only). The result is False if no summary
-    has it.
+    Their mean log odds must exceed `rest.locked` of `priors.toml`. `odds_key`: entry of the summaries with these odds,
+    "shut_odds" (from all rests) or "held_odds" (only from rests in which a load is held). The result is False if no
+    summary has it.
     """
     log_odds = [summary[odds_key] for summary in summaries if odds_key in summary]
     return bool(log_odds) and float(np.mean(log_odds)) > INFERENCE.rest.locked
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Return the start of a recording [s since 1970], delayed by `n_ages` times the longest life of a machine.
+    """Return the start of a recording [s since 1970], later by `n_ages` times the longest life of a machine.
 
-    Recordings delayed by different multiples belong to different sessions. Return None if the recording is undated.
+    Recordings that are moved by different multiples belong to different sessions, so that repeated copies count as
+    further sessions. Return None if the recording is undated.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the regression sums of a healthy recording from its summary (`VolumeBalance.learn`).
+    """Restore the Gram matrices, flow, pressure and date of a healthy recording from its summary (`learn`).
 
-    `shut`: true for the sums under the assumption that valves cut the pump off at rest; `locked`: true to include the
-    leaks during holds, if the summary has them.
+    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest; `locked`: true to
+    include the leaks while shut valves hold the load, if the summary has them.
     """
     sums = np.asarray(summary["sums"], dtype=float)
     if shut:

@@ -70,11 +70,13 @@ END_QUANTILE = 0.02
 
 
 class Size(NamedTuple):
-    """Scale of the machine's flows, since a volume balance is computed with an assumed displacement of the pump.
+    """Factor from flows computed with the machine's assumed sizes to its true flows.
 
-    `scale`: true flow of the machine over the computed one, with its relative standard `deviation`; `stated`: true if
-    flows can be stated in L/min; `ratio`: measured ratio of displacement to area, relative to the assumed one, None
-    if the position has no unit; `area`: piston area as measured with the assumed displacement [m^2], None if unknown;
+    The sizes are the pump's displacement, or the piston's areas behind a servo valve and for a load that shut valves
+    hold; a recorded flow meter needs none. `scale`: that factor, with its relative standard `deviation`; `stated`: true
+    if flows can be stated in L/min, since a flow meter is recorded or the rig's file states the size, and the pressures
+    have units; `ratio`: measured over assumed ratio of displacement to area, None if it is not measured; `area`: area
+    of the piston's loaded side as measured with the assumed displacement or the flow meter [m^2], None if unknown;
     `disagrees`: true if stated displacement and stated area contradict each other.
     """
 
@@ -90,11 +92,12 @@ class Size(NamedTuple):
 class RecordedBalance:
     """Volume balance of a recording, and the estimates that follow from it.
 
-    `blocks`: sums of the balance; `equations`, `columns`: the balances and the roles of their columns; `rig`: sizes
-    of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term;
-    `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`: true if valves cut the
-    pump off at rest, so the leak is that of the piston alone (`regimes`); `locked`: true if holds of the load behind
-    shut valves measure the leaks.
+    `blocks`: blocks of the recording with the Gram matrices of the balance; `equations`: the volume balances, one for
+    each chamber behind a servo valve; `columns`: for each equation the indices of its columns by role (leak, motion,
+    left side); `rig`: sizes of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by
+    the name of the term; `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`:
+    true if valves cut the pump off at rest, so the leak is that of the piston alone (`regimes`); `locked`: true if the
+    times in which shut valves hold the load measure the leaks (`chambers`).
     """
 
     blocks: Blocks
@@ -109,12 +112,12 @@ class RecordedBalance:
 
     @property
     def units(self) -> frozenset[tuple[str, str]]:
-        """Pairs (name, unit) of all recorded channels."""
+        """Pairs (name, unit) of all recorded channels, such as ("x", "m")."""
         return frozenset(self.recording.units.items())
 
     @property
     def is_creep(self) -> bool:
-        """True if the flow is that by which a held load creeps, and no pump's flow is known."""
+        """True if the flow is that by which a load creeps while valves hold it, and no pump's flow is known."""
         return self.equations[0].name == LOCKED
 
     @cached_property
@@ -134,7 +137,7 @@ class RecordedBalance:
 
     @cached_property
     def leak(self) -> Information:
-        """Likelihood of the leak's conductance in each block from the first motion on (`running_blocks`)."""
+        """Likelihood of the leak's conductance in each of `running_blocks` (`onset.Information`)."""
         return information(self.running_blocks, self.columns, self.columns[0].leak)
 
     @cached_property
@@ -144,7 +147,7 @@ class RecordedBalance:
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
-        """Results of the tests for a step of each coefficient within the recording, the highest score first."""
+        """Tests of the balance's coefficients for a step within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         return volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss, self.volume_ratio,
@@ -162,7 +165,7 @@ class RecordedBalance:
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Summary of the recording for comparison with other recordings of the machine."""
+        """Summary of the recording (Gram matrices, mean flow and pressure) for comparison with other recordings."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         held = None if self.chambers is None else np.array(self.chambers.leaks)
@@ -171,7 +174,7 @@ class RecordedBalance:
 
     @cached_property
     def chambers(self) -> HeldChambers | None:
-        """Estimator of the chambers' leaks during holds, in which valves cut them off from the resting pump.
+        """Estimator of the chambers' leaks in holds, i.e. while shut valves cut them off from the resting pump.
 
         None if valves do not hold the load (`locked`), if no hold is long enough or loaded, if the pressures have no
         unit, or if the piston's areas are unknown.
@@ -213,9 +216,10 @@ class RecordedBalance:
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        The pressures count from the time at which the pump stops, since a large leak equalises them while the valves
-        still shut. With equal pressures from then on nothing flows through a leak, so such a hold would not show it.
-        In the comparison all loads up to the largest pressure difference of the recording are equally probable.
+        p_A - p_B is taken from the time at which the pump stops, since a large leak equalises p_A and p_B while the
+        valves still shut. Nothing flows through a leak at equal pressures, so a hold that has them throughout would not
+        show it. In the comparison all loads up to the largest pressure difference of the recording are equally
+        probable.
         """
         prior, oil, t = INFERENCE.zero, INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -231,8 +235,9 @@ class RecordedBalance:
     def locked_odds(self) -> float | None:
         """Compute the log odds that valves really shut off the chambers in holds; None without holds.
 
-        The leaks in holds are compared with the total leakage: through open valves the resting pump would leak as
-        much as the turning one. The log odds are limited to +-`rest.most` of `priors.toml`.
+        A hold is a time in which shut valves hold the load. The leaks in holds are compared with the total leakage:
+        with open valves the holds would show the leakage of pump and piston, too. The log odds are limited to
+        +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
@@ -246,7 +251,7 @@ class RecordedBalance:
     def _cylinder_sides(self) -> CylinderSides | None:
         """Estimate the piston areas and the ends of the recorded stroke; None if they are not determined.
 
-        That is the case if nothing moves, or if the ratio of the areas is implausible.
+        They are not determined if nothing moves, or if the ratio of the areas is implausible.
         """
         area_A, area_B = self._signed_areas()
         x = self.recording["x"][np.isfinite(self.recording["x"])]
@@ -288,7 +293,7 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Sensor offset of p_A - p_B [Pa].
+        """Sensor offset of p_A - p_B [Pa], i.e. the recorded difference at equal pressures.
 
         Only a change of the leak reveals it; without one the estimate stays near 0.
         """
@@ -296,10 +301,10 @@ class RecordedBalance:
 
     @cached_property
     def position_delay(self) -> Estimate | None:
-        """Delay of the recorded position behind the flow [s], with its standard deviation; negative if x is early.
+        """Time by which the recorded position lags behind the flow [s], and its standard deviation; negative if early.
 
-        It is the coefficient of the volume balance's term of lag over the piston area. None if the balance has no such
-        term or no motion, or if the measured area is not positive.
+        It is the fitted coefficient of the term `LAG` [m^2 s] over the measured piston area [m^2]. None if the balance
+        has no such term or no motion, or if the measured area is not positive.
         """
         roles = self.columns[0]
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -317,7 +322,8 @@ class RecordedBalance:
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow over the recording [m^3/s].
 
-        Of a load that valves hold, it is the flow that the motion of the piston takes.
+        If only the creep of a held load is known (`is_creep`), it is the volume that the larger side of the piston
+        displaces per time.
         """
         if not self.is_creep:
             return self.mean_of_blocks(self.blocks.flow)
@@ -325,7 +331,7 @@ class RecordedBalance:
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) of the blocks from the time `since` [s] on, weighted by their numbers of rows.
+        """Average `values` (K,) of K blocks over those from the time `since` [s] on, weighted by their numbers of rows.
 
         A block counts if its middle is at `since` or later. If there is none, the last block counts.
         """
@@ -336,7 +342,7 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Scale of the machine's flows, relative to those computed with the pump's assumed displacement."""
+        """Factor from the flows of this balance, computed with assumed sizes, to the machine's true flows (`Size`)."""
         return _flow_scale(self)
 
     @cached_property
@@ -364,7 +370,7 @@ class RecordedBalance:
 
     @cached_property
     def total_history(self) -> History:
-        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with covariance."""
+        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance."""
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
         total = information(self.blocks, self.columns, roles.leak, pump)
@@ -372,7 +378,7 @@ class RecordedBalance:
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
     def leak_history(self, *, with_step: bool) -> History:
-        """Estimate the leak's coefficient in each block, with a step at its most likely onset or without any step.
+        """Estimate the leak's conductance [m^3/(s Pa)] in each block, with a step at its likeliest onset or without.
 
         The blocks are those from the first motion on (`running_blocks`).
         """
@@ -380,10 +386,10 @@ class RecordedBalance:
 
 
 def _flow_scale(balance: RecordedBalance) -> Size:
-    """Determine the scale of the machine's flows and its uncertainty from the sizes that the rig's file states.
+    """Determine the factor from computed to true flows (`Size`) and its uncertainty, from the sizes in the rig's file.
 
-    The flow of a flow meter needs no scale. Otherwise the volume balance measures the ratio of displacement to area. A
-    stated displacement gives the scale directly, a stated area through that ratio. If both are stated and disagree,
+    The flow of a flow meter needs no factor. Otherwise the volume balance measures the ratio of displacement to area. A
+    stated displacement gives the factor directly, a stated area through that ratio. If both are stated and disagree,
     their difference is the uncertainty. Behind a servo valve, and for a load that shut valves hold, the areas give the
     flow.
     """
@@ -417,9 +423,10 @@ def _flow_scale(balance: RecordedBalance) -> Size:
 
 
 class _Area(NamedTuple):
-    """Piston area of the loaded side [m^2]: as `measured` with the assumed displacement, and as `assumed`.
+    """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed`.
 
-    `low`, `high`: 95 % interval of the measured area.
+    It is measured with the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
+    `assumed`: the area in the rig's file.
     """
 
     measured: float
@@ -429,9 +436,10 @@ class _Area(NamedTuple):
 
 
 def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
-    """Estimate the piston area of the loaded side, as a mean over directions of motion and sides.
+    """Estimate the piston area of the loaded side, as a weighted mean over directions of motion and loaded sides.
 
-    `motion`: indices of the columns of motion, whose weights are the sums of their squares.
+    `motion`: indices of the columns of motion. Their weights are the sums of their squares, so that a side counts by
+    the motion under its load.
     """
     roles, cylinder = balance.columns[0], balance.rig.cylinder
     energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]

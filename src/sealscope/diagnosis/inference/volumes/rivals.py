@@ -1,10 +1,10 @@
 """Rivals of a leak: other faults that may explain a change of the flow since the healthy recordings.
 
-Such faults are an external leak, wear of the pump, and free air. The coefficient of each such term is fitted to the
-residual of a recording under the healthy coefficients, with priors on the differences of all other coefficients,
-including the leak's (`priors.toml`). The scatter of this difference among the healthy recordings shows which size is
-normal (`differences`). A leak to the outside and one past the piston look nearly alike. The likelihood ratio of the
-two is therefore stated with the observable.
+Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance, whose
+coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the differences of
+all other coefficients, including the leak's (`priors.toml`). The scatter of this difference among the healthy
+recordings shows which difference is normal (`differences`). A leak to the outside and one past the piston look nearly
+alike. The likelihood ratio of the two is therefore stated with the observable.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
-    These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are
-    compared during holds if possible (`held_rivals`).
+    These rivals of the leak are external leaks, leakage of the turning pump, and free air. External leaks are compared
+    while shut valves hold the load, if possible (`held_rivals`).
 
     Parameters
     ----------
     judged : RecordingSums
-        The recording.
+        Summary of the judged recording.
     healthy : sequence of RecordingSums
-        The healthy recordings of the same machine.
+        Summaries of healthy recordings of the same machine.
     columns : sequence of ColumnRoles
-        Roles of the columns in each equation.
+        For each equation the indices of its columns by role (leak, motion, left side).
     volume_ratio : float
         Measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air scale.
 
@@ -90,10 +90,10 @@ def rival_rises(
 
 
 def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
-    """Test for external leaks of chambers A and B, during holds, that exceed those of healthy recordings.
+    """Test for external leaks of chambers A and B, while shut valves hold the load, above those of healthy recordings.
 
-    In a hold shut valves hold the load. Return one observable for each chamber that can be compared, or None if the
-    judged recording has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any.
+    Such a time is a hold. Return one observable for each chamber that can be compared, or None if the recording
+    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any.
     """
     healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -112,10 +112,10 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Return the observable of an external leak with its `advantage` lowered if the leak would be large.
+    """Return the observable of an external leak with minus the penalty on its flow as `advantage` (`size_penalty`).
 
-    A large external leak is improbable, since oil outside is seen. The flow is the observable's conductance times the
-    mean pressure of the recording `judged`.
+    A large external leak is improbable, since oil outside is seen. The flow [m^3/s] is the observable's conductance
+    times the mean of abs(p_A - p_B) in the recording `judged`.
     """
     return replace(
         observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
@@ -125,10 +125,11 @@ def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
     """Estimate by how much a coefficient of a recording differs from healthy recordings, and the standard error.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the healthy ones, for each
-    equation; `tested`: index of the coefficient's column, whose coefficient counts as 0 in the healthy ones. The
-    other coefficients differ by a normal prior and are eliminated (Schur complement): change = moment / precision,
-    both summed over the equations. Without information the change is 0 and the error infinite.
+    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the healthy ones, for each equation;
+    `columns`: indices of its columns by role (leak, motion, left side); `tested`: index of the coefficient's column,
+    whose coefficient counts as 0 in the healthy ones. The other coefficients differ by a normal prior and are
+    eliminated (Schur complement): change = moment / precision, both summed over the equations. Without information the
+    change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     leak_deviation: float = INFERENCE.between.pump
