@@ -128,9 +128,9 @@ class BlockStream:
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
-        A block is a few seconds of samples, reduced to the sums of a regression (`Blocks`). `samples`: equally long
-        arrays by channel name, NaN where a sample is missing. `last`: true if no samples follow; blocks are then
-        closed that would otherwise wait for the samples after them.
+        A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions (`Blocks`).
+        `samples`: equally long arrays by channel name, NaN where a sample is missing. `last`: true if no samples
+        follow; blocks are then closed that would otherwise wait for the samples after them.
         """
         if samples:
             self._pieces.append(samples)
@@ -165,7 +165,7 @@ class BlockStream:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
         It consists of the samples that later blocks need, the offsets and signs that were estimated from the first
-        samples, and the sums over earlier blocks that weight the rows.
+        samples, and the sums over earlier blocks that determine the weights of the rows (`blocks.Weighting`).
         """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -197,7 +197,7 @@ class BlockStream:
     def _left_side_signs(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Estimate the sign of the recorded flow in each volume balance: 1 if it is right, -1 if a sensor is reversed.
 
-        `rows`: rows (r, m) of the regression of each balance.
+        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
         The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy,
         so p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with
@@ -222,7 +222,8 @@ class BlockStream:
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
-        The rows of these blocks are weighted together: one robust fit to all of them determines the weights.
+        A row is the volume balance integrated with one test function of the weak form. The rows of these blocks are
+        weighted together: one robust fit to all of them determines the weights.
         """
         length = self._strides * self._stride  # of a block [samples]
         self._estimate_stream_constants(samples, (self._n_first or end) * length)
@@ -269,9 +270,10 @@ class BlockStream:
             self._rest_limits = RestLimits(max_rest_rate(pump, self._rate), max_rest_rate(piston, self._rate))
 
     def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
-        """Compute the rows of the regression, with their weights, in the blocks `first` to `end` - 1.
+        """Compute the rows of the volume balances' regressions, with their weights, in the blocks `first` to `end` - 1.
 
-        The result also contains the mean flow and the distribution of p_A - p_B in each block.
+        `samples`: arrays by channel name. The result also contains, for each block, the mean magnitude of the first
+        balance's left side as a flow [m^3/s], and the means of equal parts of the sorted samples of p_A - p_B [Pa].
         """
         length = self._strides * self._stride
         # samples of the blocks; the test functions of the last rows extend beyond them, to SPAN strides
@@ -302,10 +304,11 @@ class BlockStream:
 
 
 class _BlockRows(NamedTuple):
-    """Rows of a regression in K blocks: `rows` (r, m) of each equation, and `weights` (r,).
+    """Rows of the regression of each volume balance in K blocks, and their weights.
 
-    The weight is 1 without holes, a fraction next to a hole of the recording, and 0 with a missing sample. `flow`
-    (K,) and `pressures` (K, p) are those of `Blocks`.
+    `rows`: for each balance an array (r, m), one row for each test function of the weak form. `weights` (r,): 1 without
+    holes (long gaps of missing samples), a fraction next to a hole, and 0 with a missing sample. `flow` (K,) and
+    `pressures` (K, p) are those of `Blocks`.
     """
 
     rows: tuple[Array, ...]
@@ -315,7 +318,10 @@ class _BlockRows(NamedTuple):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,) against a mean of zero, corrected for overlapping rows."""
+    """Compute the z score of the sum of `products` (r,) against a mean of zero, corrected for overlapping rows.
+
+    There is one product for each row of the regression, i.e. for each test function of the weak form.
+    """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
@@ -323,7 +329,8 @@ def _z_score(products: Array) -> float:
 def _sign_log_odds(z: float, other_cause: float) -> float:
     """Compute the log odds that a flow has the correct sign, given the z score `z` of a symptom of correct wiring.
 
-    `other_cause`: probability that something other than the sign causes the score.
+    `BlockStream._left_side_signs` lists the three symptoms. `other_cause`: probability that something other than the
+    sign causes the score.
     """
     from scipy.special import ndtr
 
@@ -333,8 +340,8 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares; 0 if the rows do not determine it.
 
-    `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: roles of its columns, such as leak and
-    left side.
+    `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role (leak,
+    motion, left side).
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -350,11 +357,11 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float) -> float:
-    """Compute the speed below which a pump or a piston counts as resting.
+    """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is a fraction of the mean speed in motion, or three standard deviations of the noise of an averaged speed if
-    that is larger. `increments` (n,): increments of the pump's volume [m^3] or of the position [m]; `rate`: sampling
-    rate [Hz]. The result is in m^3/s or m/s.
+    It is a fraction of the mean speed in motion (`rest.share` in `priors.toml`), or three standard deviations of the
+    noise of an averaged speed if that is larger. `increments` (n,): increments of the position [m] or of the pump's
+    volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
@@ -367,9 +374,9 @@ def max_rest_rate(increments: Array, rate: float) -> float:
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute the difference of absolute and gauge pressure [Pa] for the readings (n,) of a sensor.
+    """Compute the difference of absolute and gauge pressure [Pa] for the samples (n,) [Pa] of a sensor.
 
-    It is the atmospheric pressure, or more if a reading would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
+    It is the atmospheric pressure, or more if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -429,7 +436,7 @@ def derive_drive_signals(
 
 
 def _hold_missing(values: Array) -> Array:
-    """Replace each missing value (NaN) of an array (n,) by the last one before it, or by 0 at the beginning."""
+    """Replace each missing value (NaN) of an array (n,) by the last value before it; by 0 before the first value."""
     last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
     return np.where(last < 0, 0.0, values[last])
 
@@ -443,8 +450,9 @@ def min_samples_for_step(rate: float) -> int:
 class RegimeBlocks(NamedTuple):
     """Blocks, balances and columns of a recording, under one assumption on the valves while the pump rests.
 
-    `shut`: true if valves then cut the pump off from the cylinder, false if it stays connected. `blocks`: after
-    removal of the sensor offset of p_A - p_B; `plain`: the same blocks as recorded.
+    `shut`: true if valves then cut the pump off from the cylinder, false if it stays connected. `blocks`: the blocks
+    after removal of the sensor offset of p_A - p_B; `plain`: the blocks with p_A - p_B as recorded; `equations`: the
+    volume balances; `columns`: for each balance the indices of its columns by role (leak, motion, left side).
     """
 
     blocks: Blocks
@@ -458,7 +466,7 @@ class RecordedBlocks(NamedTuple):
     """Blocks of a recording under both assumptions on the valves while the pump rests (`regimes`).
 
     `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the pump never rests; `odds`:
-    log odds of the latter.
+    log odds that valves cut it off.
     """
 
     open: RegimeBlocks
@@ -476,8 +484,9 @@ class RecordedBlocks(NamedTuple):
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short.
 
-    A block is a few seconds of samples, reduced to the sums of a regression. The result has two versions of the
-    blocks, since the pump may stay connected to the cylinder while it rests, or valves may cut it off.
+    A block is a few seconds of samples, reduced to Gram matrices of the volume balances' regressions. The result has
+    two versions of the blocks, since the pump may stay connected to the cylinder while it rests, or valves may cut it
+    off.
     """
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)

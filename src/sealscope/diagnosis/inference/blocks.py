@@ -1,10 +1,10 @@
 """Likelihood of a volume balance's coefficients in blocks of a recording, from sums over the rows of each block.
 
 A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A
-block is a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side).
-Gram matrices of blocks add up to that of their union. A stream and a whole recording are therefore handled alike, and a
-recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
-(`row_weights`).
+block is a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side). A
+row is the balance integrated with one test function of the weak form (`rows.weak_form`). Gram matrices of blocks add up
+to that of their union. A stream and a whole recording are therefore handled alike, and a recording of hours costs no
+more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its size (`priors.toml`):
@@ -54,7 +54,7 @@ _MAX_OFFSET_STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Consecutive blocks of a recording, each a few seconds long and reduced to sums.
+    """Consecutive blocks of a recording, each a few seconds long and reduced to a regression's Gram matrices.
 
     Parameters
     ----------
@@ -64,13 +64,14 @@ class Blocks:
         Gram matrices of each block for each of E equations: weighted sums, over the rows, of the products of the m
         columns with each other. The left side is the last column.
     rows : array of float, shape (K,)
-        Number of rows without missing samples; a row next to a hole counts as a fraction of one.
+        Number of the regression's rows (one for each test function of the weak form) without missing samples; a row
+        next to a hole counts as a fraction of one.
     flow : array of float, shape (K,)
         Mean magnitude of the first equation's left side, as a flow [m^3/s].
     pressures : array of float, shape (K, p)
         Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
     zero : array of float, shape (K,)
-        Sensor offset that was subtracted from p_A - p_B in `gram` [Pa] (`pressure_offset.remove_pressure_offset`).
+        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`).
     """
 
     start: Array
@@ -116,9 +117,9 @@ class Blocks:
 
     @property
     def moving_flow(self) -> float:
-        """Mean flow while the pump delivers [m^3/s].
+        """Mean flow while the machine moves [m^3/s].
 
-        It is the mean over the blocks weighted by the flow itself, to which standstills do not contribute.
+        It is the mean of `flow` over the blocks, weighted by the flow itself, so that standstills do not contribute.
         """
         return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
 
@@ -132,7 +133,11 @@ class Blocks:
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
-        """Return at most `max_blocks` blocks, by adding up equal numbers of neighbouring ones."""
+        """Return at most `max_blocks` blocks, each the sum or weighted mean of equally many neighbouring ones.
+
+        Gram matrices and numbers of rows are added; flow and pressures are averaged with the numbers of rows as
+        weights.
+        """
         group = -(-len(self) // max_blocks)
         if group <= 1:
             return self
@@ -153,8 +158,8 @@ class Blocks:
     def mean_pressure(self, offset: float | None = None) -> Array:
         """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, shape (K,).
 
-        `offset` [Pa]: error of the sensors, by default `zero`. The mean flow of a laminar leak is its coefficient
-        times this pressure.
+        `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`, which is already subtracted in `gram`. The mean
+        flow of a laminar leak is its coefficient times this pressure.
         """
         return np.asarray(np.abs(self.pressures - (self.zero[:, None] if offset is None else offset)).mean(axis=1))
 
@@ -172,7 +177,7 @@ class Blocks:
 
 
 class ColumnRoles:
-    """Role of each column in one equation's Gram matrices, and the priors on its coefficient.
+    """Indices of the columns of one equation's Gram matrices by role, and the priors on their coefficients.
 
     A column belongs to a term of the volume balance or to its left side. Indices of columns:
 
@@ -184,9 +189,9 @@ class ColumnRoles:
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
-    `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, in the
-    unit of the coefficient. `names` and `drivers` (m - 1,): those of the terms; `healthy_conductance` [m^3/(s Pa)]:
-    standard deviation of a healthy machine's leak.
+    `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, of the
+    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): those of the terms;
+    `healthy_conductance` [m^3/(s Pa)]: standard deviation of a healthy machine's leak.
     """
 
     def __init__(self, equation: Equation) -> None:
@@ -252,7 +257,7 @@ class Weighting:
     """Weighting of the rows of successive blocks by Huber's weights, which limit the effect of outliers.
 
     The weights follow from a fit that also uses weighted sums over earlier blocks. These sums are the state of the
-    object. `columns`: roles of the columns (leak, motion, left side) in each equation.
+    object. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
@@ -331,9 +336,9 @@ def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, 
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, replaces: int | None = None) -> Information:
     """Compute the likelihood of one coefficient of a volume balance in each block, with all others eliminated.
 
-    `columns`: roles of the columns (leak, motion, left side) in each equation; the likelihoods of the equations are
-    multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its scale.
-    `replaces`: index of a column to omit, None to omit none.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side); the likelihoods of the
+    equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its
+    scale. `replaces`: index of a column to omit, whose place the tested one takes; None to omit none.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -356,7 +361,7 @@ def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
 
 
 class _NormalEquations(NamedTuple):
-    """Sums of a regression on nuisance columns, whose coefficients drift, and on the tested column.
+    """Gram matrices and moments of a regression on nuisance columns, whose coefficients drift, and on a tested column.
 
     The tested column is that of the coefficient to estimate. The nuisance columns are multiplied by their drift
     polynomials, c columns in all. `gram` (c, c) and `moment` (c,): products of these columns with each other and with
@@ -410,8 +415,9 @@ def _build_normal_equations(
 class _Prior(NamedTuple):
     """Prior standard deviations of c nuisance coefficients: of their `level` and their `drift`, (c,) each.
 
-    The last coefficient is the remaining error of a sensor offset whose prior standard deviation is `offset`. The
-    sums are computed after subtracting `current_offset`, so the error has the prior mean -`current_offset`.
+    The level is the constant part of a coefficient. The last of the c coefficients is the remaining error [Pa] of the
+    sensor offset of p_A - p_B. `offset` [Pa]: prior standard deviation of the whole offset, of which `current_offset`
+    is already subtracted; the error therefore has the prior mean -`current_offset`.
     """
 
     level: Array
@@ -436,9 +442,9 @@ class _NuisanceFit(NamedTuple):
 def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows: float) -> _NuisanceFit:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
-    `normal`: sums of the regression, from which the tested coefficient, free in each block, is eliminated. Each other
-    (nuisance) column has `degrees` coefficients: a constant one and those of the polynomials of its drift. `prior`:
-    prior standard deviations of these; `n_rows`: number of rows in all blocks.
+    `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
+    Each other (nuisance) column has `degrees` coefficients: a constant one and those of the polynomials of its drift.
+    `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -463,8 +469,8 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows:
 class _EquationFit(NamedTuple):
     """Fit of one equation: sensor offset of p_A - p_B and nuisance coefficients.
 
-    `offset`: the fitted offset [Pa], relative to the one already removed; `normal`: sums after subtracting it;
-    `nuisance`: coefficients, the last of which is the remaining error of the offset.
+    `offset`: the fitted offset [Pa], relative to the one already removed; `normal`: normal equations after subtracting
+    it; `nuisance`: coefficients, the last of which is the remaining error of the offset.
     """
 
     normal: _NormalEquations
@@ -477,10 +483,10 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
 
     The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z), so a change of g between blocks
     also changes the constant flow, by -g z. z is small, since a first estimate of the offset is already removed from
-    the sums (`pressure_offset.remove_pressure_offset`).
+    the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `gram` (K, m, m): Gram matrices of the equation in K blocks; `test`: index of the column of g; `nuisance`: indices
-    of the nuisance columns.
+    `gram` (K, m, m): Gram matrices of the equation in K blocks; `roles`: indices of its columns by role (leak, motion,
+    left side); `test`: index of the column of g; `nuisance`: indices of the nuisance columns.
     """
     offset, deviation = 0.0, roles.offset_deviation(test, blocks)
     polynomials, minutes = _drift_polynomials(blocks)
@@ -508,10 +514,11 @@ def _fit_equation(gram: Array, blocks: Blocks, roles: ColumnRoles, test: int, nu
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
     """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `roles`: roles of the columns; `test`: index of the tested column, i.e.
-    that of the coefficient g to estimate, a pressure times the sampling interval dt; `coefficients` (K,): g in each
-    block; `offset` [Pa]: subtracted from the pressure. The appended column -g dt is the derivative of the volume
-    balance with respect to the offset. It becomes the last of the m + 1 columns of the result.
+    `gram` (K, m, m): Gram matrices of K blocks; `roles`: indices of the columns by role (leak, motion, left side);
+    `test`: index of the tested column, i.e. that of the coefficient g to estimate, a pressure times the sampling
+    interval dt; `coefficients` (K,): g in each block; `offset` [Pa]: subtracted from the pressure. The appended column
+    -g dt is the derivative of the volume balance with respect to the offset. It becomes the last of the m + 1 columns
+    of the result.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -527,11 +534,11 @@ def _eliminate_nuisance(
 ) -> tuple[Array, Array]:
     """Compute the likelihood of the tested coefficient in K blocks by one equation: precision (K, K) and vector (K,).
 
-    `gram` (K, m, m): Gram matrices of the blocks; `roles`: roles of the columns (leak, motion, left side); `test`:
-    index of the tested column; `nuisance`: indices of the columns to eliminate. The precision is the Schur complement
-    (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix of the tested column's sums of squares, G the Gram matrix of
-    the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the residual
-    variance of a row.
+    `gram` (K, m, m): Gram matrices of the blocks; `roles`: indices of the columns by role (leak, motion, left side);
+    `test`: index of the tested column; `nuisance`: indices of the columns to eliminate. The precision is the Schur
+    complement (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix of the tested column's sums of squares, G the Gram
+    matrix of the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the
+    residual variance of a row.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -559,9 +566,9 @@ def offset_cost(offset: float) -> float:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    `columns`: roles of the columns of `blocks` (leak, motion, left side) in each equation. The result includes the
-    offset that is already removed from `blocks`. Only changes of the leak between blocks show the offset; without
-    them the estimate stays near the removed offset.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The result includes the
+    offset that is already removed from `blocks`. Only changes of the leak between blocks show the offset; without them
+    the estimate stays near the removed offset.
     """
     fits = [
         _fit_equation(blocks.gram[:, e], blocks, roles, roles.leak, _nuisance_columns(roles))
@@ -585,7 +592,7 @@ class LeakAndBias(NamedTuple):
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
     """Compute the joint likelihood of leak coefficient and flow offset in each block, for the first equation.
 
-    `roles`: roles of its columns (leak, motion, left side), one of which must be the flow offset. All other
+    `roles`: indices of its columns by role (leak, motion, left side), one of which must be the flow offset. All other
     coefficients are eliminated.
     """
     leak, bias = roles.leak, roles.bias
@@ -613,10 +620,10 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> LeakAndBias:
 
 
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
-    """Estimate a weighted mean of coefficients of a machine's first volume balance, and its standard error.
+    """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `roles`: roles of its columns (leak, motion, left side). `weights` maps the index of a nuisance column to its
-    weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
+    `roles`: indices of its columns by role (leak, motion, left side). `weights` maps the index of a nuisance column to
+    its weight; the weights sum to 1. Only the constant part of each coefficient is averaged, not its drift.
     """
     nuisance = _nuisance_columns(roles)
     normal, fit, _ = _fit_equation(blocks.gram[:, 0], blocks, roles, roles.leak, nuisance)
@@ -632,7 +639,7 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
     """Compute the Gram matrix of a whole recording for each equation, over the residual variance of a row, (E, m, m).
 
-    `columns`: roles of the columns (leak, motion, left side) in each of E equations.
+    `columns`: for each of E equations the indices of its columns by role (leak, motion, left side).
     """
     grams = []
     for e, roles in enumerate(columns):
