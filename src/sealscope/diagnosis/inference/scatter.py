@@ -101,9 +101,10 @@ class Mixture(NamedTuple):
 class Rise(NamedTuple):
     """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
 
-    `value`: the estimate; `deviation`: its standard deviation. In a healthy recording `value` has the distribution
-    `mixture`; if that is None, it is `deviation` times a Student's t variable of `degrees_of_freedom`.
-    `may_be_partial`: the leak may have begun within the recording, whose mean then contains only a part of the rise.
+    `value`: the estimate, and `deviation`: its standard deviation, both in the unit of the coefficient (of a laminar
+    leak m^3/(s Pa)). In a healthy recording `value` has the distribution `mixture`; if that is None, it is `deviation`
+    times a Student's t variable of `degrees_of_freedom`. `may_be_partial`: the leak may have begun within the
+    recording, whose mean then contains only a part of the rise.
     """
 
     value: float
@@ -113,7 +114,7 @@ class Rise(NamedTuple):
     may_be_partial: bool = False
 
     def widen(self, variance: float) -> Rise:
-        """Return the rise with an additional error of the given variance.
+        """Return the rise with an additional independent error of the given variance, in the square of its unit.
 
         The variance is added to that of the rise and of each normal distribution of its mixture. The rise remains
         unchanged if it has no mixture, or if the variance is not positive.
@@ -130,7 +131,10 @@ class Rise(NamedTuple):
 
     @property
     def chance(self) -> float:
-        """Probability that a healthy recording has a higher score (estimated rise over its standard deviation)."""
+        """Probability that a healthy recording has a higher score (a one-sided p-value).
+
+        The score is the estimated rise over its standard deviation.
+        """
         from scipy.special import ndtr, stdtr
 
         if self.mixture is None:
@@ -139,7 +143,7 @@ class Rise(NamedTuple):
         return min(float(weights @ ndtr((centres - self.score * self.deviation) / deviations)), 1.0)
 
     def threshold(self, chance: float) -> float:
-        """Compute the score that a healthy recording exceeds with the probability `chance`.
+        """Compute the score that a healthy recording exceeds with the probability `chance`, between 0 and 1.
 
         The score is the estimated rise of the leakage over its standard deviation.
         """
@@ -150,7 +154,7 @@ class Rise(NamedTuple):
         return self.mixture.quantile(1.0 - chance) / self.deviation
 
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
-        """Compute the log likelihood ratio of a true rise of the leakage of size `rise` to no rise.
+        """Compute the log likelihood ratio of a true rise of the leak's coefficient by `rise` to no rise.
 
         Both are compared with the estimate `value`, in whose unit `rise` is. `log_deviation`: standard deviation of
         the logarithm of the true rise about log(`rise`); 0 if the true rise is known to be `rise`.
@@ -162,9 +166,9 @@ class Rise(NamedTuple):
         return self._log_density(self.value - rise) - self._log_density(self.value)
 
     def _log_ratio_partial(self, rise: float) -> float:
-        """Compute the log likelihood ratio of a true rise to none, if the recording shows only a fraction of it.
+        """Compute the log likelihood ratio of a true rise by `rise` to none, if the recording shows a fraction of it.
 
-        `rise`: size of the true rise. The likelihood is averaged over fractions from 0 to 1.
+        `rise` is in the unit of `value`. The likelihood is averaged over fractions from 0 to 1.
         """
         densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
         if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
@@ -172,7 +176,7 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
-        """Compute the log likelihood ratio of a true rise of size `rise` to no rise, robust to outlying estimates.
+        """Compute the log likelihood ratio of a true rise by `rise` to no rise, robust to outlying estimates.
 
         Neither density may fall below the density at the quantiles `tail` and 1 - `tail` of a healthy recording. Thus
         an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
@@ -212,9 +216,10 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute the upper bound of the true rise of the leakage for a probability, in the unit of the estimate.
+        """Compute the upper bound of the true rise of the leakage, in the unit of the estimate.
 
-        A negative estimate counts as zero, so the bound is not below that of an estimate of zero.
+        The true rise is below it with the given probability. A negative estimate counts as zero, so the bound is not
+        below that of an estimate of zero.
         """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
@@ -231,8 +236,8 @@ class RecordingSums(NamedTuple):
     `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
     with the flow's offset eliminated. `flow`: mean magnitude of the pump's flow [m^3/s]; `pressure`: mean magnitude of
     p_A - p_B [Pa]. The others are None if unknown: `start_s`, date [s since 1970]; `oil_degC`, temperature of the oil;
-    `held` (6,), leaks during holds with shut valves, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of the
-    pressure drop due to motion over the speed, and its standard error.
+    `held` (6,), leaks while shut valves hold the load, as `locked_holds.HeldLeaks`; `viscous_drop` (2,), logarithm of
+    the pressure drop due to motion over the speed, and its standard error.
     """
 
     sums: Array
@@ -253,8 +258,8 @@ class RecordingSums(NamedTuple):
     ) -> RecordingSums:
         """Summarise a recording from its `blocks`: add up the Gram matrices, and average flow and pressure.
 
-        `columns`: roles of the columns (leak, motion, left side) in each equation; `start_s`: date [s since 1970] and
-        `oil_degC`: oil temperature, None if unknown, are stored as they are.
+        `columns`: for each equation the indices of its columns by role (leak, motion, left side); `start_s`: date [s
+        since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they are.
         """
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (
@@ -271,9 +276,10 @@ def _conductance_of_flow(recording: RecordingSums) -> float:
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `judged`: sums of the volume balance of the recording; `baseline`: those of the healthy ones; `columns`: roles of
-    the columns (leak, motion, left side) in each equation of the balance, the same for all recordings. The rise and
-    its standard deviation are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa).
+    `judged`: Gram matrices of the recording's volume balance, with its mean flow and pressure; `baseline`: those of the
+    healthy ones; `columns`: for each equation the indices of its columns by role (leak, motion, left side), the same
+    for all recordings. The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar
+    leak m^3/(s Pa).
     """
     healthy_sums, count = np.sum([recording.sums for recording in baseline], axis=0), len(baseline)
     prior, conductance_of_flow = INFERENCE.scatter, _conductance_of_flow(judged)
@@ -295,11 +301,11 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the leakage past the piston over healthy recordings, from holds with shut valves.
+    """Estimate the rise of the leakage past the piston over healthy recordings, while shut valves hold the load.
 
-    `judged`: the recording; `baseline`: the healthy ones. The leak may have begun within the recording, whose mean
-    then contains only a part of it. Return None if the judged recording has no holds, or fewer than `MIN_WITH_HOLDS`
-    healthy ones have any.
+    Such times are holds. `judged`: the recording; `baseline`: the healthy ones. The leak may have begun within the
+    recording, whose mean then contains only a part of it. Return None if the judged recording has no holds, or fewer
+    than `MIN_WITH_HOLDS` healthy ones have any.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
@@ -324,11 +330,12 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
 
 
 class _Estimates(NamedTuple):
-    """Rises of the leak coefficient, each estimated with s widths of the prior on differences between recordings.
+    """Rises of the leak coefficient, estimated with each of s prior standard deviations of the other coefficients.
 
-    `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
-    `errors` (s,): standard error of one rise; `level`: mean coefficient of the healthy recordings; `level_error`: its
-    standard error; `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero.
+    These priors are on the differences of the coefficients between recordings. `values` (s,): rises of the judged
+    recording; `rises` (s, n): rises of n healthy recordings over their mean; `errors` (s,): standard error of one rise;
+    `level`: mean coefficient of the healthy recordings; `level_error`: its standard error; `min_crossover`: minimum of
+    `_LevelScale.crossover`, large where healthy levels are about zero. All have the unit of the coefficient.
     """
 
     values: Array
@@ -342,9 +349,10 @@ class _Estimates(NamedTuple):
 def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
     """Estimate by how much the judged leak coefficient exceeds the one that the healthy recordings predict.
 
-    `estimates`: rises of all recordings over the healthy mean. Levels are compared as z = asinh(level / 2 c), which
-    is logarithmic for large levels (`_LevelScale`) and normal about an unknown mean. Each recording has an unknown
-    scatter sigma; sessions, oil and unusual conditions add covariances (see the module).
+    `estimates`: rises of all recordings over the healthy mean. A level is the leak coefficient of one recording. Levels
+    are compared as z = asinh(level / 2 c), which is logarithmic for large levels (`_LevelScale`) and normal about an
+    unknown mean. Each recording has an unknown scatter sigma; sessions, oil and unusual conditions add covariances (see
+    the module).
     """
     values, rises, errors, level, level_error, min_crossover = estimates
     prior = INFERENCE.scatter
@@ -433,7 +441,7 @@ def _candidate_covariances(
 
 
 class _LevelScale(NamedTuple):
-    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic far above c, linear far below.
+    """Transform z = asinh(a / 2 c) of a leak coefficient a: logarithmic for a far above c, linear for a far below.
 
     `level`: mean coefficient of the healthy recordings; `crossover`: c. Both are in the unit of the coefficient.
     """
@@ -533,8 +541,9 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n of the amount by which the coefficient exceeds that of the other n - 1 recordings. The other
-    coefficients may differ between recordings within their usual prior.
+    It is (n - 1)/n of the amount by which the coefficient exceeds that of the other n - 1 recordings. `columns`: for
+    each equation the indices of its columns by role (leak, motion, left side). The other coefficients may differ
+    between recordings within their usual prior.
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)
@@ -712,8 +721,9 @@ def _oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[_Oil]:
 def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from the Gram matrices `gram` (E, m, m).
 
-    The other coefficients are eliminated from each equation (Schur complement), and the equations are added up. Both
-    results are 0 if the matrices have no information on the leak.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other coefficients
+    are eliminated from each equation (Schur complement), and the equations are added up. Both results are 0 if the
+    matrices have no information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -726,15 +736,16 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Estimate the log ratio of the flow that the piston's motion takes to that in healthy recordings.
+    """Estimate the log of the ratio of the flow that the piston's motion takes to that in healthy recordings.
 
     Returns the logarithm and its standard error from the recording alone. The ratio differs from 1 if area over
     displacement changed: another machine, or another scale of a sensor.
 
-    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: roles of
-    their columns. The flow is the sum of the coefficients of motion, weighted by the sums of squares of their columns
-    in the recording. The leak is fitted together with the motion, which would otherwise absorb leakage in proportion
-    to the speed. The other coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
+    `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: indices of
+    their columns by role (leak, motion, left side). The ratio is that of the mean coefficients of motion [m^2],
+    weighted by the sums of squares of their columns in the recording. The leak is fitted together with the motion,
+    which would otherwise absorb leakage in proportion to the speed. The other coefficients differ from the healthy ones
+    by a normal prior (`between` in `priors.toml`).
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -752,7 +763,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 
 
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
-    """Make a rise of size `value` whose error follows Student's t, scaled by the scatter of n healthy recordings.
+    """Make a rise by `value` whose error follows Student's t, scaled by the scatter of n healthy recordings.
 
     `deviations` (n,): deviation of each healthy recording from the mean of the others; `prior_scatter`: prior
     standard deviation of a recording. All are in the unit of `value`.
@@ -770,9 +781,9 @@ def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
 
     They are those without a prior on differences between recordings. Columns that count only within a recording
-    (`ColumnRoles.within`) are left out. `gram` (E, m, m): Gram matrices of E equations;
-    `columns`: roles of the columns (leak, motion, left side) in each equation. The result is the Schur complement of
-    the same shape, in which the rows and columns of the eliminated coefficients are zero.
+    (`ColumnRoles.within`) are left out. `gram` (E, m, m): Gram matrices of E equations; `columns`: for each equation
+    the indices of its columns by role (leak, motion, left side). The result is the Schur complement of the same shape,
+    in which the rows and columns of the eliminated coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
@@ -788,9 +799,9 @@ def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
 class LawFit(NamedTuple):
     """Comparison of an orifice's law with the laminar law, for leakage above that of healthy recordings.
 
-    `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all
-    other terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak per independent
-    reading, from the residual sums of squares.
+    `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all other
+    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak, from the residual sums of
+    squares. It is for one independent reading, of which a recording counts as `size.readings` (`priors.toml`).
     """
 
     regression: float
@@ -803,8 +814,8 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Each leak is fitted to the residual of the recording `judged` under the coefficients of the healthy recordings,
-    `baseline`. `columns`: roles of the columns (leak, motion, left side) in each equation. Return None if the volume
-    balance has no column of an orifice, or the recording has no information on one of the two leaks.
+    `baseline`. `columns`: for each equation the indices of its columns by role (leak, motion, left side). Return None
+    if the volume balance has no column of an orifice, or the recording has no information on one of the two leaks.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -830,10 +841,12 @@ def compare_with_leak(
 ) -> float | None:
     """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
-    Returns the log likelihood ratio of the rival to the leak, for one independent reading, from the residual sums of
-    squares under the coefficients of the healthy recordings, `baseline`. While the rival (for example an external
-    leak) is fitted, the leak may differ as it does between healthy recordings. Return None if the balance has no
-    column of that name, or the recording has no information on the leak or on the rival.
+    Returns the log likelihood ratio of the rival to the leak, for one independent reading (a recording counts as
+    `size.readings` of `priors.toml`), from the residual sums of squares under the coefficients of the healthy
+    recordings, `baseline`. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    While the rival (for example an external leak) is fitted, the leak may differ as it does between healthy recordings.
+    Return None if the balance has no column of that name, or the recording has no information on the leak or on the
+    rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None
@@ -872,9 +885,9 @@ class _Residual(NamedTuple):
 def _residual_products(gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False) -> _Residual:
     """Compute the residual of a recording under the coefficients fitted to other recordings (`_Residual`).
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others. The coefficients of
-    `roles.compared` may differ from those of the others within a prior, except for the leak's. With `has_leak` the
-    leak's may differ, too, by the prior `between.pump`.
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the others; `roles`: indices of their
+    columns by role (leak, motion, left side). The coefficients of `roles.compared` may differ from those of the others
+    within a prior, except for the leak's. With `has_leak` the leak's may differ, too, by the prior `between.pump`.
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients = np.zeros(len(gram))
@@ -895,8 +908,9 @@ def _project_on_leak(
 ) -> tuple[Array, Array]:
     """Estimate by how much a recording's leak coefficient exceeds that of other recordings, and the standard errors.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the others, for each equation. The
-    other coefficients differ by a normal prior, scaled by each of `widths` (s,), and are eliminated (Schur
+    `gram`, `reference` (E, m, m): Gram matrices of the recording and of the sum of the others, for each equation.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `widths` (s,): factors on
+    the usual prior standard deviations of the other coefficients' differences. These coefficients are eliminated (Schur
     complement): rise = moment / precision, both summed over the equations. Both results have the shape (s,) and are 0
     where there is no information.
     """
