@@ -4,8 +4,8 @@ If they are open, the leakage of pump and piston is in the volume balance at res
 pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
 rest only the piston leaks. A pump may also turn slowly to hold the load, and is then connected. The leakage of such
 holds has a third coefficient, else a drive that is switched off would look like a leak that ends. Between recordings
-one coefficient is compared for all rests, since many machines show the piston's leak in such holds alone. Both
-balances select from the same columns, so one set of sums serves both. Let g be the leakage coefficient (of p_A - p_B)
+one coefficient is compared for all rests, since many machines show the piston's leak in such holds alone. Both balances
+select from the same columns, so one set of Gram matrices serves both. Let g be the leakage coefficient (of p_A - p_B)
 in motion and r that at rest; their covariance allows for errors that differ from block to block. With open valves r
 scatters about g; with shut valves and a healthy piston, about zero:
 
@@ -37,9 +37,9 @@ NEGLIGIBLE = 1e-6
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston
-    (`terms.with_rests`). For open valves these columns are dropped from the Gram matrices. For shut valves the flow
-    offset in motion replaces that of all times (`terms.shut_at_rest`).
+    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
+    piston, and the flow offset in motion (`terms.with_rests`). For open valves these columns are dropped from the Gram
+    matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`).
     """
     names = (*roles.names, "left")
     if shut:
@@ -68,8 +68,8 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if the pump rests in any block.
 
-    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston
-    (`terms.with_rests`).
+    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
+    piston, and the flow offset in motion (`terms.with_rests`). A pump that only holds the load counts as resting.
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
@@ -77,7 +77,8 @@ def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
-    `states`: names of the columns of p_A - p_B in these states, such as `TURNING`; the others are as for `has_rests`.
+    `states`: names of the columns of p_A - p_B in these states, such as `TURNING` (the pump moves the piston); the
+    other arguments are those of `has_rests`.
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
@@ -99,8 +100,9 @@ def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
-    `roles`: roles of the columns of `blocks`, which include those of a pump that moves or holds the piston. The
-    odds are limited by `rest.most` in `priors.toml`, and 0 if the recording says nothing about the valves.
+    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
+    piston, and the flow offset in motion (`terms.with_rests`). Positive log odds mean that valves cut the pump off.
+    They are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says nothing about the valves.
     """
     gram = blocks.gram[:, 0]
     if not has_rests(blocks, roles) or len(blocks) < 2:
@@ -123,7 +125,8 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
     """Compute the log odds that the leakage at rest is about zero rather than about equal to the leakage in motion.
 
     `value`, `variance`: estimated leakage at rest and the variance of its error; `motion`: leakage in motion;
-    `difference_variance`: variance of the error of `value` - `motion`.
+    `difference_variance`: variance of the error of `value` - `motion`. All leakages are conductances [m^3/(s Pa)], or
+    all are flows [m^3/s].
     """
     prior = INFERENCE.rest
     shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)
@@ -133,8 +136,8 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
 def _fit_with_robust_covariance(grams: Array, moments: Array) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `grams` (K, c, c): sums of the products of the columns in each block; `moments` (K, c): sums of their products
-    with the left side.
+    `grams` (K, c, c): Gram matrices of the c columns in each block; `moments` (K, c): sums of the products of the
+    columns with the left side.
     """
     total = grams.sum(axis=0)
     coefficients = solve(total, moments.sum(axis=0))

@@ -56,8 +56,8 @@ class Signals:
     `channels`: samples (n,) of each channel by name, in SI units; `rate`: sampling rate [Hz]; `to_absolute`: absolute
     minus gauge pressure [Pa] by the name of the channel, by default the atmosphere; `offset`: sensor offset that is
     subtracted from p_A - p_B [Pa]; `rest_limits`: speeds below which the machine rests, None to find no rests.
-    `step(name)` returns the increments of a channel between samples, and `mean(name)` the means of neighbouring
-    samples, (n - 1,) each.
+    `step(name)` returns the differences of a channel between consecutive samples, and `mean(name)` the means of
+    neighbouring samples, (n - 1,) each.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Signals:
         """Return the increments of the position x [m] in one direction while one side has the higher pressure.
 
         `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true while p_A > p_B.
-        In all other intervals the increments (n - 1,) are 0, or halved at a change between two samples.
+        Elsewhere the increments (n - 1,) are 0; an interval in which direction or side changes counts half.
         """
         is_counted = (self._is_outward == outward) & (self.carried_by_A == by_A)
         return _interval_means(is_counted.astype(float)) * self.step("x")
@@ -141,7 +141,7 @@ class Signals:
         return np.asarray(self.speed >= 0.0)
 
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Compute a flag of each sampling interval, shape (n - 1,): 1 if pump and piston move, else 0.
+        """Flag each sampling interval in which pump and piston move: 1 there, else 0; shape (n - 1,).
 
         `pump_volume` computes the increments of the pump's volume [m^3] from these signals. Without `rest_limits` all
         flags are 1.
@@ -149,7 +149,7 @@ class Signals:
         return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Compute a flag of each sampling interval, shape (n - 1,): 1 if the pump turns and the piston rests, else 0.
+        """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
 
         The pump then holds the load by replacing what leaks. `pump_volume` is that of `moving`. Without `rest_limits`
         all flags are 0.
@@ -248,12 +248,15 @@ class Term(NamedTuple):
 
     @property
     def nuisance(self) -> bool:
-        """True if the coefficient is fitted in any recording, since its size is unknown even in a healthy machine."""
+        """True if the coefficient is fitted in every recording, as it is unknown even in a healthy machine."""
         return bool(self.drift) and not self.compared
 
     @property
     def compared(self) -> bool:
-        """True if the coefficient is fitted only to compare recordings with different motion and load."""
+        """True if the term serves only to compare recordings.
+
+        It is fitted when recordings with different motion and load are compared, and left out within one recording.
+        """
         return self.drift == "speed"
 
 
@@ -398,8 +401,8 @@ def _external_leak_term(side: str, weight: float = 1.0) -> Term:
 def _compensated_leak_term(side: str) -> Term:
     """Make the term of an external leak from one side in a circuit whose check valve refills the low-pressure side.
 
-    The leak changes the volume balance only while its side has the higher pressure: max(p, 0) dt for A, and -max(p, 0)
-    dt for B. In all other intervals the term is 0.
+    The leak changes the volume balance only while its side has the higher pressure, since otherwise the check valve
+    replaces the lost oil: max(p, 0) dt for A, and -max(p, 0) dt for B. In all other intervals the term is 0.
     """
 
     def lost_volume(s: Signals) -> Array:
@@ -446,8 +449,9 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     """Make the terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
     `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
-    command u that opens it. The flow is the gain times abs(u) times the signed root of the pressure drop, with a
-    delay from the lag of the spool, and reduced by an overlap.
+    command u that opens it. The flow is the gain times abs(u) times the signed root of the pressure drop, with a delay
+    from the lag of the spool, and reduced by the spool's overlap. The magnitude of the overlap's coefficient is the
+    gain times the dead band of u.
     """
 
     def unit_flow(s: Signals) -> Array:
@@ -455,11 +459,11 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
         return _signed_root(s.mean(upstream) - s.mean(downstream))
 
     def proportional_flow(s: Signals) -> Array:
-        """Compute the volume over the edge for a gain of 1, in proportion to the command, shape (n - 1,)."""
+        """Compute the increments abs(u) times the root times dt [V Pa^0.5 s] while the edge is open, (n - 1,)."""
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * unit_flow(s) * s.dt)
 
     def overlap_flow(s: Signals) -> Array:
-        """Compute the volume that an overlap of 1 takes from the flow while the edge is open, shape (n - 1,)."""
+        """Compute the increments of the root times dt [Pa^0.5 s] while the edge is open, shape (n - 1,)."""
         return np.asarray((sign * s.mean("u") > 0.0) * unit_flow(s) * s.dt)
 
     def make_term(name: str, unit: str, increments: Callable[[Signals], Array]) -> Term:
@@ -544,10 +548,11 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a load that is held by shut valves.
 
-    The piston moves only as far as oil leaks from the loaded side. The channels do not separate leaks of seal, valve
-    and line. A constant command means shut valves. If no channel shows a command or a flow, a slow piston may be held
-    by valves or by a control loop that replaces what leaks. x grows as A fills. Return None for a circuit without such
-    valves, as a pump-controlled one, or if position or a pressure is missing.
+    The piston moves only as far as oil leaks from the loaded side. The left side of the balance is minus the volume
+    that the loaded side of the piston displaces. The channels do not separate leaks of seal, valve and line. A constant
+    command means shut valves. If no channel shows a command or a flow, a slow piston may be held by valves or by a
+    control loop that replaces what leaks. x grows as A fills. Return None for a circuit without such valves, as a
+    pump-controlled one, or if position or a pressure is missing.
     """
     if not {"x", *_PRESSURES} <= channels:
         return None
