@@ -7,12 +7,13 @@ Such a hold leaves each chamber a closed volume with leaks. From the beginning o
 
 with the piston's areas m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk
 modulus K and free air alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are those of the
-pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way,
-while a check valve may fill the other side. All holds form one regression, each side of a hold about its mean. The
-logarithms of K, alpha and the volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that
-no oil is incompressible; the regression is linearised about the estimate, iteratively. The onset of the leak and the
-sensor offset z of p_A - p_B are those of the highest posterior; a leak that has equalised the pressures determines z.
-The three leaks are hypotheses, each with its probability.
+pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way, while
+a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The
+readings of all holds form one regression, each side of a hold about its mean. The logarithms of K, alpha and the
+volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is incompressible; the
+regression is linearised about the estimate, iteratively. The onset of the leak and the sensor offset z of p_A - p_B are
+those of the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses,
+each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -74,8 +75,8 @@ class CylinderSides(NamedTuple):
 class LockedHold(NamedTuple):
     """Samples of one hold, in which shut valves hold the load.
 
-    `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each.
-    `edges` (k + 1,): indices between which the samples are averaged to k readings.
+    `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
+    samples that bound k intervals; the mean of the samples of an interval is a reading.
     """
 
     t: Array
@@ -93,10 +94,10 @@ class LockedHold(NamedTuple):
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given that of the recording, `offset` [Pa].
 
         The two differ where the gains of the sensors do, with the standard deviation s = `held_oil.gain`
-        (`priors.toml`) times the pressure. The difference d at the end of the hold is either the own offset, if a leak
-        has equalised the pressures, or that of a load, which may be any up to the pressures themselves. The more
-        probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its cost as -2 log of a
-        relative probability density.
+        (`priors.toml`) times the pressure. The difference p_A - p_B at the end of the hold is either the own offset, if
+        a leak has equalised the pressures, or that of a load, of which all up to the higher pressure are equally
+        probable. The more probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its
+        cost as -2 log of a relative probability density.
         """
         last = self.mean(np.stack([self.p_A, self.p_B]))[:, -1]
         pressure, deviation = float(last.max()), INFERENCE.held_oil.gain * float(last.max())
@@ -117,11 +118,11 @@ class LockedHold(NamedTuple):
 
 
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
-    """Find the pressure that check valves maintain in a chamber without load: the lowest one while the pump rests.
+    """Find the pressure [Pa] that check valves maintain in a chamber without load: the lowest while the pump rests.
 
     A moving piston draws oil through lines and check valves, which drop pressure. `lower_pressure` (n,): the lower of
-    the chamber pressures, averaged to remove noise; `rests` (n - 1,): flags of the sampling intervals in which the
-    pump rests, all of them if none does; `rate`: sampling rate [Hz].
+    the chamber pressures [Pa], which is averaged over a time to remove noise; `rests` (n - 1,): flags of the sampling
+    intervals in which the pump rests, all of them if none does; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     return float(np.nanquantile(steady_pressure[:-1][rests] if rests.any() else steady_pressure, LOWEST))
@@ -168,10 +169,11 @@ def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
 
 
 class UnitLeak(NamedTuple):
-    """Flow of a leak of unit coefficient during holds.
+    """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
-    `flows`: flow at the samples (n,) of each hold; `signs`: sign of this flow in the balances of sides A and B, or 0;
-    `is_refilled`: true if check valves replace displaced oil once a chamber is at the charge pressure.
+    `flows`: flow over the coefficient at the samples (n,) of each hold, in Pa^e for the exponent e of the law (laminar:
+    1); `signs`: sign of this flow in the balances of sides A and B, or 0; `is_refilled`: true if check valves replace
+    displaced oil once a chamber is at the charge pressure.
     """
 
     flows: Sequence[Array]
@@ -182,12 +184,13 @@ class UnitLeak(NamedTuple):
 class _OilRegression(NamedTuple):
     """Regression of displaced volumes on the properties of the oil, over r readings of all holds.
 
-    The properties are compressibility, dead volume of A and of B, and free air, each relative to its usual value; the
-    regression is on their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the
-    piston; `strained` and `aired` (r, 3): volumes taken up by the compression of the oil and of the free air with the
+    A reading is the mean of several neighbouring samples of a hold (`LockedHold.edges`). The properties are
+    compressibility, dead volume of A and of B, and free air, each relative to its usual value; the regression is on
+    their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the piston [m^3];
+    `strained` and `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air with the
     usual properties, in the stroke, and in the dead volumes of A and of B; `inflation`: number of readings over the
-    number of independent ones; `misfit_variance`: variance of a reading in addition to that of the noise, since the
-    model describes the compressed volume only to within a fraction.
+    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to that of the noise, since
+    the model describes the compressed volume only to within a fraction.
     """
 
     displaced: Array
@@ -222,9 +225,10 @@ def _oil_deviations() -> Array:
 
 
 class _LeakRegression(NamedTuple):
-    """Fit of c leaks to the holds: `coefficients` (c,), their covariances (c, c), and `variance` of a reading.
+    """Fit of c leaks to the holds: `coefficients` (c,), their covariances (c, c), and `variance` of a reading [m^6].
 
-    The covariance is split into two parts: `by_noise` of the readings, and `by_oil`, whose properties are uncertain.
+    A reading is the mean of a volume over several neighbouring samples of a hold. The covariance is the sum of two
+    parts: `by_noise`, due to the noise of the readings, and `by_oil`, due to the uncertain properties of the oil.
     """
 
     coefficients: Array
@@ -256,10 +260,10 @@ class PistonFit(NamedTuple):
 
 
 class LeakFit(NamedTuple):
-    """Fitted coefficient of a leak: `value`, and log `likelihood` of the fit.
+    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and log `likelihood` of the fit.
 
-    The coefficient has two standard deviations: `deviation` due to noise, and `by_oil` due to the uncertain
-    properties of the oil.
+    e is the exponent of the leak's law. The coefficient has two standard deviations in the same unit: `deviation` due
+    to noise, and `by_oil` due to the uncertain properties of the oil.
     """
 
     value: float
@@ -280,8 +284,8 @@ class LeakHypothesis(NamedTuple):
 class HeldChambers:
     """Estimator of the leaks of a cylinder's chambers from holds, i.e. times in which shut valves hold the load.
 
-    `holds`: samples of each hold; `sides`: areas and stroke of the cylinder; `begin`, `end`: times of the first and
-    the last sample of the recording [s]; `charge`: absolute pressure that check valves maintain [Pa].
+    `holds`: samples of each hold; `sides`: areas and recorded stroke of the cylinder; `begin`, `end`: times of the
+    first and the last sample of the recording [s]; `charge`: absolute pressure that check valves maintain [Pa].
     """
 
     holds: Sequence[LockedHold]
@@ -292,13 +296,13 @@ class HeldChambers:
 
     @property
     def n_readings(self) -> float:
-        """Effective number of independent readings in all holds."""
+        """Effective number of independent readings (means of neighbouring samples) in all holds."""
         independent: float = INFERENCE.held_oil.independent
         return independent * 2.0 * len(self.holds)  # on both sides of each hold
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of the volumes that the piston displaces in holds on the properties of the enclosed oil.
+        """Regressions of the volumes that the piston displaces in holds on the properties of the oil.
 
         The first is for chambers without check valves, the second for check valves that refill a chamber.
         """
@@ -348,7 +352,7 @@ class HeldChambers:
         return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved)
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute the flow during holds of a leak past the piston with a coefficient of 1.
+        """Compute the flow in the holds of a leak past the piston with a coefficient of 1, in Pa^`exponent`.
 
         It is sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. The sensor offset z of a hold is near `offset` [Pa]
         (`LockedHold.own_offset`).
@@ -359,8 +363,8 @@ class HeldChambers:
     def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow of a laminar leak with a conductance of 1 from one chamber to the outside.
 
-        The chamber is A if `is_A` is True, else B. The flow is its gauge pressure, or 0 while a check valve refills
-        it.
+        The chamber is A if `is_A` is True, else B. The flow is its gauge pressure [Pa], or 0 while a check valve
+        refills it.
         """
         pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
         flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
@@ -380,9 +384,9 @@ class HeldChambers:
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
         """Fit the coefficients of c leaks together with the properties of the oil.
 
-        `columns` (r, c): volumes leaked with unit coefficients, at each reading; `is_refilled`: true if check valves
-        replace displaced oil. The variance of a reading, which weights the priors of the oil against the readings, is
-        found by iteration.
+        `columns` (r, c): volumes leaked with coefficients of 1, at each reading (mean of several samples of a hold);
+        `is_refilled`: true if check valves replace displaced oil. The variance of a reading, which weights the priors
+        of the oil against the readings, is found by iteration.
         """
         regression, n_leaks, logs = self._regressions[is_refilled], columns.shape[1], np.zeros(4)
         left, misfit_variance = regression.leaked(logs), regression.misfit_variance
@@ -434,8 +438,8 @@ class HeldChambers:
         """Estimate the leaks past the piston and to the outside from the holds, with standard deviations, shape (6,).
 
         The conductances [m^3/(s Pa)] are in the order of `HeldLeaks`. The leak past the piston is that since `onset`
-        [s], times the probability that holds give it beside the leaks to the outside. Those are means over the whole
-        recording. Return None if no hold shows a flow past the piston after the onset.
+        [s], times its probability (`piston_leak`). The leaks to the outside are means over the whole recording. Return
+        None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -494,7 +498,7 @@ class HeldChambers:
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Compute the volume that a leak of unit coefficient loses since each of o onsets, at all r readings, (r, o).
+        """Compute the volume that a leak with a coefficient of 1 loses since each of o onsets, at r readings, (r, o).
 
         A reading is a mean over several samples of a hold. The volumes have the sign of the flow in the volume balance
         of each side, and are relative to their mean over the hold.
@@ -542,7 +546,10 @@ class HeldChambers:
 
     @cached_property
     def piston_fit(self) -> PistonFit:
-        """Most probable onset of a leak past the piston and sensor offset, by a grid search that is refined once."""
+        """Most probable onset [s] of a leak past the piston, and most probable sensor offset of p_A - p_B [Pa].
+
+        Both are found by a grid search that is refined once.
+        """
         grid = self._offset_grid
         best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
         refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
@@ -582,7 +589,7 @@ class HeldChambers:
         ]
 
     def total_leak(self) -> Flow:
-        """Estimate the mean conductance of whatever leaks in the holds, also through valves that are open.
+        """Estimate the mean conductance [m^3/(s Pa)] of whatever leaks in the holds, also through valves that are open.
 
         Through open valves the pump leaks into the other chamber, which check valves keep at the charge pressure: only
         one chamber loses oil, driven by p_A - p_B. The leak is the piston's, one to the outside, or one of this kind;
@@ -601,9 +608,10 @@ class HeldChambers:
 
     @cached_property
     def leaks(self) -> HeldLeaks:
-        """Mean leaks over the recording, past the piston and to the outside from A and from B, as the holds show.
+        """Mean leaks over the recording, past the piston and to the outside from A and from B, from the holds.
 
-        Each is its estimate times the probability of that leak; the standard deviations are not weighted in this way.
+        A hold is a time in which shut valves hold the load. Each leak is its estimate times the probability of that
+        leak; the standard deviations are not weighted in this way.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
@@ -616,12 +624,15 @@ class HeldChambers:
 
     @property
     def piston_leak(self) -> LeakHypothesis:
-        """Hypothesis of a leak past the piston, with its probability and fit."""
+        """Hypothesis of a leak past the piston while shut valves hold the load, with its probability and fit."""
         return self._leak_hypotheses[0]
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last hold of the load, so that no hold shows it."""
+        """Prior probability that a leak begins after the last hold, so that no hold shows it.
+
+        A hold is a time in which shut valves hold the load.
+        """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
