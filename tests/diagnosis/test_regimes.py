@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.scatter import Rise
-from sealscope.diagnosis.inference.terms import find_rests
+from sealscope.diagnosis.inference.terms import HOLDING, TURNING, find_rests
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
@@ -42,11 +42,13 @@ def press(
     servo: bool = False,
     loads: tuple[float, ...] = LOADS,
     speed_noise: float = 0.01,
+    holds_until: float = 0.0,
 ) -> Recording:
     """Record a press that moves out and loads, holds with the pump at rest, and comes back.
 
     A dx = D omega dt - S d(p_A - p_B) - (G_pump [moves or open] + G) (p_A - p_B) dt. Before `start` [s] it is off, its
-    valves shut under the load of a hold. A `servo` makes good what leaks, also during a hold.
+    valves shut under the load of a hold. A `servo` makes good what leaks, also during a hold. Until `holds_until` [s]
+    the pump turns in holds, too, and makes good what leaks; later it is off in holds.
     """
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds * RATE)) / RATE
@@ -55,8 +57,9 @@ def press(
     stroke = np.interp(phase, [0.0, 0.4, 2.1, 2.5, 9.5, 9.9, 11.6, 12.0], [0.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, 0.0])
     force = np.interp(phase, [0.0, 0.4, 1.5, 2.4, 9.6, 10.0, 12.0], loads)
     omega, dp = 60.0 * stroke, LOAD * force * (1.0 + 0.1 * np.sin(0.7 * t))
-    passes = pump * (moves if shut else t >= start) + leak * (t >= since)
-    omega += passes * dp * (t >= start) / DISPLACEMENT if servo else 0.0
+    holds = ~moves & (t < holds_until)
+    passes = pump * (moves | holds if shut else t >= start) + leak * (t >= since)
+    omega += passes * dp * ((t >= start) if servo else holds) / DISPLACEMENT
     rate = DISPLACEMENT * omega - STORED * np.gradient(dp) * RATE - passes * dp
     x = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]))]) / (RATE * AREA)
     channels = {
@@ -105,6 +108,19 @@ def test_rests_are_no_step_and_hide_none(shut: bool) -> None:
         assert healthy is not None and leaking is not None
         assert healthy.chance > 0.01 and leaking.chance < 1e-4
         assert leaking.onset().low < 50.0 < leaking.onset().high
+
+
+def test_a_drive_that_no_longer_turns_in_holds_is_no_leak_that_ends() -> None:
+    """Neither past the piston nor to the outside; a leak that begins shows beside it."""
+    for seed in range(3):
+        switched = balance(seed, odds=10.0, holds_until=50.0)
+        assert switched.shut
+        others = [o for o in switched.observables if o.name not in (TURNING, HOLDING)]
+        assert switched.test is not None and switched.test.chance > 0.01
+        assert min(o.chance for o in others) > 1e-3
+        leaking = balance(seed, odds=10.0, holds_until=50.0, leak=0.5e-13, since=60.0).test
+        assert leaking is not None and leaking.chance < 1e-4
+        assert leaking.onset().low < 60.0 < leaking.onset().high
 
 
 def test_a_machine_that_is_switched_on_does_not_leak_from_then_on() -> None:

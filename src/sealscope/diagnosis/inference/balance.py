@@ -29,6 +29,7 @@ from sealscope.diagnosis.inference.terms import (
     CYLINDER,
     HALF_DIFFERENCE,
     MIN_ABSOLUTE_PRESSURE,
+    MIN_HOLD,
     MIN_REST,
     MOVING_BIAS,
     START,
@@ -107,7 +108,7 @@ class BlockStream:
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
-            self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
+            self._margin += round(AVERAGING_TIME * rate) + round(max(MIN_REST, MIN_HOLD) * rate)
         self._rest_limits: RestLimits | None = None  # from the first samples on
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # from gauge to absolute pressure [Pa], by channel

@@ -86,15 +86,34 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 
 
 def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
-    """Set the column of a pump that holds the load to zero if the pump is never off.
+    """Set the column of a pump that holds the load to zero, unless the recording shows that such holds leak more.
 
-    Holds are then the only rests, and show the leak past the piston. The arguments are those of `has_rests`.
+    The arguments are those of `has_rests`.
     """
-    if _rest_share(blocks, roles, TURNING, HOLDING) > NEGLIGIBLE:
+    if _holding_odds(blocks, roles) > 0.0:
         return blocks
     gram, held = blocks.gram.copy(), roles.names.index(HOLDING)
     gram[..., held, :] = gram[..., held] = 0.0
     return replace(blocks, gram=gram)
+
+
+def _holding_odds(blocks: Blocks, roles: ColumnRoles) -> float:
+    """Compute the log odds that a pump leaks while it holds the load as it does in motion, rather than not at all.
+
+    A pump at rest, which is cut off, does not leak; both leakages are what is added to the leakage of such rests. The
+    log odds are minus infinity if the recording has no such rests or a single block: holds then show the leak past
+    the piston. The arguments are those of `has_rests`.
+    """
+    if _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE or len(blocks) < 2:
+        return -np.inf
+    columns = [*roles.nuisance, *(roles.names.index(name) for name in STATES)]
+    coefficients, covariance = _fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
+    turning, holding = (columns.index(roles.names.index(name)) for name in (TURNING, HOLDING))
+    variance = float(covariance[holding, holding])
+    difference_variance = variance + float(covariance[turning, turning] - 2.0 * covariance[turning, holding])
+    if not (variance > 0.0 and difference_variance > 0.0):
+        return -np.inf
+    return -rest_log_odds(coefficients[holding], variance, coefficients[turning], difference_variance)
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
@@ -104,13 +123,11 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     piston, and the flow offset in motion (`terms.with_rests`). Positive log odds mean that valves cut the pump off.
     They are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says nothing about the valves.
     """
-    gram = blocks.gram[:, 0]
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
     turning, bias = roles.names.index(TURNING), roles.names.index(MOVING_BIAS)
     columns = [*roles.nuisance, turning, bias]
-    grams, moments = gram[:, columns][:, :, columns], gram[:, columns, roles.left]
-    coefficients, covariance = _fit_with_robust_covariance(grams, moments)
+    coefficients, covariance = _fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
     rest, extra_in_motion = (columns.index(k) for k in (roles.leak, turning))
     rest_leak, motion = coefficients[rest], coefficients[rest] + coefficients[extra_in_motion]
     rest_variance, extra_variance = float(covariance[rest, rest]), float(covariance[extra_in_motion, extra_in_motion])
@@ -133,12 +150,13 @@ def rest_log_odds(value: float, variance: float, motion: float, difference_varia
     return shut - _normal_log_density(value - motion, difference_variance + (prior.open * motion) ** 2)
 
 
-def _fit_with_robust_covariance(grams: Array, moments: Array) -> tuple[Array, Array]:
+def _fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `grams` (K, c, c): Gram matrices of the c columns in each block; `moments` (K, c): sums of the products of the
-    columns with the left side.
+    `gram` (K, m, m): Gram matrices of the columns in each block; `columns` (c,) and `left`: indices of the fitted
+    columns and of the left side.
     """
+    grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
     total = grams.sum(axis=0)
     coefficients = solve(total, moments.sum(axis=0))
     scores = moments - grams @ coefficients
