@@ -16,6 +16,7 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
 from ..refusals import refusal
+from ..representatives import SLOW, few
 
 PLAN = """
 [campaign]
@@ -121,7 +122,7 @@ def test_a_wrong_plan_is_one_line(tmp_path, before, after, words):
         plan_of(tmp_path, PLAN.replace(before, after))
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", few([True, False], 1, SLOW))
 def test_a_recording_is_judged_as_diagnose_judges_it(recordings, tmp_path, stated):
     """Where nobody states a rig neither of them states a flow, and the plan has given none."""
     text = PLAN[: PLAN.index("[[recordings.sets]]")] + '[[recordings.sets]]\nfiles = "leaky-0.csv"\n'

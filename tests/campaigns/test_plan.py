@@ -162,6 +162,7 @@ def test_detectors_do_not_change_the_records(tmp_path, text):
     assert [case.id for case in plain] == [case.id for case in other]
 
 
+@pytest.mark.slow
 def test_names_and_seeds_are_the_same_in_another_process(tiny):
     code = (
         "import sys\nfrom sealscope.campaigns.plans.reader import load_plan\n"

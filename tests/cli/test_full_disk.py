@@ -57,7 +57,7 @@ def room(size: int) -> Iterator[None]:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.parametrize("size", [2000, 5000, 60_000])
+@pytest.mark.parametrize("size", [pytest.param(2000, marks=pytest.mark.slow), 5000, 60_000])
 @pytest.mark.parametrize("suffix", ["nc", "csv", "parquet"])
 def test_a_recording_is_whole_or_absent(size: int, suffix: str, shell, call, recordings: Path, tmp_path: Path) -> None:
     """libhdf5 ends the process at such a write: the call in a process of its own is the one that tells."""

@@ -107,6 +107,7 @@ def test_a_command_loads_what_it_needs(shell, run_files, command):
     assert len(modules) <= budget
 
 
+@pytest.mark.slow
 def test_a_length_is_fast_as_scipy_says():
     for count in (*range(1, 3000), 123_457, 7_654_321):
         assert fast_length(count) == next_fast_len(count, real=True)

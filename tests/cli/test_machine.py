@@ -89,6 +89,7 @@ def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     assert "--rig must not stand beside --machine" in refused
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
 def test_a_link_is_written_through(call, commissioned, tmp_path):
     """Whatever reads the file that the link leads to reads what was added."""

@@ -95,6 +95,7 @@ def test_report_for_one_file(call, recordings, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(call, recordings, tmp_path):
     files = [recordings / "leak.nc", tmp_path / "absent.csv", recordings / "healthy_1.nc"]
     done = call("report", *files, "-o", tmp_path / "new" / "pages", "--baseline", recordings / "healthy_2.nc")
@@ -109,6 +110,7 @@ def test_report_for_several_files_makes_a_folder_and_skips_what_cannot_be_read(c
     assert len(done.out.splitlines()) == 2
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_report_of_one_file_into_a_folder(call, recordings, tmp_path):
     assert call("report", recordings / "healthy_1.nc", "-o", tmp_path).status == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["healthy_1.html", "index.html"]
@@ -221,6 +223,7 @@ def test_inspect_shows_what_a_foreign_file_holds_and_what_is_wrong(call, tmp_pat
     assert "columns not used: PB_bar" in again.out
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_parts_of_a_run_are_joined(call, recordings, tmp_path):
     whole = sealscope.read(recordings / "healthy_1.nc")
     half = len(whole) // 2

@@ -117,6 +117,7 @@ def test_none_runs_in_worker_processes(run: Ran) -> None:
     assert done.stdout == "[(-1, 1), (2, 2)]\n", done.stderr
 
 
+@pytest.mark.slow
 def test_none_runs_in_the_compiler_of_units(run: Ran) -> None:
     pytest.importorskip("ziglang")
     text = "import subprocess\nfrom sealscope.fmu.build import find_compiler\n"

@@ -100,6 +100,7 @@ def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str,
     assert "'leak', 'no leak', 'cannot tell'" in call("trend", days / "day_1.nc", "--fail-on", "rust").err
 
 
+@pytest.mark.usefixtures("two_methods")
 def test_diagnose_offers_the_trend_of_days_and_of_nothing_else(call, days: Path) -> None:
     files = [days / f"day_{k}.nc" for k in (1, 2, 3)]
     assert call("diagnose", *files).err == (

@@ -11,6 +11,7 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.recordings.recording import Recording
 
+from ..representatives import SLOW, few
 from ..wording import says
 from .judging import judge
 
@@ -33,9 +34,9 @@ def test_a_leak_from_the_start_needs_a_baseline(records, sound_ones: list[Record
         assert says(result.reason, "bound.against", count=count)
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
-def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
-    result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(4)]
+@pytest.mark.parametrize(("count", "seeds"), [(2, 2), *(pytest.param(n, 4, marks=pytest.mark.slow) for n in (2, 7))])
+def test_a_sound_one_is_no_leak_beside_sound_ones(count: int, seeds: int, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
+    result = [diagnose(records(seed, duration=60.0, throttled=True), sound_ones[:count]) for seed in range(seeds)]
     assert "leak" not in [one.verdict for one in result]
     assert all(says(one.reason, "bound.ringing") for one in result)
 
@@ -78,7 +79,7 @@ def test_what_may_not_be_compared_is_not(
     assert reason is None or reason in result.reason
 
 
-@pytest.mark.parametrize("change", ["other duty", "other level"])
+@pytest.mark.parametrize("change", few(["other duty", "other level"], 1, SLOW))
 def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     """What it does to the details is not known from recordings of a single duty, and counts as uncertain."""
     one = records(1, duration=60.0, throttled=True)
@@ -91,8 +92,8 @@ def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[
 
 def test_a_baseline_given_twice_counts_once(records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]
     recording = records(1, duration=60.0, throttled=True)
-    for many, few in ((sound_ones[:1] * 3, sound_ones[:1]), ([*sound_ones[:4], sound_ones[2]], sound_ones[:4])):
-        result, expected = diagnose(recording, many), diagnose(recording, few)
+    for many, single in ((sound_ones[:1] * 3, sound_ones[:1]), ([*sound_ones[:4], sound_ones[2]], sound_ones[:4])):
+        result, expected = diagnose(recording, many), diagnose(recording, single)
         assert replace(result, quality=expected.quality) == expected
         assert "the same samples as another baseline recording" in result.quality[-1].text
 

@@ -14,6 +14,8 @@ from sealscope.diagnosis.inference.differences import (
     excess_error,
 )
 
+from ..representatives import SLOW, few
+
 HEALTHY = (1.0, 1.1, 0.9, 1.05, 0.95)
 
 
@@ -49,7 +51,7 @@ def estimates_chance(value: float, healthy: list[Estimate], error: float = 0.05,
     return observable.chance
 
 
-@pytest.mark.parametrize("ratio", [0.3, 1.0])
+@pytest.mark.parametrize("ratio", few([1.0, 0.3], 1, SLOW))
 def test_chances_of_estimates_are_those_stated_where_the_scatter_is_no_larger_than_believed(ratio: float) -> None:
     """Errors differ tenfold from day to day; the scatter is drawn from its prior, or is smaller throughout."""
     random, chances = np.random.default_rng(2), []

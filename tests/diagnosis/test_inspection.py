@@ -25,7 +25,7 @@ def copied(recording: Recording) -> Recording:
 
 @pytest.fixture(scope="module")
 def healthy(records) -> list[Recording]:  # type: ignore[no-untyped-def]
-    return [records(seed, duration=120.0, throttled=True) for seed in range(10, 13)]
+    return [records(seed, duration=60.0, throttled=True) for seed in range(10, 13)]
 
 
 def verdicts(diagnosis: Diagnosis) -> list[tuple[str, str, str, float | None, float | None]]:

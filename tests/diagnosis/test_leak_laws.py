@@ -89,7 +89,7 @@ def test_a_leak_of_much_of_the_flow_is_found_sized_and_dated(command: str, lpm: 
     ("laws", "lpm"),
     [
         *(pytest.param((law,), 0.5, marks=[pytest.mark.slow, pytest.mark.long]) for law in ("laminar", "orifice")),
-        (("laminar", "orifice"), 0.4),
+        pytest.param(("laminar", "orifice"), 0.4, marks=pytest.mark.slow),
     ],
 )
 def test_zero_errors_of_the_transducers_do_not_bend_the_law(laws: tuple[str, ...], lpm: float) -> None:

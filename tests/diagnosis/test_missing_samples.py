@@ -13,9 +13,11 @@ from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 
+from ..representatives import SLOW, few
 from ..wording import says
 from .judging import judge
 
@@ -35,6 +37,12 @@ def observed(recording: Recording, view: str) -> Recording:
 @pytest.fixture(scope="module")
 def late_leak(records) -> Recording:  # type: ignore[no-untyped-def]
     return records(1, leak="0.05 L/min from 61 s", duration=120.0, throttled=True)
+
+
+@pytest.fixture(scope="module")
+def of_late_leak(late_leak: Recording) -> Diagnosis:
+    """The diagnosis of it as it is."""
+    return diagnose(late_leak)
 
 
 GAPS: dict[str, Callable[[Recording], Recording]] = {
@@ -66,7 +74,7 @@ def test_a_leak_after_a_gap_is_found(gap: str, view: str, late_leak: Recording) 
     assert diagnosis.onset_s == pytest.approx(61.0, abs=5.0)  # within the blocks that the gap takes
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", few(VIEWS, 1, SLOW))
 def test_a_few_missing_samples_change_no_verdict_of_a_sound_machine(view: str, healthy: Recording) -> None:
     diagnosis = diagnose(observed(GAPS["2 s of all channels"](healthy), view))
     assert diagnosis.verdict == "no leak"
@@ -83,9 +91,11 @@ MOTIONS = {
 
 
 @pytest.mark.parametrize("gaps", ["samples here and there", pytest.param("a slower encoder", marks=pytest.mark.slow)])
-def test_a_motion_with_short_gaps_is_that_of_a_mass(gaps: str, late_leak: Recording, healthy: Recording) -> None:
+def test_a_motion_with_short_gaps_is_that_of_a_mass(
+    gaps: str, late_leak: Recording, of_late_leak: Diagnosis, healthy: Recording
+) -> None:
     """A position on every fifth row ended in an error of linear algebra, single samples in `cannot tell`."""
-    whole, missing = diagnose(late_leak), diagnose(MOTIONS[gaps](late_leak))
+    whole, missing = of_late_leak, diagnose(MOTIONS[gaps](late_leak))
     assert (missing.verdict, missing.share) == ("leak", 1.0)
     assert missing.methods[0].detector == "volume balance"
     assert missing.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.1)
@@ -107,9 +117,11 @@ def test_only_a_missing_end_hides_a_leak(seconds: tuple[float, float], verdict: 
     assert (diagnosis.verdict, diagnosis.share < 0.95) == (verdict, True)
 
 
-def test_what_a_hole_touches_weighs_less_and_is_not_lost(late_leak: Recording, healthy: Recording) -> None:
+def test_what_a_hole_touches_weighs_less_and_is_not_lost(
+    late_leak: Recording, of_late_leak: Diagnosis, healthy: Recording
+) -> None:
     """The balance loses as much as the holes last, not the test functions that they touch."""
-    whole, holes = diagnose(late_leak), diagnose(dotted(late_leak))
+    whole, holes = of_late_leak, diagnose(dotted(late_leak))
     assert holes.verdict == "leak"
     assert holes.relative.pump_share == pytest.approx(whole.relative.pump_share, rel=0.05)
     sound = diagnose(dotted(healthy))
@@ -193,7 +205,7 @@ def test_single_samples_that_leap_are_left_out(late_leak: Recording) -> None:
     assert next(own.count for own in diagnosis.quality if own.code == "spike") == 2
 
 
-@pytest.mark.parametrize("flow", ["omega", "q_pump"])
+@pytest.mark.parametrize("flow", few(["omega", "q_pump"], 1, SLOW))
 def test_a_speed_without_a_sign_gets_it_from_the_motion(late_leak: Recording, flow: str) -> None:
     """Displacement over area read several times the assumed one, and no leak was found."""
     speed = late_leak["omega"] if flow == "omega" else late_leak["omega"] * load_rig("thesis").pump.q_b / (2 * np.pi)

@@ -244,7 +244,8 @@ def test_too_few_blocks_have_no_test() -> None:
     assert step_test(silent._replace(precision=0.0 * silent.precision, vector=0.0 * silent.vector)) is None
 
 
-@pytest.mark.parametrize("walk", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("walk", [0.0, 1.0])
 def test_what_is_believed_of_slope_and_walk_keeps_the_false_alarms_and_finds_more(walk: float) -> None:
     """A slope that is believed is nearly known: a step is found that a free slope would pass for."""
     count, draws = 30, 200

@@ -23,6 +23,7 @@ from sealscope.simulation.commands import parse_command
 from sealscope.simulation.simulate import simulate, simulate_experiment
 from sealscope.simulation.targets_and_loads import parse_force
 
+from ..representatives import SLOW, few
 from ..wording import says
 from .judging import judge
 
@@ -180,7 +181,7 @@ def test_what_noise_drowns_is_not_called_healthy() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [103, 107])
+@pytest.mark.parametrize("seed", few([103, 107], 1))
 def test_a_loaded_machine_that_wanders_is_not_called_leaky(seed: int) -> None:
     """Under 800 N the ringing follows friction twice as much as it does unloaded, and the change of RMS alarms."""
     machine = replace(draw("load", seed, rig="thesis-closed-loop", duration=120.0), command=parse_command("5 sin(2t)"))
@@ -188,7 +189,7 @@ def test_a_loaded_machine_that_wanders_is_not_called_leaky(seed: int) -> None:
     assert diagnose(run.recording.only(["u", "p_A", "p_B"]), rig="thesis-closed-loop").verdict != "leak"
 
 
-@pytest.mark.parametrize("rate", [100.0, 200.0])
+@pytest.mark.parametrize("rate", few([200.0, 100.0], 1, SLOW))
 def test_a_rate_that_does_not_show_the_ringing_shows_no_absence_of_a_leak(rate: float) -> None:
     """0.5 L/min read `no leak` in 2 of 6 records at 100 Hz, 5 of 6 at 200 Hz: details follow the strokes there."""
     record = {"command": "8 sin(t)", "rate": rate, "duration": "60 s", "seed": 1}

@@ -161,9 +161,8 @@ def believed_scatter(random: np.random.Generator) -> float:
     return float(np.exp(random.uniform(*ends)))
 
 
-@pytest.mark.parametrize(
-    "count", [1, pytest.param(3, marks=[pytest.mark.slow, pytest.mark.long]), pytest.param(6, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.long), 6])
 def test_the_chance_is_uniform_over_machines_as_they_are_believed(count: int) -> None:
     random = np.random.default_rng(count)
     made = [risen(random, count, believed_scatter(random)) for _ in range(80)]
@@ -233,6 +232,7 @@ def test_a_machine_that_repeats_itself_is_judged_closer_and_another_not_falsely(
         assert np.sum([own.chance < 0.05 for own in made]) <= binom.ppf(0.999, len(made), 0.05)
 
 
+@pytest.mark.slow
 def test_one_healthy_recording_tells_little() -> None:
     random = np.random.default_rng(1)
 
@@ -383,7 +383,8 @@ def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: 
     return rise(judged, healthy, (COLUMNS,))
 
 
-@pytest.mark.parametrize("draws", [2, pytest.param(9, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
+@pytest.mark.parametrize("draws", [2, pytest.param(9, marks=pytest.mark.long)])
 def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_logged(draws: int) -> None:
     random, leak = np.random.default_rng(12), 20.0 * PRIORS
     precise, vague, useless = (

@@ -19,6 +19,7 @@ from sealscope.diagnosis.verdict.evidence import LEAKS
 from sealscope.recordings import Recording, read
 from sealscope.reporting.messages import diagnosis_text, short_text
 
+from ..representatives import SLOW, few
 from ..wording import says
 from .balance_machine import AREA, machine, step
 
@@ -116,7 +117,7 @@ DIALECTS: dict[str, Callable[[Recording, Path], Path]] = {
 }
 
 
-@pytest.mark.parametrize("case", DIALECTS)
+@pytest.mark.parametrize("case", few(DIALECTS, 4, SLOW))
 def test_a_log_of_a_test_bench(case: str, own: Recording, tmp_path: Path) -> None:
     recording = read(DIALECTS[case](own, tmp_path))
     assert recording.rate == pytest.approx(own.rate, rel=1e-3)

@@ -22,6 +22,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
+from ..representatives import SLOW, few
 from ..wording import says
 
 RATE, DURATION, ONSET = 200.0, 60.0, 30.0
@@ -211,7 +212,7 @@ def test_a_zero_that_is_far_off_leaves_a_single_rod_s_leak_as_it_is(single_rod: 
     assert says(diagnosis.reason, "remark.zero too high" if bar > 0.0 else "remark.zero too low")
 
 
-@pytest.mark.parametrize("samples", [-2, 0, 2])
+@pytest.mark.parametrize("samples", few([2, 0, -2], 1, SLOW))
 def test_a_position_recorded_late_is_named_and_changes_no_size(samples: int) -> None:
     experiment = Experiment.of(command="3 sin(4t)", duration=40, leak="0.05 L/min from 20 s", seed=3)
     own = simulate_experiment(experiment).recording

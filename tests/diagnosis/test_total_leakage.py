@@ -14,6 +14,7 @@ from sealscope.reporting.messages import diagnosis_text, total_leakage
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
+from ..representatives import SLOW, few
 from .balance_machine import machine, step
 from .judging import judge
 
@@ -112,15 +113,16 @@ def test_no_leak_only_where_one_worth_finding_would_have_shown() -> None:
 @pytest.mark.parametrize(
     ("command", "load"),
     [
-        pytest.param("5 sin(2t)", "0 N", marks=pytest.mark.slow),
-        ("5 sin(2t)", "-3000 N"),
-        pytest.param("3 sin(4t)", "2000 N", marks=pytest.mark.slow),
+        pytest.param("5 sin(2t)", 0.0, marks=pytest.mark.slow),
+        ("5 sin(2t)", -3000.0),
+        pytest.param("3 sin(4t)", 2000.0, marks=pytest.mark.slow),
     ],
 )
-def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load: str) -> None:
+def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load: float) -> None:
     """An angle has no zero of the flow: what drifts over a cycle is what pump and piston pass together."""
     own = load_rig("single-rod-eha")
-    experiment = Experiment.of(rig=own, command=command, load=load, duration=60, leak="0.1 L/min from 0 s", seed=3)
+    loaded = {"cylinder.F_l": load}
+    experiment = Experiment.of(rig=own, set=loaded, command=command, duration=60, leak="0.1 L/min from 0 s", seed=3)
     simulated = simulate_experiment(experiment)
     difference = simulated.truth.outputs["p_A"] - simulated.truth.outputs["p_B"]
     true = own.pump.G_pump * float(np.abs(difference).mean()) * LPM + simulated.truth.mean_leak_lpm
@@ -134,7 +136,7 @@ def test_a_single_rod_s_total_is_stated_from_the_first_sample(command: str, load
 
 
 @pytest.mark.parametrize(
-    "stated", [{"pump.q_b": "4.9[cm^3/rev]"}, {"cylinder.A_A": "633 mm^2", "cylinder.A_B": "633 mm^2"}]
+    "stated", few([{"pump.q_b": "4.9[cm^3/rev]"}, {"cylinder.A_A": "633 mm^2", "cylinder.A_B": "633 mm^2"}], 1, SLOW)
 )
 def test_a_size_alone_says_nothing_of_what_a_healthy_pump_leaks(stated: dict[str, str]) -> None:
     """The pump of another rig is none of this machine's: with a size alone a worn or a large pump was a leak."""

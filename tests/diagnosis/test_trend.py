@@ -175,7 +175,8 @@ def delay(wears: float, seed: int) -> float:
     return trend.alarm.day - 20.0
 
 
-@pytest.mark.parametrize("machines", [1, pytest.param(3, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.slow
+@pytest.mark.parametrize("machines", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_faster_wear_alarms_earlier_and_before_it_has_doubled_the_level(machines: int) -> None:
     slow, fast = (np.median([delay(wears, seed) for seed in range(machines)]) for wears in (0.002, 0.02))
     assert 1.0 <= fast < 0.5 * slow

@@ -15,7 +15,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.simulate import simulate_experiment
 
-from ..representatives import few
+from ..representatives import SLOW, few
 from .balance_machine import irregular, machine, step
 from .judging import judge
 
@@ -109,24 +109,25 @@ def test_duties_that_do_not_repeat_and_loads(detector: VolumeBalance) -> None:
         assert judge(detector, machine(seed, speed=irregular(seed), load=push)).verdict == "no leak"
 
 
-def test_a_duty_that_changes_is_no_leak(detector: VolumeBalance) -> None:
+@pytest.mark.parametrize("seeds", few([1, 4], 1, SLOW))
+def test_a_duty_that_changes_is_no_leak(detector: VolumeBalance, seeds: int) -> None:
     def speed(t: np.ndarray) -> np.ndarray:
         return np.where(t < 60.0, 10.0, 16.0) * np.sin(4.0 * t)
 
     def load(t: np.ndarray) -> np.ndarray:
         return np.where(t < 60.0, 0.0, 5.0e4)
 
-    for seed in range(4):
+    for seed in range(seeds):
         assert judge(detector, machine(seed, speed=speed, load=load, ratio=1.002)).verdict == "no leak"
 
 
-def test_a_pump_that_warms_up_is_no_leak(detector: VolumeBalance) -> None:
-    for seed, tau in enumerate((10.0, 40.0, 100.0)):
-        warm = machine(seed, G_pump=lambda t, tau=tau: 2.4e-13 * (1.0 - 0.3 * np.exp(-t / tau)))
-        assert judge(detector, warm).verdict == "no leak"
+@pytest.mark.parametrize(("seed", "tau"), few([(1, 40.0), (0, 10.0), (2, 100.0)], 1))
+def test_a_pump_that_warms_up_is_no_leak(detector: VolumeBalance, seed: int, tau: float) -> None:
+    warm = machine(seed, G_pump=lambda t: 2.4e-13 * (1.0 - 0.3 * np.exp(-t / tau)))
+    assert judge(detector, warm).verdict == "no leak"
 
 
-@pytest.mark.parametrize("omega", [0.3, 2.0])
+@pytest.mark.parametrize("omega", few([0.3, 2.0], 1))
 def test_a_leak_worth_finding_is_two_percent_of_the_pumps_flow_however_long_the_cycle(
     detector: VolumeBalance, omega: float
 ) -> None:
@@ -159,7 +160,7 @@ def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
             assert "the scale of the position" in result.reason  # named, or said to compete with a leak
 
 
-@pytest.mark.parametrize(("channel", "towards"), [("p_A", -1.0), ("p_B", 1.0)])
+@pytest.mark.parametrize(("channel", "towards"), few([("p_A", -1.0), ("p_B", 1.0)], 1, SLOW))
 def test_oil_lost_to_the_outside_is_no_piston_leak(detector: VolumeBalance, channel: str, towards: float) -> None:
     """A side loses what its pressure drives out; half of that is a motion that no pressure difference explains."""
     healthy = machine(8)
@@ -193,7 +194,7 @@ def test_lives_with_what_a_rig_does(detector: VolumeBalance, worn: Recording, ti
 @pytest.mark.parametrize(
     "factor, offset",
     [
-        (1.0 / 6894.757, -50.0),
+        pytest.param(1.0 / 6894.757, -50.0, marks=pytest.mark.slow),
         *(pytest.param(*each, marks=[pytest.mark.slow, pytest.mark.long]) for each in ((3.0, 0.0), (1.0, 1.0e5))),
     ],
 )

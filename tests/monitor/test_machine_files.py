@@ -37,7 +37,7 @@ def commissioned(tmp_path_factory: pytest.TempPathFactory) -> dict[float, Path]:
     files = {}
     for G in (0.0, 3.0e-13):
         folder = tmp_path_factory.mktemp("healthy")
-        for seed in range(11, 15):
+        for seed in range(11, 14):
             ss.write(machine(seed, G=G, duration=30.0, rate=50.0), folder / f"run{seed}.nc")
         files[G] = ss.write_machine(ss.commission(folder, rig="thesis"), folder / "press.toml")
     return files
@@ -68,7 +68,7 @@ def test_the_samples_of_an_invalid_alarm_are_taught(tmp_path, commissioned):
     service.actuators.apply_mark(NAME, "invalid", text="another valve", by_whom="Ada")
     assert said_by(service.actuators) == "press.toml: taught as healthy"
     before, after = (ss.read_machine(tmp_path / f"press.toml{end}") for end in (".bak", ""))
-    assert (len(before.healthy), len(after.healthy)) == (4, 5)
+    assert (len(before.healthy), len(after.healthy)) == (3, 4)
     (taught,) = [own for own in after.healthy if own.file == f"{NAME}-1"]
     assert WORN.t[0] + 100.0 < taught.start_s < WORN.t[-1]
     (alarm,) = after.alarms
@@ -79,7 +79,7 @@ def test_samples_that_leak_are_not_taught_whatever_is_said(tmp_path, commissione
     service = alarmed(tmp_path, commissioned[0.0], worn(1.0e-11))
     service.actuators.apply_mark(NAME, "invalid", text="no oil seen")
     assert said_by(service.actuators).startswith("press.toml: not taught: a healthy recording must not leak")
-    assert len(ss.read_machine(tmp_path / "press.toml").healthy) == 4
+    assert len(ss.read_machine(tmp_path / "press.toml").healthy) == 3
 
 
 @pytest.mark.slow
@@ -99,7 +99,7 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
         return replace(machine(seed, G=3.0e-13, duration=30.0, rate=50.0), provenance=made)
 
     early, late = healthy(alarm.onset_s - 3600.0), healthy(alarm.date_s + 3600.0)
-    assert len(known.with_healthy(early).healthy) == 5
+    assert len(known.with_healthy(early).healthy) == 4
     with refusal("press 1-1", "valid"):
         known.with_healthy(late)
     service.actuators.apply_mark(NAME, "repaired")
@@ -122,7 +122,7 @@ def test_the_last_word_on_an_alarm_counts(tmp_path, commissioned):
     later = known.alarms[1].date_s + 120.0
     made = {"start": datetime.fromtimestamp(later, UTC).replace(tzinfo=None).isoformat()}
     late = replace(machine(20, G=3.0e-13, duration=30.0, rate=50.0), provenance=made)
-    assert len(known.with_healthy(late).healthy) == 6
+    assert len(known.with_healthy(late).healthy) == 5
     again = known.alarms[0]._replace(onset_s=later - 60.0, date_s=later)
     with refusal("leak"):  # another alarm, of a database that counts from 1 again
         replace(known, alarms=(*known.alarms, again)).with_healthy(late)

@@ -57,6 +57,7 @@ def test_what_is_replayed_is_known(undisturbed, undisturbed_run, tmp_path):
     assert (out, again) == (undisturbed_run[1], "")
 
 
+@pytest.mark.slow
 def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
     settings = settings_in(tmp_path)
     lines = tmp_path / "lines.jsonl"
@@ -287,6 +288,7 @@ def test_a_clock_that_is_set_back_hides_nothing_that_is_new(tmp_path):
     assert [alarm["id"] for alarm in store.alarms()] == ["a-2", "a-1"]
 
 
+@pytest.mark.slow
 def test_a_restart_with_other_thresholds_changes_nothing_that_was_said(tmp_path):
     """A leak below the threshold is announced when the threshold is lowered: by the next block, and as raised."""
     settings = settings_in(tmp_path)

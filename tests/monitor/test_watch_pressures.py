@@ -246,6 +246,6 @@ def test_a_damaged_state_is_refused_in_one_line(damage: str, learned: str):
 
 def test_a_rig_of_assumptions_states_no_litres():
     watch = ss.watch(ss.load_rig("thesis").as_assumed("for this test"), learn_hours=LEARN)
-    _, estimates = run(part(0, HEALTHY), 50_000, watch)
+    _, estimates = run(part(0, 420), 50_000, watch)
     assert watch.baseline is not None
     assert all(replace(estimate, status="") == BlockEstimate(estimate.number, estimate.t, "") for estimate in estimates)

@@ -76,7 +76,8 @@ def mass(rig, run) -> np.ndarray:
     return held
 
 
-@pytest.mark.parametrize("throttled", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["free", "throttled"])
+@pytest.mark.slow
+@pytest.mark.parametrize("throttled", [False, True], ids=["free", "throttled"])
 @settings(max_examples=4, deadline=None)
 @given(
     amplitude=st.floats(0.5, 6.0),
@@ -93,6 +94,7 @@ def test_where_volumes_move_the_mass_is_kept(check_rig, drive, throttled, amplit
     assert np.abs(held - held[0]).max() <= 1e-8 * held[0]  # the solver's: a quarter at half the step
 
 
+@pytest.mark.slow
 def test_the_mean_pressure_of_a_sealed_circuit_stays_and_only_balanced_volumes_pump_it_up(check_rig, drive):
     """180 s of long strokes; printed as volume flows, the balances make oil out of nothing."""
     ends = {}

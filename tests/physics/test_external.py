@@ -103,7 +103,7 @@ def test_the_make_up_holds_the_low_side_and_gives_off_its_own_pressure(check_rig
 
 def test_without_a_make_up_a_leaking_rod_seal_empties_the_circuit_and_the_refusal_names_the_remedy(check_rig, drive):
     with refusal("fluid.p_vap", "check_valves", error=SimulationFailed):
-        drive(check_rig(G_ext_A=2e-12), 20.0)
+        drive(check_rig(G_ext_A=2e-12, volumes="position"), 20.0)
 
 
 def test_a_tight_circuit_needs_no_make_up_once_it_is_filled(check_rig, drive):

@@ -65,7 +65,17 @@ def test_the_spool_answers_a_step_as_its_lag_and_its_rate_limit_say(drive, volts
     assert run["x_s"].max() <= v.x_max
 
 
-@given(dp=st.floats(1e3, 2e7), way=st.floats(-5e-4, 5e-4), overlap=st.floats(-1e-4, 1e-4), dp_N=st.floats(1e5, 1e7))
+def whole_picometres(length: float) -> float:
+    """An opening of 1e-310 m is a subnormal number, whose flow has few digits."""
+    return round(length, 12)
+
+
+@given(
+    dp=st.floats(1e3, 2e7),
+    way=st.floats(-5e-4, 5e-4).map(whole_picometres),
+    overlap=st.floats(-1e-4, 1e-4).map(whole_picometres),
+    dp_N=st.floats(1e5, 1e7),
+)
 def test_an_edge_passes_its_rated_flow_by_the_root_of_pressure_and_evenly_with_its_opening(dp, way, overlap, dp_N):
     Q_N, x_max, dp_lam = 1.5e-4, 5e-4, 5e4
     share = max(way - overlap, 0.0) / x_max

@@ -212,7 +212,7 @@ def examples(default: int, slow: int):
 
 
 #: Compiled of its own, and long.
-LONG = ("lines, losses and an opposing cylinder", "servo valve")
+LONG = ("lines, losses and an opposing cylinder", "servo valve", "single rod")
 
 
 @pytest.mark.parametrize(

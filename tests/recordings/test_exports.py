@@ -267,6 +267,7 @@ def test_no_cell_keeps_the_search_for_units_busy(cell: str, tmp_path: Path) -> N
     assert count_calls(lambda: refused(tmp_path / "log.csv")) < 1000 * len(text)
 
 
+@pytest.mark.slow
 def test_cells_of_many_unknown_units_do_not_keep_it_busy(tmp_path: Path) -> None:
     odd = ";".join(f"{k} q{chr(97 + k % 26)}{chr(97 + k // 26 % 26)}" for k in range(65, 1000))
     text = "t [s];p_A [Pa]\n" + f"{odd}\n" * 3

@@ -134,10 +134,16 @@ SLOW = {
     "delimiters": "," * 60_000 + "\n" + "," * 60_000,
     "open quotation marks": "t [s],p_A [Pa]\n" + '0,"1\n' * 10_000,
 }  # fmt: skip
+#: Texts that take a second or more.
+LONG = ("headings between blanks", "delimiters")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "headings between blanks" else name for name in SLOW]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in ("headings between blanks", "delimiters") else name
+        for name in SLOW
+    ],
 )
 def test_the_work_goes_with_the_length_of_a_text(tmp_path: Path, name: str) -> None:
     path = tmp_path / "log.csv"

@@ -26,6 +26,7 @@ PAGE = "<!DOCTYPE html><title>t</title><h1>Leak</h1>"
 BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
 def test_a_browser_prints(tmp_path: Path) -> None:
     assert printing.print_page(PAGE, tmp_path / "page.pdf") == Path(str(BROWSER)).name

@@ -90,7 +90,7 @@ def test_details_are_windowed_where_they_are_free_of_padding():
     assert ends[-1] <= 6000 - 120
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=8)
 @given(block=st.integers(1, 3000), seed=st.integers(0, 2**32 - 1))
 def test_the_live_chain_gives_the_windows_of_the_whole_recording(block, seed):
     x = 3e5 + 1e3 * np.random.default_rng(seed).normal(size=6000)

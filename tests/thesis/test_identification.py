@@ -109,6 +109,7 @@ def test_the_sign_of_d3_on_p_A_is_predicted_from_leak_free_data(measured_sheet: 
     assert 0.35 < np.mean(change) / np.mean(real) < 0.65
 
 
+@pytest.mark.slow
 @needs_sheet
 def test_only_the_leak_free_columns_are_read(measured_sheet: DataSheet, residuals: np.ndarray) -> None:
     sheet = measured_sheet

@@ -9,9 +9,9 @@ import sealscope as ss
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """Four healthy recordings of 20 s."""
+    """Three healthy recordings of 20 s."""
     path = tmp_path_factory.mktemp("healthy")
-    for seed in range(1, 5):
+    for seed in range(1, 4):
         ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", seed=seed), path / f"run{seed}.nc")
     return path
 

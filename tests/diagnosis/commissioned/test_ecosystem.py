@@ -12,19 +12,32 @@ import pytest
 import sealscope as ss
 
 
+def record(path, seed, leak=None):
+    """20 s of a machine whose logger has no command: nothing is fitted to what the pressures make of one."""
+    recording = ss.simulate(command="3 sin(4t)", duration="20 s", leak=leak, seed=seed)
+    ss.write(recording.only(name for name in recording.channels if name != "u"), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two healthy recordings."""
+    path = tmp_path_factory.mktemp("healthy")
+    for seed in (1, 2):
+        record(path / f"run{seed}.nc", seed)
+    return path
+
+
 @pytest.fixture(scope="module")
 def leaking(tmp_path_factory):
-    path = tmp_path_factory.mktemp("leaking") / "leaking.nc"
-    ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", leak="0.05 L/min from 10 s", seed=8), path)
-    return path
+    return record(tmp_path_factory.mktemp("leaking") / "leaking.nc", 8, "0.05 L/min from 10 s")
 
 
 def test_the_estimator_learns_and_predicts(folder, leaking):
     """Order, subsets, copies and a pickle change nothing; a second fit forgets the first."""
     from sklearn.base import clone
 
-    healthy, new = sorted(folder.iterdir())[:2], leaking.with_name("new.nc")
-    ss.write(ss.simulate(command="3 sin(4t)", duration="20 s", seed=44), new)
+    healthy, new = sorted(folder.iterdir()), record(leaking.with_name("new.nc"), 44)
     detector = ss.LeakDetector(rig="thesis")
     assert detector.fit([new]) is detector
     margins = detector.fit(healthy).decision_function([new, leaking])
@@ -71,8 +84,8 @@ def test_the_estimator_passes_the_checks_of_scikit_learn_that_apply():
 
 
 @pytest.fixture(scope="module")
-def leak(machine, leaking):
-    return machine.diagnose(leaking)
+def leak(folder, leaking):
+    return ss.commission(folder, rig="thesis", name="actuator7").diagnose(leaking)
 
 
 def test_a_diagnosis_is_a_row_of_a_table(leak):

@@ -91,13 +91,13 @@ def test_without_its_damaged_summary_the_machine_has_the_others(pair):
     assert "run2.nc" in refused(text)
     parts = text.read_text().split("[[healthy]]")
     text.write_text("[[healthy]]".join(part for part in parts if "run2.nc" not in part))
-    assert [learnt.file for learnt in ss.read_machine(text).healthy] == ["run1.nc", "run3.nc", "run4.nc"]
+    assert [learnt.file for learnt in ss.read_machine(text).healthy] == ["run1.nc", "run3.nc"]
 
 
 def test_a_summary_that_is_not_there_is_named(pair):
     text, summaries = pair
     summaries.write_bytes(b"".join(summaries.read_bytes().splitlines(keepends=True)[:-1]))
-    assert "of run4.nc must be in the file of healthy summaries, got none such" in refused(text)
+    assert "of run3.nc must be in the file of healthy summaries, got none such" in refused(text)
 
 
 def test_summaries_that_were_left_behind_are_asked_for(pair):
@@ -109,9 +109,9 @@ def test_summaries_that_were_left_behind_are_asked_for(pair):
 def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
     text, summaries = pair
     alone = text.rename(tmp_path / "press.toml")
-    assert len(ss.read_machine(alone).healthy) == 4
+    assert len(ss.read_machine(alone).healthy) == 3
     summaries.rename(tmp_path / "press.healthy")
-    assert len(ss.read_machine(alone).healthy) == 4
+    assert len(ss.read_machine(alone).healthy) == 3
     ss.write_machine(ss.read_machine(alone), alone)
     assert 'summaries = "press.healthy"' in alone.read_text()
 
@@ -131,9 +131,9 @@ def test_a_machine_of_before_version_0_1_is_read_and_written_anew(pair):
     ss.write_machine(old, text)
     assert "lesson" not in text.read_text()
     summaries.with_suffix(".lessons").unlink()
-    assert len(ss.read_machine(text).healthy) == 4
+    assert len(ss.read_machine(text).healthy) == 3
     text.with_suffix(".toml.bak").rename(text)
-    assert len(ss.read_machine(text).healthy) == 4
+    assert len(ss.read_machine(text).healthy) == 3
 
 
 @pytest.mark.parametrize("name", ["../actuator7.healthy", "/etc/passwd", "sub/actuator7.healthy", "passwd"])
@@ -174,13 +174,13 @@ def test_each_text_keeps_its_summaries_whichever_file_was_written_last(pair, mac
         return [(known.name, len(known.healthy)) for known in texts]
 
     assert [written(count) for count in range(3)] == [
-        [("first", 4), ("kept", 4)],
-        [("first", 4), ("kept", 4)],
-        [("first", 4), ("first", 4)],
+        [("first", 3), ("kept", 3)],
+        [("first", 3), ("kept", 3)],
+        [("first", 3), ("first", 3)],
     ]
     ss.write_machine(later, text)
-    assert len(ss.read_machine(text).healthy) == 3
-    assert len(ss.read_machine(text.with_suffix(".toml.bak")).healthy) == 4
+    assert len(ss.read_machine(text).healthy) == 2
+    assert len(ss.read_machine(text.with_suffix(".toml.bak")).healthy) == 3
 
 
 def test_summaries_that_no_text_names_are_kept_for_its_copies_while_they_are_few(pair, machine, monkeypatch):
@@ -189,7 +189,7 @@ def test_summaries_that_no_text_names_are_kept_for_its_copies_while_they_are_few
     copy.write_bytes(text.read_bytes())
     for _ in range(3):
         ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
-    assert len(ss.read_machine(copy).healthy) == 4
+    assert len(ss.read_machine(copy).healthy) == 3
     monkeypatch.setattr("sealscope.diagnosis.commissioned.machine_file._SPARE", 0)
     ss.write_machine(replace(machine, healthy=machine.healthy[:1]), text)
     assert len(summaries.read_bytes().splitlines()) == 2
