@@ -2,13 +2,12 @@
 
 If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
 pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
-rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. If a
-recording shows that such holds leak more than rests do, their leakage has a third coefficient, else a drive that is
-switched off would look like a leak that ends. Between recordings one coefficient is compared for all rests, since many
-machines show the piston's leak in such holds alone. Both balances select from the same columns, so one set of Gram
-matrices serves both. Let g be the leakage coefficient (of p_A - p_B) in motion and r that at rest; their covariance
-allows for errors that differ from block to block. With open valves r scatters about g; with shut valves and a healthy
-piston, about zero:
+rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The
+leakage of such holds has a third coefficient within a recording, else a drive that is switched off would look like a
+leak that ends. Between recordings one coefficient is compared for all rests, since many machines show the piston's
+leak in such holds alone. Both balances select from the same columns, so one set of Gram matrices serves both. Let g be
+the leakage coefficient (of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from
+block to block. With open valves r scatters about g; with shut valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
@@ -87,34 +86,15 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 
 
 def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
-    """Set the column of a pump that holds the load to zero, unless the recording shows that such holds leak more.
+    """Set the column of a pump that holds the load to zero if the pump is never off.
 
-    The arguments are those of `has_rests`.
+    Holds are then the only rests, and show the leak past the piston. The arguments are those of `has_rests`.
     """
-    if _holding_odds(blocks, roles) > 0.0:
+    if _rest_share(blocks, roles, TURNING, HOLDING) > NEGLIGIBLE:
         return blocks
     gram, held = blocks.gram.copy(), roles.names.index(HOLDING)
     gram[..., held, :] = gram[..., held] = 0.0
     return replace(blocks, gram=gram)
-
-
-def _holding_odds(blocks: Blocks, roles: ColumnRoles) -> float:
-    """Compute the log odds that a pump leaks while it holds the load as it does in motion, rather than not at all.
-
-    A pump at rest, which is cut off, does not leak; both leakages are what is added to the leakage of such rests. The
-    log odds are minus infinity if the recording has no such rests or a single block: holds then show the leak past
-    the piston. The arguments are those of `has_rests`.
-    """
-    if _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE or len(blocks) < 2:
-        return -np.inf
-    columns = [*roles.nuisance, *(roles.names.index(name) for name in STATES)]
-    coefficients, covariance = _fit_with_robust_covariance(blocks.gram[:, 0], columns, roles.left)
-    turning, holding = (columns.index(roles.names.index(name)) for name in (TURNING, HOLDING))
-    variance = float(covariance[holding, holding])
-    difference_variance = variance + float(covariance[turning, turning] - 2.0 * covariance[turning, holding])
-    if not (variance > 0.0 and difference_variance > 0.0):
-        return -np.inf
-    return -rest_log_odds(coefficients[holding], variance, coefficients[turning], difference_variance)
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:

@@ -165,7 +165,7 @@ class BalanceLeak:
         assert motion_rise is not None
         low, high = motion_rise.interval()
         flow = estimate_rise_flow(
-            balance.leak,
+            balance.compared_leak,
             self.step,
             motion_rise.value,
             (high - low) / (2.0 * WITHIN_95),
@@ -352,7 +352,7 @@ class BalanceLeak:
         The information of a block is the sum of its row of the precision matrix (`onset.Information`).
         """
         is_after = self.balance.running_blocks.time >= step.onset().value
-        weights = self.balance.leak.precision.sum(axis=0)
+        weights = self.balance.compared_leak.precision.sum(axis=0)
         return float(np.clip(weights[is_after].sum() / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
     @property

@@ -141,6 +141,13 @@ class RecordedBalance:
         return information(self.running_blocks, self.columns, self.columns[0].leak)
 
     @cached_property
+    def compared_leak(self) -> Information:
+        """The same likelihood without columns that count only within a recording, as recordings are compared."""
+        roles = self.columns[0]
+        omitted = roles.within[0] if roles.within else None
+        return information(self.running_blocks, self.columns, roles.leak, omitted)
+
+    @cached_property
     def test(self) -> StepTest | None:
         """Test for a leak that begins within the recording; None if too few blocks have information."""
         return find_leak_step(self.running_blocks, self.columns, self.leak)
