@@ -29,7 +29,6 @@ from sealscope.diagnosis.inference.terms import (
     CYLINDER,
     HALF_DIFFERENCE,
     MIN_ABSOLUTE_PRESSURE,
-    MIN_HOLD,
     MIN_REST,
     MOVING_BIAS,
     START,
@@ -37,12 +36,14 @@ from sealscope.diagnosis.inference.terms import (
     RestLimits,
     Signals,
     equations,
+    find_rests,
     shut_at_rest,
     with_rests,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.corrections.gaps import flag_holes
+from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.plain_state import plain_array, require_part, restore_array
@@ -108,7 +109,7 @@ class BlockStream:
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
-            self._margin += round(AVERAGING_TIME * rate) + round(max(MIN_REST, MIN_HOLD) * rate)
+            self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
         self._rest_limits: RestLimits | None = None  # from the first samples on
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # from gauge to absolute pressure [Pa], by channel
@@ -514,11 +515,13 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         return None
     columns = ColumnRoles(stream_balances[0])
 
+    has_holds = may_shut and _longest_hold(Signals(samples, recording.rate), balances[0]) >= INFERENCE.held_oil.shortest
+
     def regime_blocks_about(shut: bool, offset: float) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa], for a pump that is cut off at rest (`shut`) or not."""
         blocks = blocks_about(offset)
         assert blocks is not None  # as many samples as for `recorded`
-        return apply_regime(blocks, columns, shut) if may_shut else blocks
+        return apply_regime(blocks, columns, shut, has_holds) if may_shut else blocks
 
     open_regime = _build_regime(balances, partial(regime_blocks_about, False))
     if not may_shut or not has_rests(recorded, columns):
@@ -526,6 +529,16 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
     shut_regime = _build_regime(shut_balances, partial(regime_blocks_about, True))._replace(shut=True)
     return RecordedBlocks(open_regime, shut_regime, shut_odds(recorded, columns))
+
+
+def _longest_hold(signals: Signals, balance: Equation) -> float:
+    """Find the longest time [s] in which the piston rests while the pump turns, as to hold a load; 0 without any."""
+    pumped, moved = balance.left(signals), signals.step("x")
+    pump_rests, piston_rests = (
+        find_rests(values, signals.rate, max_rest_rate(values, signals.rate)) for values in (pumped, moved)
+    )
+    lengths = find_runs(piston_rests & ~pump_rests)[:, 1]  # [samples]
+    return float(lengths.max(initial=0)) / signals.rate
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:

@@ -36,7 +36,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, Equation
+from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -211,7 +211,8 @@ class ColumnRoles:
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
-        states = tuple(self.names.index(name) for name in STATES) if MOVING_BIAS in self.names else ()
+        # rests are told from motion here, but not each of their kinds: they would hide outliers
+        states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None
         self.drivers = tuple(term.driver for term in equation.terms)

@@ -632,7 +632,7 @@ def _test_step_up(whitened: _Whitened, steps: Array, fits: _StepFits) -> StepTes
         onsets=whitened.onsets,
         likelihood=log_likelihood_with_step.max(axis=0),
         size=size,
-        deviation=np.sqrt(np.maximum(squares, 0.0) / n / energies[walk_without_step]),
+        deviation=np.sqrt(np.maximum(squares, 0.0) / n) / np.sqrt(energies[walk_without_step]),
         fitted=FittedStep(float(size_at_best), float(error_at_best)),
         walk=(unit * float(WALKS[walk_without_step]), unit * float(WALKS[walk])),
         noise=(float(total[walk_without_step]) / n, noise),

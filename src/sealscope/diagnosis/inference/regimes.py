@@ -3,7 +3,7 @@
 If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
 pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
 rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The
-leakage of such holds has a third coefficient within a recording, else a drive that is switched off would look like a
+leakage of all holds then has a third coefficient within a recording, else a drive that is switched off would look like a
 leak that ends. Between recordings one coefficient is compared for all rests, since many machines show the piston's
 leak in such holds alone. Both balances select from the same columns, so one set of Gram matrices serves both. Let g be
 the leakage coefficient (of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from
@@ -34,20 +34,25 @@ from sealscope.recordings.recording import Array
 NEGLIGIBLE = 1e-6
 
 
-def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
+def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool = True) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
     piston, and the flow offset in motion (`terms.with_rests`). For open valves these columns are dropped from the Gram
-    matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`).
+    matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`). The leakage
+    of a pump that holds the load is distinguished only with `has_holds`, i.e. if it does so for seconds, and if it is
+    off at other times.
     """
     names = (*roles.names, "left")
-    if shut:
-        blocks, bias = _drop_holding(blocks, roles), names.index(MOVING_BIAS)
-        index = [bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
-    else:
-        index = [k for k, name in enumerate(names) if name not in STATES]
-    return replace(blocks, gram=np.asarray(blocks.gram[..., index, :][..., index]))
+    if not shut:
+        kept = [k for k, name in enumerate(names) if name not in STATES]
+        return replace(blocks, gram=np.asarray(blocks.gram[..., kept, :][..., kept]))
+    bias, held = names.index(MOVING_BIAS), names.index(HOLDING)
+    kept = [bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
+    gram = blocks.gram.copy()
+    if not has_holds or _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE:
+        gram[..., held, :] = gram[..., held] = 0.0
+    return replace(blocks, gram=np.asarray(gram[..., kept, :][..., kept]))
 
 
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
@@ -83,18 +88,6 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
     return float(1.0 - energies[columns].sum() / max(energies[leak], np.finfo(float).tiny))
-
-
-def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
-    """Set the column of a pump that holds the load to zero if the pump is never off.
-
-    Holds are then the only rests, and show the leak past the piston. The arguments are those of `has_rests`.
-    """
-    if _rest_share(blocks, roles, TURNING, HOLDING) > NEGLIGIBLE:
-        return blocks
-    gram, held = blocks.gram.copy(), roles.names.index(HOLDING)
-    gram[..., held, :] = gram[..., held] = 0.0
-    return replace(blocks, gram=gram)
 
 
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:

@@ -41,8 +41,6 @@ MIN_ABSOLUTE_PRESSURE: float = INFERENCE.pressure.least
 HALF_DIFFERENCE = 0.025
 #: Averaging time of the speeds from which rests (standstills) are found, and minimum length of a rest [s].
 AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
-#: Minimum time in which a turning pump holds the load [s].
-MIN_HOLD: float = INFERENCE.held_oil.shortest
 
 
 class RestLimits(NamedTuple):
@@ -153,9 +151,8 @@ class Signals:
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
 
-        The pump then holds the load by replacing what leaks. Only times of at least `MIN_HOLD` count, since the
-        reversals of a slow motion look alike for shorter times. `pump_volume` is that of `moving`. Without
-        `rest_limits` all flags are 0.
+        The pump then holds the load by replacing what leaks. `pump_volume` is that of `moving`. Without `rest_limits`
+        all flags are 0.
         """
         return self._find_states(pump_volume)[1]
 
@@ -167,8 +164,8 @@ class Signals:
         if self._states is None:
             pump_rests = find_rests(pump_volume(self), self.rate, limits.pump)
             piston_rests = find_rests(self.step("x"), self.rate, limits.piston)
-            is_holding = _keep_long_runs(~pump_rests & piston_rests, round(MIN_HOLD * self.rate))
-            self._states = (~pump_rests & ~piston_rests).astype(float), is_holding.astype(float)
+            is_moving, is_holding = ~pump_rests & ~piston_rests, ~pump_rests & piston_rests
+            self._states = is_moving.astype(float), is_holding.astype(float)
         return self._states
 
 
@@ -187,15 +184,8 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     )
     is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate  # in the window that begins at a sample
     is_slow &= n_missing[window:] == n_missing[:-window]
-    return _keep_long_runs(_extend_flags(is_slow, window), min_length)
-
-
-def _keep_long_runs(flags: NDArray[np.bool_], min_length: int) -> NDArray[np.bool_]:
-    """Clear the flags (n,) in runs of fewer than `min_length` consecutive flagged samples."""
-    if len(flags) < min_length:
-        return np.zeros_like(flags)
-    n_cleared = np.concatenate([[0], np.cumsum(~flags)])
-    return _extend_flags(n_cleared[min_length:] == n_cleared[:-min_length], min_length)
+    n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
+    return _extend_flags(n_moving[min_length:] == n_moving[:-min_length], min_length)
 
 
 def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
