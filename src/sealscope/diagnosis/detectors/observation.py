@@ -176,7 +176,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
     They are the null distributions of the test results (observables) of all detectors. A test for a change within a
     recording has one value from each healthy recording. The tests of one kind of data (`Observable.data`) that compare
     recordings share a distribution: the largest surprisal of each healthy recording, compared with all others. With
-    `shut`, those of the volume balance are under the hypothesis that valves cut the pump off at rest.
+    `shut`, the results of the volume balance hold if valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

@@ -7,13 +7,13 @@ to that of their union. A stream and a whole recording are therefore handled ali
 more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
-level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its size (`priors.toml`):
+level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).
+Let d be the column of g (the tested column), o the other columns with their drifts, y the left side and s^2 the
+residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
+o o' over all rows, plus the precision of the priors, and m the sum of o y. The likelihood is exp(eta'g - g'Lambda g/2)
+with
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2.
-
-d is the column of g (the tested column), o are the other columns with their drifts, y is the left side and s^2 the
-residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
-o o' over all rows, plus the precision of the priors, and m that of o y. The likelihood is exp(eta'g - g'Lambda g/2).
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ class ColumnRoles:
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
     `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, of the
-    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): those of the terms;
+    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): names and drivers of the terms;
     `healthy_conductance` [m^3/(s Pa)]: standard deviation of a healthy machine's leak.
     """
 

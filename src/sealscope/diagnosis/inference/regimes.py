@@ -2,18 +2,18 @@
 
 If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
 pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
-rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The
-leakage of such holds has a third coefficient within a recording, else a drive that is switched off would look like a
-leak that ends. Between recordings one coefficient is compared for all rests, since many machines show the piston's
-leak in such holds alone. Both balances select from the same columns, so one set of Gram matrices serves both. Let g be
-the leakage coefficient (of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from
-block to block. With open valves r scatters about g; with shut valves and a healthy piston, about zero:
+rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The leakage
+of such holds has a third coefficient within a recording, else a drive that is switched off would look like a leak that
+ends. Between recordings one coefficient is compared for all rests, since many machines show the piston's leak in such
+holds alone. Both balances select from the same columns, so one set of Gram matrices serves both. Let g be the leakage
+coefficient (of p_A - p_B) in motion and r the one at rest; their covariance allows for errors that differ from block to
+block. With open valves r scatters about g; with shut valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
-where V are the variances of the estimates, and s and w the relative scatters of the prior. The odds of the recordings
-of one machine multiply. Since a leaking piston moves r towards g, the healthy recordings decide (`shut` in
-`volumes.detector`).
+where V are the variances of the estimates, and s and w the prior scatters of r over g (`shut` and `open` of `[rest]` in
+`priors.toml`). The odds of the recordings of one machine multiply. Since a leaking piston moves r towards g, the
+healthy recordings decide (`shut` in `volumes.detector`).
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -39,7 +39,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
     piston, and the flow offset in motion (`terms.with_rests`). For open valves these columns are dropped from the Gram
-    matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`).
+    matrices. For shut valves the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`).
     """
     names = (*roles.names, "left")
     if shut:

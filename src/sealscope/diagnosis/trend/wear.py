@@ -106,7 +106,7 @@ class Levels:
 
     @property
     def interval(self) -> float:
-        """Typical time between two successive recordings [days]; 1 if there is only one."""
+        """Median of the times > 0 between successive recordings [days]; 1 if there is none."""
         steps = np.diff(self.t)
         return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 
@@ -114,9 +114,11 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        It is the root of a weighted mean of two variances. The first is that of the prior plus the mean square of the
-        stated errors; its weight is the prior's degrees of freedom. The second follows from the median change between
-        neighbours in a group; its weight is the number of these changes.
+        From the prior's `scale` and `freedom` f, and the n changes between neighbours in a group, it is
+
+            sqrt((f v_prior + n v_changes) / (f + n)),    v_prior = scale^2 + mean of error^2,
+
+        where v_changes is the variance of a level that the median change corresponds to.
         """
         prior = self.prior
         # the step of two neighbours has twice the variance of one
@@ -265,9 +267,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     `profiles` (n, m) are the effects of m changes of unit size on each recording. With `may_grow`, the level may have
     grown evenly since the first recording even without a change.
 
-    The levels have the covariance shared + tau^2 (r C + (1 - r) I) + error^2, where C is the correlation over the
-    time between recordings. Vectors are whitened by its Cholesky factor L: z is the levels, u the unit level of the
-    last group, and G the profiles. Up to each recording a = sum G^2 and b = sum G z.
+    With C the correlation over the time between recordings, `error` the standard errors that they state, and `shared`
+    what does not depend on tau (the wide priors on the level of each group and on the growth, and the prior on the
+    covariate's coefficient), the levels have the covariance
+
+        shared + tau^2 (r C + (1 - r) I) + error^2 = L L'.
+
+    Multiplied by L^-1, the levels become z, the profiles G, and the covariance of the levels with the level of the last
+    group u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
     """
     from scipy.linalg import solve_triangular
 

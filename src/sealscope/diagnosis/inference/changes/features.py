@@ -154,8 +154,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to that of the neighbouring bins.
 
-    `frequency`: that of the line, divided by the sampling rate. Ringing is wider than a line and raises the
-    neighbouring bins as well. The spectrum is Welch's estimate from both halves of each block.
+    `frequency`: frequency of the line over the sampling rate. Ringing is wider than a line and raises the neighbouring
+    bins as well. The spectrum is Welch's estimate from both halves of each block.
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)

@@ -5,15 +5,16 @@ Such a hold leaves each chamber a closed volume with leaks. From the beginning o
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
-with the piston's areas m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk
-modulus K and free air alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are those of the
-pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way, while
-a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The
-readings of all holds form one regression, each side of a hold about its mean. The logarithms of K, alpha and the
-volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is incompressible; the
-regression is linearised about the estimate, iteratively. The onset of the leak and the sensor offset z of p_A - p_B are
-those of the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses,
-each with its probability.
+with G, e_A and e_B the coefficients of the leaks past the piston and to the outside from A and B, the piston's areas
+m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk modulus K and free air
+alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are the time integrals of the gauge pressures;
+p_0 is the atmospheric pressure. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the
+piston gives way, while a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold
+(`LockedHold.edges`). The readings of all holds form one regression, each side of a hold about its mean. The logarithms
+of K, alpha and the volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is
+incompressible; the regression is linearised about the estimate, iteratively. The onset of the leak and the sensor
+offset z of p_A - p_B have the highest posterior; a leak that has equalised the pressures determines z. The three leaks
+are hypotheses, each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -302,14 +303,15 @@ class HeldChambers:
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of the volumes that the piston displaces in holds on the properties of the oil.
+        """Regressions of displaced volumes on the oil's properties: without check valves, and with refilling ones.
 
-        The first is for chambers without check valves, the second for check valves that refill a chamber.
+        A displaced volume is what the piston displaces in a hold; the properties are compressibility, dead volumes of A
+        and B, and free air (`_OilRegression`).
         """
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
-        """Build the regression of the volumes that the piston displaces in holds on the properties of the oil.
+        """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
 
         Its rows are the readings of each hold, side A before side B, relative to their mean over the hold. A reading
         is a mean of several samples (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the

@@ -1,8 +1,8 @@
 """Balances of recordings without position or without flow: over whole cycles, or while the piston is held.
 
 A suitable test function removes the piston's displacement from the volume balance. A box of one cycle, convolved with
-itself, has a double zero at every harmonic of the cycle. Over it a piston that a control loop returns displaces
-nothing,
+itself, has a double zero at every harmonic of the cycle. With this test function phi, a piston that a control loop
+returns displaces nothing,
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 

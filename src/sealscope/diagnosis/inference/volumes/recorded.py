@@ -117,7 +117,7 @@ class RecordedBalance:
 
     @property
     def is_creep(self) -> bool:
-        """True if the flow is that by which a load creeps while valves hold it, and no pump's flow is known."""
+        """True if the balance's flow is the creep of a load that valves hold, as no pump's flow is known."""
         return self.equations[0].name == LOCKED
 
     @cached_property
@@ -142,7 +142,7 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """The same likelihood without columns that count only within a recording, as recordings are compared."""
+        """Likelihood of the leak's conductance without the columns that count only within a recording."""
         roles = self.columns[0]
         omitted = roles.within[0] if roles.within else None
         return information(self.running_blocks, self.columns, roles.leak, omitted)
