@@ -184,7 +184,7 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
     """Check that a row of the data sheet states the same test as `condition`: command, closing, leak and leak level.
 
-    The closing is that of the throttles [%], the leak is the mean flow [L/min], and the level is the position of the
+    The throttles are closed by the closing [%]; the leak is its mean flow [L/min], and the level the position of the
     needle valve, such as "large".
 
     Raises InputError otherwise.

@@ -168,7 +168,7 @@ class Watch:
 
     @property
     def block_seconds(self) -> float:
-        """Approximate length of a block [s]; until samples have arrived, that of the volume balance."""
+        """Approximate length of a block [s]; until samples have arrived, the length for the volume balance."""
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
@@ -422,7 +422,7 @@ class Watch:
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test the mean of the last `GROUP` blocks against the healthy machine, and raise the alarm if it is higher.
 
-        The healthy machine is that of the baseline or, until there is one, of the healthy recordings. Without either
+        The healthy mean is taken from the baseline or, until there is one, from the healthy recordings. Without either
         there is no test.
         """
         has_baseline = self.baseline is not None
@@ -462,9 +462,9 @@ class Watch:
     ) -> None:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance.
 
-        The increase was found at the end of `block`. `threshold` is that of the test, and `reason` the text of the
-        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is
-        by default that of the estimator. If there is an alarm already, its time and its conductance before the onset
+        The increase was found at the end of `block`. `threshold` is the test's threshold, and `reason` the text of the
+        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is by
+        default what the estimator states. If there is an alarm already, its time and its conductance before the onset
         are kept.
         """
         raised_s = block.end
@@ -542,7 +542,7 @@ class Watch:
     def state(self) -> dict[str, Any]:
         """Return the state of the watch as plain values for JSON, which `from_state` restores.
 
-        ``"version"`` is that of the format.
+        ``"version"`` is the version of the format.
         """
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {

@@ -1,9 +1,11 @@
 """Describe the increase of a machine's leakage over its recordings in the form that `decision.decide` judges.
 
-The sequential test of `wear` gives the chance that a healthy machine shows such an increase: the time between two
-recordings over the mean time to a false alarm. Other explanations are observed as in a diagnosis: terms of the volume
-balance in all recordings since the onset, and the ringing (RMS of the pressures' wavelet details) of the last
-recording.
+The sequential test of `wear` gives the chance that a healthy machine shows such an increase,
+
+    chance = time between two recordings / mean time to a false alarm.
+
+Other explanations are observed as in a diagnosis: terms of the volume balance in all recordings since the onset, and
+the ringing (RMS of the pressures' wavelet details) of the last recording.
 """
 
 from __future__ import annotations
@@ -104,7 +106,7 @@ def decide_trend(
     pressure : float or None
         Pressure difference at which L/min are stated [Pa], None if the levels are relative.
     interval : float
-        Typical time between two recordings [days].
+        Median time between two recordings [days].
     years : float
         Mean time between false alarms [machine-years].
 

@@ -180,8 +180,7 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
     """Build the stored result of an item from JSON values; return None if it was made from other inputs.
 
-    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are not those of a
-    result.
+    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are no stored result.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")

@@ -1,7 +1,8 @@
 """Judge the testable sentences of chapter 4.
 
-Claims on the orifices are judged on converged runs under both interpretations ("readings") of the equations
-(`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
+Claims on the orifices are judged on converged runs under both interpretations ("readings") of the throttles' equations,
+meter-out and as printed (`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for
+comparison.
 """
 
 from __future__ import annotations
