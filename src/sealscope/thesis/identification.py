@@ -49,7 +49,7 @@ def noise_free_mean_squares(
     Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are
     sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as
     text, for which the rig's leakage coefficient is found; `x_0` [m]: start of the piston; `values`: parameters that
-    override those of the test. Raises the errors of the simulation.
+    override the test's. Raises the errors of the simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -134,7 +134,7 @@ def predicted_sheet(
 ) -> DataSheet:
     """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
 
-    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, that of d3d4 in psi^2.
+    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, of d3d4 in psi^2.
     """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)

@@ -136,9 +136,9 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 of its files.
 
-    Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value
-    is not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row
-    k are not those of test k in `APPENDIX_C`.
+    Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value is
+    not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row k
+    differ from test k in `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()

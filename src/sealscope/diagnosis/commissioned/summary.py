@@ -276,7 +276,7 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `summaries` are those of the healthy recordings by the detector `balance`, and `channels` the names of the recorded
+    `summaries` of the healthy recordings are by the detector `balance`; `channels` are the names of the recorded
     channels. The leak is detected with the probability `power` (`priors.toml`). With the threshold of Student's t test
     and the deviation of a healthy rise, it raises the leakage by
 

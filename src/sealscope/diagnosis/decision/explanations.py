@@ -187,7 +187,7 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    `factors`: observables with their log Bayes factors. The onset of the event is that of the observable which it
+    `factors`: observables with their log Bayes factors. The event begins at the onset of the observable that it
     explains best. Other observables count if they may have changed at the same time.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]

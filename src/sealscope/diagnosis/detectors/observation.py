@@ -135,8 +135,8 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
 
-    The changes are those of the signals and of the volume balance; without a balance, or if it is uncertain that
-    valves hold the load (no channel of the flow), those of the pressure response are added.
+    The signals and the volume balance are tested; without a balance, or if it is uncertain that valves hold the load
+    (no channel of the flow), the pressure response as well.
     """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest

@@ -149,7 +149,7 @@ def estimate_rise_flow(
 ) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
-    The value is that of the most probable law; the other laws contribute to its standard deviation.
+    The most probable law gives the value; the other laws contribute to its standard deviation.
 
     Parameters
     ----------

@@ -42,9 +42,9 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
     `columns`: indices of the columns of each equation's Gram matrix: the leak, the motion, and the left side of the
-    volume balance. The offset is that of maximum a posteriori probability. It is subtracted in the Gram matrices and
-    added to `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for
-    a constant flow, or too few blocks have information.
+    volume balance. The offset has the highest posterior probability. It is subtracted in the Gram matrices and added to
+    `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for a
+    constant flow, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks

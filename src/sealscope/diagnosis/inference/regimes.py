@@ -53,9 +53,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool) -> Blocks:
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    In a recording without rests the column of the leakage of the turning pump equals that of the leak, and that of
-    the holding pump is zero. `names` (m - 1,): names of the columns without the left side. The result has the shape
-    (E, m + 2, m + 2).
+    In a recording without rests the column of the turning pump's leakage equals the column of the leak, and the column
+    of the holding pump's leakage is zero. `names` (m - 1,): names of the columns without the left side. The result has
+    the shape (E, m + 2, m + 2).
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
@@ -78,7 +78,7 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
     `states`: names of the columns of p_A - p_B in these states, such as `TURNING` (the pump moves the piston); the
-    other arguments are those of `has_rests`.
+    other arguments are as in `has_rests`.
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
@@ -88,7 +88,7 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def _drop_holding(blocks: Blocks, roles: ColumnRoles) -> Blocks:
     """Set the column of a pump that holds the load to zero if the pump is never off.
 
-    Holds are then the only rests, and show the leak past the piston. The arguments are those of `has_rests`.
+    Holds are then the only rests, and show the leak past the piston. The arguments are as in `has_rests`.
     """
     if _rest_share(blocks, roles, TURNING, HOLDING) > NEGLIGIBLE:
         return blocks

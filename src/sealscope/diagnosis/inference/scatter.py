@@ -117,8 +117,8 @@ class Rise(NamedTuple):
     def widen(self, variance: float) -> Rise:
         """Return the rise with an additional independent error of the given variance, in the square of its unit.
 
-        The variance is added to that of the rise and of each normal distribution of its mixture. The rise remains
-        unchanged if it has no mixture, or if the variance is not positive.
+        The variance is added to the variances of the rise and of each normal distribution of its mixture. The rise
+        remains unchanged if it has no mixture, or if the variance is not positive.
         """
         if self.mixture is None or not variance > 0.0:
             return self
@@ -219,8 +219,9 @@ class Rise(NamedTuple):
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute the upper bound of the true rise of the leakage, in the unit of the estimate.
 
-        The true rise is below it with the given probability. A negative estimate counts as zero, so the bound is not
-        below that of an estimate of zero.
+        The true rise is below it with the given probability. A negative estimate counts as zero:
+
+            bound = max(value, 0) - threshold(probability) deviation.
         """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
@@ -465,7 +466,7 @@ class _LevelScale(NamedTuple):
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
-        """Convert a distribution of z to that of the leak coefficient, relative to the healthy mean `level`.
+        """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
         `predicted`: mixture of normal distributions of z, shape (s, g, nodes), whose weights are logarithms and whose
         centres are relative to `transformed` (s,), the z of the judged recording. Each normal distribution is split
@@ -501,9 +502,9 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
 class UnusualCondition(NamedTuple):
     """Operating condition of a recording that lies outside of the range `low` to `high` of the healthy recordings.
 
-    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: that of
-    the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0 for oil, since the
-    uncertain slope in temperature already covers it.
+    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: load, speed
+    or temperature in the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0
+    for oil, since the uncertain slope in temperature already covers it.
     """
 
     name: str
@@ -542,9 +543,9 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n of the amount by which the coefficient exceeds that of the other n - 1 recordings. `columns`: for
-    each equation the indices of its columns by role (leak, motion, left side). The other coefficients may differ
-    between recordings within their usual prior.
+    deviation = (n - 1)/n times the amount by which the coefficient exceeds the coefficient of the other n - 1
+    recordings. `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other
+    coefficients may differ between recordings within their usual prior.
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)

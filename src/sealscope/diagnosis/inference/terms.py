@@ -333,7 +333,7 @@ def _conductance_term(
 ) -> Term:
     """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
 
-    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are those of `Term`.
+    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are as in `Term`.
     """
     return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
 

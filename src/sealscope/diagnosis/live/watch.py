@@ -293,8 +293,8 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of
-        the first fit arrive together in one result, and count as one block; the estimate is that of the last of them.
+        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of the
+        first fit arrive together in one result, and count as one block; the last of them is estimated.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -347,8 +347,8 @@ class Watch:
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        The duty is the mean pressure difference and pump flow; a change is one from known duties, those of the
-        baseline, to others or back. `row` is the block as an array with one row of `_BLOCK`.
+        The duty is the mean pressure difference and pump flow; a change is one from the duties of the baseline to
+        others, or back. `row` is the block as an array with one row of `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")

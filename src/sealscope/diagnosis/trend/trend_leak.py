@@ -36,8 +36,8 @@ MIN_RECORDINGS = 3
 class TrendLeak:
     """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
 
-    The fields are those of the protocol `LeakMeasure`, which explains them. Flows are in the unit of the trend. There
-    is no test for a step within a recording, and no history other than the trend itself.
+    The protocol `LeakMeasure` explains the fields. Flows are in the unit of the trend. There is no test for a step
+    within a recording, and no history other than the trend itself.
     """
 
     provider: str
@@ -135,9 +135,9 @@ def _measure_leak(
 ) -> TrendLeak:
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
-    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy
-    machine. The other arguments are those of `decide_trend`. The leak may be laminar or an orifice, so its flow is
-    proportional to the pressure to one of the powers `EXPONENTS`.
+    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy machine.
+    The other arguments are as in `decide_trend`. The leak may be laminar or an orifice, so its flow is proportional to
+    the pressure to one of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]

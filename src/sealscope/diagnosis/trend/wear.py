@@ -6,16 +6,15 @@ The level that recording i states at the time t_i is
 
 Here mu_l is the mean of the group l of comparable recordings, c a covariate with a normal prior on beta, and e_i the
 recording's own error of stated deviation s_i. The change g is a step, ``g = [t >= t_j]``, or a growth, ``g = max(t -
-t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this
-variance is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2
-((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is
-uniform on a few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several
-scales in units of tau. With L L' = cov(y), the rows of z = L^-1 y up to n are those of the first n recordings alone,
-so that one factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the
-likelihood ratio exp(b delta - a delta^2/2).
+t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this variance
+is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2 ((1 - r) [i
+= k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is uniform on a
+few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several scales in units
+of tau. With L L' = cov(y), the rows of z = L^-1 y up to n depend on the first n recordings alone, so that one
+factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the likelihood
+ratio exp(b delta - a delta^2/2).
 
-The test is that of Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against
-none,
+The test is by Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
 
     R_n = sum_(j <= n) w_j LR_j(n),   w_j = min(t_j - t_(j-1), longest wait),   alarm where R_n > A.
 

@@ -161,14 +161,14 @@ def _empty_runs_folder(store: Path) -> Path:
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
     """Compute for each item a digest of all inputs of its products and files, by id.
 
-    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes
-    those of the items it needs.
+    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes the
+    digests of the items it needs.
     """
     by_id, sources = {item.id: item for item in items}, sources_key()
 
     @cache
     def item_key(name: str) -> str:
-        """Compute the digest of one item, which includes those of the items it needs."""
+        """Compute the digest of one item, which includes the digests of the items it needs."""
         item = by_id[name]
         identity = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
         sheet = sheet_key if item.reads_sheet else ""

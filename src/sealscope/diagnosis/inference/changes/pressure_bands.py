@@ -14,7 +14,7 @@ The ratios of an octave vary between healthy recordings by an unknown variance w
 vary together: a recording's ratios follow a multivariate t distribution. Its phases follow von Mises distributions,
 whose variance is learnt likewise and is larger where the pressures are hardly coherent; a fraction of the phases is
 uniform. The observable is the Bayes factor of a filter, averaged over the pairs, the filtered pressure, f_c and the
-noise; as its mean over healthy recordings is 1, that of a healthy one exceeds b with a probability of at most 1 / b
+noise; as its mean over healthy recordings is 1, a healthy recording exceeds b with a probability of at most 1 / b
 (Markov).
 
 Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70; J. S. Bendat, A. G. Piersol, Random

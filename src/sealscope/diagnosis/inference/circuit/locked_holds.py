@@ -92,11 +92,11 @@ class LockedHold(NamedTuple):
         return np.asarray(sums / np.diff(self.edges))
 
     def own_offset(self, offset: float) -> tuple[float, float]:
-        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given that of the recording, `offset` [Pa].
+        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
         The two differ where the gains of the sensors do, with the standard deviation s = `held_oil.gain`
         (`priors.toml`) times the pressure. The difference p_A - p_B at the end of the hold is either the own offset, if
-        a leak has equalised the pressures, or that of a load, of which all up to the higher pressure are equally
+        a leak has equalised the pressures, or due to a load, of which all up to the higher pressure are equally
         probable. The more probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its
         cost as -2 log of a relative probability density.
         """
@@ -190,8 +190,8 @@ class _OilRegression(NamedTuple):
     their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the piston [m^3];
     `strained` and `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air with the
     usual properties, in the stroke, and in the dead volumes of A and of B; `inflation`: number of readings over the
-    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to that of the noise, since
-    the model describes the compressed volume only to within a fraction.
+    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise,
+    since the model describes the compressed volume only to within a fraction.
     """
 
     displaced: Array
@@ -433,7 +433,7 @@ class HeldChambers:
         return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of the sensor offset [Pa] and of those of the holds near it."""
+        """Compute -2 log of the prior density of the sensor offset [Pa], and of the holds' own offsets near it."""
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:

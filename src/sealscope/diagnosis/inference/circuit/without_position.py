@@ -177,9 +177,9 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 def _shrink_offset(values: Array, names: list[str]) -> None:
     """Reduce, in place, the columns of the leak in rows (r, c) by the part that sensor offsets may cause.
 
-    The rows are those of a volume balance; `names`: names of the columns. The mean pressure difference d of a row
-    becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote). The column of an
-    orifice is scaled by the same factor.
+    A row is the volume balance integrated with one test function; `names`: names of the columns. The mean pressure
+    difference d of a row becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote).
+    The column of an orifice is scaled by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

@@ -202,7 +202,7 @@ class BalanceLeak:
         """Estimate the mean flow of the leak that shows while shut valves hold the load.
 
         It is averaged over the laws of the leak, weighted by their likelihoods. `rise`: rise of the leakage over
-        healthy recordings in these times, whose uncertainty is added to that of the fits.
+        healthy recordings in these times, whose variance is added to the variance of the fits.
         """
         laws, (low, high) = self._hold_laws(), rise.interval()
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]

@@ -96,8 +96,8 @@ class RecordedBalance:
     each chamber behind a servo valve; `columns`: for each equation the indices of its columns by role (leak, motion,
     left side); `rig`: sizes of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by
     the name of the term; `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`:
-    true if valves cut the pump off at rest, so the leak is that of the piston alone (`regimes`); `locked`: true if the
-    times in which shut valves hold the load measure the leaks (`chambers`).
+    true if valves cut the pump off at rest, so that the piston alone leaks (`regimes`); `locked`: true if the times in
+    which shut valves hold the load measure the leaks (`chambers`).
     """
 
     blocks: Blocks
