@@ -143,7 +143,7 @@ def compile_at_address(function: Callable[..., Any], signature: Any, folder: Pat
     """
 
     def compile_address() -> int:
-        """Compile the function and return its address."""
+        """Compile `function` for C's calling convention and return the address of its machine code."""
         callback = numba.cfunc(signature, **_OPTIONS)(function)
         callbacks.append(callback)  # keeps the code in memory
         return int(callback.address)

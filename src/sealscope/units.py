@@ -278,8 +278,8 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
     """Compute the exact conversion from `unit` to `si_unit`: (factor, power of pi, first offset, second offset).
 
-    They are those of `_conversion`. If the dimensions differ, raises an InputError that states `name`, the expected
-    dimension and, if it is not None, the file or option `place`.
+    Target value = (value + first offset) * factor * pi^power - second offset. If the dimensions differ, raises an
+    InputError that states `name`, the expected dimension and, if it is not None, the file or option `place`.
     """
     try:
         return _conversion(unit, si_unit)

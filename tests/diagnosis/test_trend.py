@@ -238,7 +238,7 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
     trend = trend_of(days, healthy=8)
     assert trend.alarm is not None and trend.verdict != "leak"
     assert trend.decision.cause == "external leak" and trend.state.cause == "external leak"
-    assert "oil leaves the circuit on side A" in trend.reason
+    assert "the external leakage on side A changed" in trend.reason
 
 
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:

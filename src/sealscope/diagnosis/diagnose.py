@@ -172,9 +172,9 @@ def diagnose(
 ) -> Diagnosis:
     """Decide whether oil bypasses the piston in a recording.
 
-    The verdict is that of the first method which the channels allow and which reaches a decision: the balance of
-    volumes, the response of the pressures, plug-ins, and last the change of RMS. The results of plug-ins and of the
-    change of RMS are always stated in addition.
+    The first method that the channels allow, and that reaches a decision, gives the verdict: the balance of volumes,
+    the response of the pressures, plug-ins, and last the change of RMS. The results of plug-ins and of the change of
+    RMS are always stated in addition.
 
     Parameters
     ----------

@@ -12,9 +12,10 @@ class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
     A further circuit is a further value of this type. Other modules ask for the properties below and do not compare
-    circuits. `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the volume balance
-    of `diagnosis/inference/terms.py`, and the drawing of `reporting/schematic.py`. `pump_feeds_chambers` chooses the
-    controller's model of the drive (`control/drive.py`: `drive_of`).
+    circuits. `valve_controlled` chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of
+    `physics/solvers/limits.py` (as `valved`), the volume balance of `diagnosis/inference/terms.py`, and the drawing of
+    `reporting/schematic.py`. `pump_feeds_chambers` chooses the controller's model of the drive (`control/drive.py`:
+    `drive_of`).
 
     Attributes
     ----------

@@ -46,10 +46,10 @@ def noise_free_mean_squares(
 ) -> Array:
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
-    Returns those of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are sampled at the
-    rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as text, for which
-    the rig's leakage coefficient is found; `x_0` [m]: start of the piston; `values`: parameters that override those
-    of the test. Raises the errors of the simulation.
+    Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are
+    sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as
+    text, for which the rig's leakage coefficient is found; `x_0` [m]: start of the piston; `values`: parameters that
+    override the test's. Raises the errors of the simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -64,9 +64,9 @@ def noise_free_mean_squares(
 def log_rms(squares: Array, sigma: float) -> Array:
     """Compute the logarithm of the RMS of the wavelet details d1..d4 and d3d4 of pressures with white noise.
 
-    It is ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the
-    product d3d4. `squares` (..., 5): mean squares m of the details without noise; `sigma` [psi]: standard deviation
-    of the noise. Returns (..., 5).
+    `squares` (..., 5): mean squares m_1 to m_4 and m_34 of the details without noise; `sigma` [psi]: standard deviation
+    of the noise. Returns (..., 5): ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 +
+    sigma^4) / 2`` for the product d3d4.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -78,7 +78,8 @@ def log_rms(squares: Array, sigma: float) -> Array:
 def pressure_noise(rig: Rig, chamber: str) -> float:
     """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
 
-    It combines the noise of the sensor, the noise common to all sensors, and the quantisation of variance step^2/12.
+    It is ``sqrt(sensor^2 + common^2 + step^2/12)``, from the noise of the sensor, the noise common to all sensors, and
+    the step of the quantisation.
     """
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
@@ -133,7 +134,7 @@ def predicted_sheet(
 ) -> DataSheet:
     """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
 
-    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, that of d3d4 in psi^2.
+    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, of d3d4 in psi^2.
     """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)

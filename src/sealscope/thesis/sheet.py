@@ -136,9 +136,9 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 of its files.
 
-    Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value
-    is not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row
-    k are not those of test k in `APPENDIX_C`.
+    Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value is
+    not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row k
+    differ from test k in `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -184,7 +184,7 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
     """Check that a row of the data sheet states the same test as `condition`: command, closing, leak and leak level.
 
-    The closing is that of the throttles [%], the leak is the mean flow [L/min], and the level is the position of the
+    The throttles are closed by the closing [%]; the leak is its mean flow [L/min], and the level the position of the
     needle valve, such as "large".
 
     Raises InputError otherwise.

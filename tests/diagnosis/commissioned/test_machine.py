@@ -295,7 +295,7 @@ def test_another_actuator_is_named_and_is_no_leak(machine):
     same, another = (machine.diagnose(run) for run in runs.values())
     assert (same.verdict, same.cause) == ("no leak", None)
     assert another.verdict != "leak" and another.cause == "sensor fault"
-    assert "or the machine, changed (motion" in another.reason
+    assert "scale of its position or speed changed (motion" in another.reason
 
 
 @pytest.mark.long

@@ -53,7 +53,7 @@ class AlarmFractions:
 
     @property
     def informedness(self) -> float:
-        """Fraction of alarms minus fraction of false alarms (Youden's J), which is 0 for guesses.
+        """Fraction of leaks with an alarm minus fraction of false alarms (Youden's J), which is 0 for guesses.
 
         nan if the fraction of false alarms is not known.
         """

@@ -165,8 +165,7 @@ class CommissionedMachine:
     ) -> Diagnosis:
         """Decide whether a recording, or the log at a path, shows a leak, given the machine's healthy recordings.
 
-        Arguments, result and errors are those of `sealscope.diagnose`; rig, baseline and repair limit are the
-        machine's.
+        Arguments, result and errors are as in `sealscope.diagnose`; rig, baseline and repair limit are the machine's.
         """
         judged = recording if isinstance(recording, Recording) else self.read(recording)
         return diagnose(
@@ -309,7 +308,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
 def _summarise(recording: Recording, rig: Rig, file: str, checksum: str) -> SummarisedRecording:
     """Compute the summaries of a healthy recording for `summarise_healthy`, without a limit on the number of threads.
 
-    Arguments and errors are those of `summarise_healthy`.
+    Arguments and errors are as in `summarise_healthy`.
     """
     from sealscope.diagnosis.commissioned.summary import describe_recording
 

@@ -204,9 +204,8 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: first its summaries, then a backup of the present text, then the new text.
 
     In this order an interruption at any time leaves a complete text with all its summaries. The file of summaries
-    contains those of the machine and those that the present text or its backup names. Other summaries in the present
-    file are kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be
-    read back.
+    contains the machine's and all that the present text or its backup names. Other summaries in the present file are
+    kept while the total size stays below 5 MB (`_SPARE`). Raises InputError if the new text could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))

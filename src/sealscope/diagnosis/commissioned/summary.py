@@ -276,10 +276,13 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `summaries` are those of the healthy recordings by the detector `balance`, and `channels` the names of the
-    recorded channels. The leak is detected with the probability `power` (`priors.toml`). The rise of the leakage due
-    to it exceeds the threshold of Student's t test by the normal quantile of this probability. More healthy days
-    lower the threshold and the error of the healthy mean, but not the scatter between recordings.
+    `summaries` of the healthy recordings are by the detector `balance`; `channels` are the names of the recorded
+    channels. The leak is detected with the probability `power` (`priors.toml`). With the threshold of Student's t test
+    and the deviation of a healthy rise, it raises the leakage by
+
+        rise = (threshold + normal quantile of `power`) deviation.
+
+    More healthy days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
@@ -322,9 +325,13 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
-    The variance of second differences of white noise is 6 times that of the noise, and 0.6745 is the median absolute
-    value of a standard normal number. The estimate is at least the rounding error of the channel's resolution.
-    Returns 0 for fewer than three finite values.
+    Second differences have sqrt(6) times the deviation of the noise, and the median absolute value of a standard normal
+    number is 0.6745:
+
+        noise = median(abs(second differences)) / (0.6745 sqrt(6)).
+
+    The estimate is at least the rounding error of the channel's resolution. Returns 0 for fewer than three finite
+    values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:
@@ -347,7 +354,7 @@ def _describe_vacuum(part: Recording, name: str) -> str:
 def _describe_glitches(part: Recording, name: str) -> str:
     """Describe a channel in which single samples stand out from both neighbours by more than the channel's range.
 
-    The result is "" if there are none. The range is that between the 1 % and 99 % quantiles of the channel.
+    The result is "" if there are none. The range is the difference of the 99 % and the 1 % quantile of the channel.
     """
     values = part[name]
     if len(values) < 3:

@@ -46,9 +46,9 @@ class LeakTest(NamedTuple):
 class OtherEvent(NamedTuple):
     """Event other than a leak that explains a rare change in a recording.
 
-    `cause`, `description`: those of the event; `probability`: posterior probability of an event with this cause;
-    `observable`: the rarest observable that it explains; `chance`: probability that a healthy recording has at least
-    its score.
+    `cause`, `description`: cause of the event, and what it changes in words; `probability`: posterior probability of an
+    event with this cause; `observable`: the rarest observable that it explains; `chance`: probability that a healthy
+    recording has at least its score.
     """
 
     cause: str
@@ -97,8 +97,8 @@ class Case:
         """Compute the probability that a leak past piston or pump caused an alarm, rather than another event.
 
         It is 1 if other causes are not weighed (`weigh_rivals`). If the alarm is a leakage above the limit of the rig's
-        file, a leak that began within the recording may have raised it: the result is then that of the alarm of the
-        test for such a leak, or 1 if that test raised none.
+        file, a leak that began within the recording may have raised it: the result is then the probability for the
+        alarm of the test for such a leak, or 1 if that test raised none.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -212,8 +212,8 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 def step_key(provider: str) -> str:
     """Return the key by which the distribution of a detector's step test is stored, such as "volume balance: step".
 
-    The test is that for a step of the leak within a recording; the distribution is that in healthy recordings
-    (`HealthyNull`).
+    It is the distribution, in healthy recordings (`HealthyNull`), of the test for a step of the leak within a
+    recording.
 
     `provider`: name of the detector.
     """

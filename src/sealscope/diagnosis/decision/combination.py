@@ -46,7 +46,7 @@ def is_decided(evidence: Evidence) -> bool:
 
 
 def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
-    """Combine the decisions of several detectors: that of the first one counts, by rank, that decides.
+    """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
     All decisions become the `parts` of the result. A verdict `no leak` becomes `cannot tell` if the end of the
     recording is not judged, or if `refusal` gives a reason why `no leak` must not be stated (None if there is none).
@@ -78,8 +78,7 @@ def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -
     """Make the verdict `cannot tell` with a reason, as no detector decides.
 
     `ranked`: decisions of all detectors in the order of judging; `usable`: those that could use the recording. The
-    reason is that of the first usable detector. If none is usable, it is that of the built-in detector which needs
-    the fewest channels.
+    first usable detector states the reason or, if none is usable, the built-in detector that needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

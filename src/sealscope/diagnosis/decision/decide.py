@@ -3,8 +3,8 @@
 The verdict is `leak` if both conditions hold for one test of the leakage:
 
 - An alarm: `chance` < `probability` (`Case.alarms`). `chance` is the probability that a healthy recording scores as
-  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`, `[questions] within`
-  of `priors.toml`) of the allowed probability of a false alarm: that of the caller, or else `[false_alarm]
+  high, calibrated by healthy recordings. `probability` is the test's share (`case._leak_tests`, `[questions] within` of
+  `priors.toml`) of the allowed probability of a false alarm, which the caller states, or else `[false_alarm]
   probability` of `verdict/priors.toml`. Score and threshold are the same comparison, for display.
 - No better explanation: the probability that a leak caused the alarm (`Case.leak_probability`) is above
   `[explanation] leak` of `priors.toml`.

@@ -19,7 +19,7 @@ class Event:
     `name`: such as "piston leak" or "pump wear"; `cause`: heading under which a verdict names the event, None if a
     verdict never does; `probability`: prior probability that it begins within a recording; `affected`: patterns "data:
     name" of the observables that it changes; `disturbed`: patterns of those that it may change as a side effect;
-    `description`: words for it in a reason.
+    `description`: what it changes in the words of a reason, such as "the external leakage on side A".
     """
 
     name: str

@@ -1,10 +1,13 @@
 """Explanations of what the detectors observe in a recording: sets of at most three events, each with its probability.
 
-The posterior of a set is the product of the prior probabilities of its events and of one Bayes factor for each kind
-of data: that of the best description by an event of the set. Data that no event of the set changes contribute a
-factor of 1. Thus a step of the noise together with a leak is explained by two events, which do not compete. The Bayes
-factor of a change is at most 1 / (-e p log p), where p is the probability of the change in a healthy recording, or 1
-for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy recordings (`null`).
+The posterior of a set of events is proportional to
+
+    product over its events of the prior * product over kinds of data of the largest Bayes factor of its events.
+
+Data that no event of the set changes have the factor 1. Thus a step of the noise together with a leak is explained by
+two events, which do not compete. The Bayes factor of a change is at most 1 / (-e p log p), where p is the probability
+of the change in a healthy recording, or 1 for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy
+recordings (`null`).
 
 A term of the volume balance describes a change only to within a fraction. Therefore the logarithms of the Bayes factors
 of the same data are divided by 1 + 2 m B, with the largest of them, B, and the misfit m (`priors.toml`). Alternative
@@ -101,10 +104,13 @@ def explain(
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
 
-    The terms are alternative descriptions of the same residual. The best one keeps its factor. That of another term
-    is the best minus the difference of their log likelihoods, and at least 0. Healthy recordings show how rare the
-    best description is, but are too few to show which term is the best; for that only the likelihoods in the judged
-    recording count.
+    The terms are alternative descriptions of the same residual. With the best term's log Bayes factor B and log
+    likelihood L, a term with the log likelihood l gets
+
+        log factor = max(B - (L - l), 0).
+
+    Healthy recordings show how rare the best description is, but are too few to show which term is the best; for that
+    only the likelihoods in the judged recording count.
 
     `log_factors`: observables with their log Bayes factors. Those of other data than the balance's are returned
     unchanged. Factors and differences are corrected for the misfit of the model (`_correct_for_misfit`).
@@ -181,7 +187,7 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    `factors`: observables with their log Bayes factors. The onset of the event is that of the observable which it
+    `factors`: observables with their log Bayes factors. The event begins at the onset of the observable that it
     explains best. Other observables count if they may have changed at the same time.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
@@ -208,8 +214,9 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
     `chance`: probability that a healthy recording has at least its score. An increase of the leakage makes an
-    alternative to it, such as an external leak, seem to increase as well. Therefore the log factor of such an
-    observable is at most that of the leakage (`rise`) plus the log likelihood ratio of the two.
+    alternative to it, such as an external leak, seem to increase as well. Therefore such an observable has at most
+
+        log factor = log factor of the leakage (`rise`) + log likelihood ratio of the alternative to the leak.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:

@@ -2,8 +2,9 @@
 
 A detector states for each statistic a chance P, i.e. the probability that a healthy recording scores as high. If that
 is right, the surprisal u = -log P of a healthy recording is exponentially distributed. In a fraction of machines
-(`priors.toml`) the stated chances are too small: there u / lambda is exponential, with an exponential prior on
-log lambda > 0. With the u_1 .. u_n of n healthy recordings the calibrated (predictive) chance is
+(`priors.toml`) the stated chances are too small: there u / lambda is exponential, with an exponential prior on log
+lambda > 0. With the u_1 .. u_n of n healthy recordings, and prior probabilities p_k of values lambda_k, the calibrated
+(predictive) chance is
 
     P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ p_k lambda_k^(-n) exp(-sum_i u_i / lambda_k),
 

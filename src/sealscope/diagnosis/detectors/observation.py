@@ -135,8 +135,8 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
 
-    The changes are those of the signals and of the volume balance; without a balance, or if it is uncertain that
-    valves hold the load (no channel of the flow), those of the pressure response are added.
+    The signals and the volume balance are tested; without a balance, or if it is uncertain that valves hold the load
+    (no channel of the flow), the pressure response as well.
     """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest
@@ -176,7 +176,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
     They are the null distributions of the test results (observables) of all detectors. A test for a change within a
     recording has one value from each healthy recording. The tests of one kind of data (`Observable.data`) that compare
     recordings share a distribution: the largest surprisal of each healthy recording, compared with all others. With
-    `shut`, those of the volume balance are under the hypothesis that valves cut the pump off at rest.
+    `shut`, the results of the volume balance hold if valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

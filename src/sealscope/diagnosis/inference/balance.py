@@ -309,8 +309,9 @@ class _BlockRows(NamedTuple):
     """Rows of the regression of each volume balance in K blocks, and their weights.
 
     `rows`: for each balance an array (r, m), one row for each test function of the weak form. `weights` (r,): 1 without
-    holes (long gaps of missing samples), a fraction next to a hole, and 0 with a missing sample. `flow` (K,) and
-    `pressures` (K, p) are those of `Blocks`.
+    holes (long gaps of missing samples), a fraction next to a hole, and 0 with a missing sample. `flow` (K,): mean
+    magnitude of the first balance's left side [m^3/s]; `pressures` (K, p): means of p equal parts of the sorted samples
+    of p_A - p_B [Pa].
     """
 
     rows: tuple[Array, ...]

@@ -2,18 +2,19 @@
 
 A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A
 block is a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side). A
-row is the balance integrated with one test function of the weak form (`rows.weak_form`). Gram matrices of blocks add up
-to that of their union. A stream and a whole recording are therefore handled alike, and a recording of hours costs no
-more than one of minutes. Rows are weighted once, when their block is closed (`row_weights`).
+row is the balance integrated with one test function of the weak form (`rows.weak_form`). The Gram matrix of several
+blocks together is the sum of their Gram matrices. A stream and a whole recording are therefore handled alike, and a
+recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
+(`row_weights`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
-level and a slow drift, c_j(t) = sum_p c_jp P_p(t), with a normal prior on its size (`priors.toml`):
+level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).
+Let d be the column of g (the tested column), o the other columns with their drifts, y the left side and s^2 the
+residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
+o o' over all rows, plus the precision of the priors, and m the sum of o y. The likelihood is exp(eta'g - g'Lambda g/2)
+with
 
     Lambda = (diag N - B M^-1 B') / s^2,    eta = (n - B M^-1 m) / s^2.
-
-d is the column of g (the tested column), o are the other columns with their drifts, y is the left side and s^2 the
-residual variance of a row. N_k, n_k and B_k are the sums of d^2, d y and d o' over the rows of block k; M is the sum of
-o o' over all rows, plus the precision of the priors, and m that of o y. The likelihood is exp(eta'g - g'Lambda g/2).
 """
 
 from __future__ import annotations
@@ -190,7 +191,7 @@ class ColumnRoles:
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
     `between_deviation`, relative difference between recordings, infinite without a prior; `level_deviation`, of the
-    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): those of the terms;
+    constant part of the coefficient, in its unit. `names` and `drivers` (m - 1,): names and drivers of the terms;
     `healthy_conductance` [m^3/(s Pa)]: standard deviation of a healthy machine's leak.
     """
 
@@ -231,8 +232,8 @@ class ColumnRoles:
     def leak_deviation(self, test: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in its own unit.
 
-        `test`: index of the coefficient's column. The prior of a flow through an orifice gives the same mean flow
-        over `blocks` as that of a laminar leak. The result is infinite for columns that no pressure drives, or
+        `test`: index of the coefficient's column. For a flow through an orifice, the prior gives the same mean flow
+        over `blocks` as the prior of a laminar leak. The result is infinite for columns that no pressure drives, or
         without a prior.
         """
         driver = self.drivers[test] if test < self.left else ""
@@ -243,8 +244,8 @@ class ColumnRoles:
     def offset_deviation(self, test: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error of a regression column due to a pressure sensor's offset.
 
-        `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for that of an
-        orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The deviation of
+        `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for the column of
+        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The deviation of
         the pressure is at most its mean over `blocks`, since recordings may be in counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
@@ -291,8 +292,8 @@ class Weighting:
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
         Huber's weights follow from a fit to these and earlier blocks, in which the coefficients of fast columns are
-        free in each block and those of slow columns common to all (`ColumnRoles`). The sums over earlier blocks are
-        updated.
+        free in each block and the coefficients of slow columns common to all (`ColumnRoles`). The sums over earlier
+        blocks are updated.
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # a mean at first, then exponential forgetting
@@ -364,7 +365,7 @@ def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
 class _NormalEquations(NamedTuple):
     """Gram matrices and moments of a regression on nuisance columns, whose coefficients drift, and on a tested column.
 
-    The tested column is that of the coefficient to estimate. The nuisance columns are multiplied by their drift
+    The tested column belongs to the coefficient to estimate. The nuisance columns are multiplied by their drift
     polynomials, c columns in all. `gram` (c, c) and `moment` (c,): products of these columns with each other and with
     the left side. Sums of the tested column in each of K blocks: `coupling` (K, c), its products with the nuisance
     columns; `energy` (K,), its sum of squares; `tested_moment` (K,), its product with the left side. `left_square`: sum
@@ -444,7 +445,7 @@ def _fit_nuisance(normal: _NormalEquations, prior: _Prior, degrees: int, n_rows:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
     `normal`: normal equations of the regression, from which the tested coefficient, free in each block, is eliminated.
-    Each other (nuisance) column has `degrees` coefficients: a constant one and those of the polynomials of its drift.
+    Each other (nuisance) column has `degrees` coefficients: a constant one, and one for each polynomial of its drift.
     `prior`: prior standard deviations of these; `n_rows`: number of rows in all blocks.
     """
     gram, moment, left_square = normal.eliminate_tested()
@@ -516,10 +517,10 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
     `gram` (K, m, m): Gram matrices of K blocks; `roles`: indices of the columns by role (leak, motion, left side);
-    `test`: index of the tested column, i.e. that of the coefficient g to estimate, a pressure times the sampling
-    interval dt; `coefficients` (K,): g in each block; `offset` [Pa]: subtracted from the pressure. The appended column
-    -g dt is the derivative of the volume balance with respect to the offset. It becomes the last of the m + 1 columns
-    of the result.
+    `test`: index of the tested column, a pressure times the sampling interval dt, whose coefficient g is to be
+    estimated; `coefficients` (K,): g in each block; `offset` [Pa]: subtracted from the pressure. The appended column -g
+    dt is the derivative of the volume balance with respect to the offset. It becomes the last of the m + 1 columns of
+    the result.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))

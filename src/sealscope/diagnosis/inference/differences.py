@@ -1,8 +1,8 @@
 """Tests whether a number of a recording differs from that of healthy recordings, whose scatter is unknown.
 
 *Without a prior on the scatter* (`compare_with_healthy`): n healthy values are normal about an unknown mean with an
-unknown standard deviation, at least the error e of a single value (Jeffreys prior). The next value then follows
-Student's t with n - 1 degrees of freedom,
+unknown standard deviation, at least the error e of a single value (Jeffreys prior). With their mean and standard
+deviation s, the next value y then follows Student's t with n - 1 degrees of freedom,
 
     t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
 

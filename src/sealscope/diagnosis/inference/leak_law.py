@@ -6,10 +6,11 @@ proportional to r_k in each block thus covers every law, and the healthy laminar
 continues to wear leaks more towards the end: the step grows by a fraction of itself. The flow of a step is a mixture
 over laws, growths and onsets, each weighted by its likelihood and prior.
 
-A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow
-on p_A - p_B over the whole recording. Under another law the flow is g <|dp|^e> / b_e, with the regression coefficient
-b_e of that law's flow on p_A - p_B after elimination of all other terms. A leak that began within the recording had a
-larger flow while it lasted: if a fraction s of the recording's information lies after the onset, the step is g / s.
+A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
+p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
+coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. A leak
+that began within the recording had a larger flow while it lasted: if a fraction s of the recording's information lies
+after the onset, the step is g / s.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ _TINY = np.finfo(float).tiny
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the apparent conductance in each of K blocks of a leak with the flow |p_A - p_B|^e.
 
-    It is the regression coefficient of this flow on p_A - p_B: 1 for laminar flow, and from the Gram matrices for an
-    orifice; between the two its logarithm is interpolated. The result maps each exponent e of `EXPONENTS` to an array
+    It is the regression coefficient of this flow on p_A - p_B, r^(2 (1 - e)), with r from the Gram matrices for an
+    orifice, e = 1/2, and thus 1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array
     (K,). `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
@@ -55,8 +56,9 @@ def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Ar
 def law_flows(blocks: Blocks) -> dict[float, Array]:
     """Compute the mean flow in each of K blocks of a leak with the flow |p_A - p_B|^e times a coefficient.
 
-    Its logarithm is interpolated between e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of
-    `EXPONENTS` to an array (K,) of flows over the coefficient [Pa^e].
+    With the means over a block it is <|p_A - p_B|>^(2 e - 1) <|p_A - p_B|^(1/2)>^(2 - 2 e), exact for e = 1 (laminar)
+    and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to an array (K,) of flows over the coefficient
+    [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
@@ -109,9 +111,10 @@ def _onset_positions(leak: Information, onsets: NDArray[np.intp]) -> Array:
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, averaged from its onset to the end.
 
-    The flow is averaged over the laws, growths and onsets of the leak, weighted by their probabilities. `columns`: for
-    each equation the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's
-    coefficient in the blocks; `test`: test for a step of it.
+    The flow is averaged over the leak's laws (exponents of |p_A - p_B|, `EXPONENTS`), growths (fractions by which it
+    increases from its onset to the end) and onsets, weighted by their probabilities. `columns`: for each equation the
+    indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
+    blocks; `test`: test for a step of it.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions, rows = _onset_positions(leak, onsets), np.maximum(blocks.rows, 1e-9)
@@ -146,7 +149,7 @@ def estimate_rise_flow(
 ) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
-    The value is that of the most probable law; the other laws contribute to its standard deviation.
+    The most probable law gives the value; the other laws contribute to its standard deviation.
 
     Parameters
     ----------
@@ -181,11 +184,11 @@ def estimate_rise_flow(
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
     """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
 
-    Returns the log weight of each onset, and the fraction of the recording's information after it, (o,) each. The
-    first onset is the recording's start, with the fraction 1. A leak that begins later must cause a step of `value`
-    over this fraction. The weight is the likelihood of such a step relative to no step, divided by the number of
-    onsets. Without a `test`, or if `value` is not positive, only the first onset remains. `leak`: likelihood of the
-    coefficient in the blocks.
+    Returns the log weight of each onset, and the fraction of the recording's information after it, (o,) each. The first
+    onset is the recording's start, with the fraction 1. A leak that begins later must cause a larger step, `value` /
+    fraction. The weight is the likelihood of such a step relative to no step, divided by the number of onsets. Without
+    a `test`, or if `value` is not positive, only the first onset remains. `leak`: likelihood of the coefficient in the
+    blocks.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)

@@ -85,7 +85,7 @@ class Observable:
 class Flow(NamedTuple):
     """A leakage flow and its standard error [m^3/s].
 
-    The error excludes that of the piston's area and the pump's displacement, which scale all flows.
+    The error excludes the errors of the piston's area and the pump's displacement, which scale all flows.
     """
 
     value: float

@@ -1,19 +1,21 @@
 """Test for a step of a coefficient within a recording: likelihood ratio over all onsets, against a random walk.
 
 A step is a sudden, lasting change, as by a leak that begins within the recording. The likelihood of one coefficient g
-in K blocks of time is `Information`(Lambda, eta). In a healthy machine g has a level, a slope and a random walk; with
-a leak also a step from its onset on:
+in K blocks of time is `Information`(Lambda, eta). In a healthy machine g has a level and a slope, F a, and a random
+walk w. With a leak it also has a step of size delta, whose shape s is 0 before the onset and 1 after it. z are the
+whitened estimates:
 
     g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
 
-where kappa is the inflation of the noise by the correlation of the rows. F is projected out. (q, kappa) are estimated
-with the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm of the
-likelihood ratio, for steps > 0. If the onset lies within a block, that block shows a fraction of the step.
+where kappa is the inflation of the noise by the correlation of the rows, and kappa q the variance of the walk in a
+block. F is projected out. (q, kappa) are estimated with the step and without it; one eigenproblem serves all onsets and
+all q. The score is twice the logarithm of the likelihood ratio, for steps > 0. If the onset lies within a block, that
+block shows a fraction of the step.
 
 The probability of the score in a healthy machine follows from geometry, without a simulation. For a known q the
-whitened z is uniform on a sphere in n = K - 2 dimensions, and steps over all onsets form a curve of length L on it.
-The best onset is at the angle cos^2 = 1 - exp(-score/n) from z. The probability that z lies that close to the curve
-is that of a tube about it,
+whitened z is uniform on a sphere in n = K - 2 dimensions, and steps over all onsets form a curve of length L on it. The
+angle between z and the best onset has the cosine c, with c^2 = 1 - exp(-score/n). The probability that z lies that
+close to the curve is the probability of a tube about it, with the regularised incomplete beta function I,
 
     P = I_{1-c^2}((m - 1)/2, 1/2) / 2 + L / (2 pi) (1 - c^2)^((m - 2)/2),    1 - c^2 = exp(-score/m),    m = n.
 
@@ -74,10 +76,10 @@ RANK_TOLERANCE = 1e-9
 class Information(NamedTuple):
     """Likelihood of one coefficient g (K,) in K blocks of a recording: exp(vector g - g precision g / 2).
 
-    `time` (K,): middles of the blocks [s]; `precision` (K, K) and `vector` (K,) as in the formula. Scales of priors
-    in the unit of g, infinite if there is none: `level`, standard deviation of the coefficient before the first
-    block; `slope`, standard deviation of a linear change over all blocks; `walk`, scale of a half-Cauchy prior on the
-    standard deviation that a random walk reaches over all blocks.
+    `time` (K,): middles of the blocks [s]; `precision` (K, K): inverse covariance of the estimates of g; `vector` (K,):
+    precision times these estimates. Scales of priors in the unit of g, infinite if there is none: `level`, standard
+    deviation of the coefficient before the first block; `slope`, standard deviation of a linear change over all blocks;
+    `walk`, scale of a half-Cauchy prior on the standard deviation that a random walk reaches over all blocks.
     """
 
     time: Array
@@ -278,9 +280,9 @@ def _inverse(matrix: Array) -> Array:
 class NullLaw(NamedTuple):
     """Distribution of the score of a step test in a healthy machine, i.e. without a step.
 
-    `dimensions`: degrees of freedom m; `length`: length L of the curve that the whitened steps over all onsets form
-    on the unit sphere (see the module); `share`: fraction of the false-alarm probability that is this test's, if the
-    best of several tests counts.
+    `dimensions`: degrees of freedom m; `length`: length L of the curve that the whitened steps over all onsets form on
+    the unit sphere (see the module); `share`: fraction of the false-alarm probability that this test gets, if the best
+    of several tests counts.
     """
 
     dimensions: float

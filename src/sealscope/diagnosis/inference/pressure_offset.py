@@ -1,20 +1,21 @@
 """Constant error of the recorded pressure difference, estimated from a change of the leakage and removed.
 
-With a constant error z of the sensors, the flow of a leak is g (d - z), where d is the recorded difference p_A - p_B.
-A change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here z is
+With a constant error z of the sensors, the flow of a leak is g (d - z), where d is the recorded difference p_A - p_B. A
+change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here z is
 estimated even if it is larger than the pressure difference itself. In block k the Gram matrix determines two numbers:
-g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k. With
-a step delta of the leak's coefficient at the onset s, a random walk w of unknown size q, and a drift of the constant
-flow,
+g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k. The
+leak's coefficient has a slow change F a (level and slope), a random walk w, and a step delta whose shape s is 0 before
+the onset and 1 after it. The constant flow has a slow change B b (level, slope and curvature). With the variance kappa
+of the noise and q kappa of the walk in a block,
 
     g = F a + w + delta s,    o = (d_k - z) g + B b,    cov w = kappa q min(k, l);
 
-F (level and slope) and B (level, slope and curvature) are projected out. z maximises its prior times the restricted
-likelihood, over onsets and (q, kappa). The prior is a normal density for good sensors, with small odds of a wide one.
-The walk may be no larger than the one fitted without z; otherwise z and a free walk would describe changes that no leak
-explains. The residual of the volume balance repeats from cycle to cycle: no more than `size.readings` residuals count
-as independent. If the leak does not change, there is no information on z. It then stays near zero, and no result
-depends on it. Behind a servo valve both chambers have the same leak, step and z, so their whitened rows are stacked.
+F and B are projected out. z maximises its prior times the restricted likelihood, over onsets and (q, kappa). The prior
+is a normal density for good sensors, with small odds of a wide one. The walk may be no larger than the one fitted
+without z; otherwise z and a free walk would describe changes that no leak explains. The residual of the volume balance
+repeats from cycle to cycle: no more than `size.readings` residuals count as independent. If the leak does not change,
+there is no information on z. It then stays near zero, and no result depends on it. Behind a servo valve both chambers
+have the same leak, step and z, so their whitened rows are stacked.
 
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
@@ -41,9 +42,9 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
     `columns`: indices of the columns of each equation's Gram matrix: the leak, the motion, and the left side of the
-    volume balance. The offset is that of maximum a posteriori probability. It is subtracted in the Gram matrices and
-    added to `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for
-    a constant flow, or too few blocks have information.
+    volume balance. The offset has the highest posterior probability. It is subtracted in the Gram matrices and added to
+    `Blocks.zero` [Pa], the offset removed so far. Return the blocks unchanged if an equation has no column for a
+    constant flow, or too few blocks have information.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -69,9 +70,14 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> float:
     """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
 
-    `z` (n,): whitened residuals. A unit step of the leak from block k on changes them by column k of `leak_steps`
-    (n, K), minus the offset times column k of `offset_steps` (n, K). The search is over asinh of the offset, which is
-    linear near zero and logarithmic for large offsets.
+    With the whitened residuals `z` (n,), a leak that steps up by `size` in block k, and S = `leak_steps` - offset
+    `offset_steps`, (n, K) each,
+
+        z = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
+
+    where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
+    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
+    near zero and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
     # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains

@@ -11,9 +11,9 @@ block to block. With open valves r scatters about g; with shut valves and a heal
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 
-where V are the variances of the estimates, and s and w the relative scatters of the prior. The odds of the recordings
-of one machine multiply. Since a leaking piston moves r towards g, the healthy recordings decide (`shut` in
-`volumes.detector`).
+where V are the variances of the estimates, and s and w the prior scatters of r over g (`shut` and `open` of `[rest]` in
+`priors.toml`). The odds of the recordings of one machine multiply. Since a leaking piston moves r towards g, the
+healthy recordings decide (`shut` in `volumes.detector`).
 
 Source: H. White, Econometrica 48 (1980) 817 (covariance where the errors differ).
 """
@@ -58,9 +58,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    In a recording without rests the column of the leakage of the turning pump equals that of the leak, and that of
-    the holding pump is zero. `names` (m - 1,): names of the columns without the left side. The result has the shape
-    (E, m + 2, m + 2).
+    In a recording without rests the column of the turning pump's leakage equals the column of the leak, and the column
+    of the holding pump's leakage is zero. `names` (m - 1,): names of the columns without the left side. The result has
+    the shape (E, m + 2, m + 2).
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
@@ -83,7 +83,7 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
     `states`: names of the columns of p_A - p_B in these states, such as `TURNING` (the pump moves the piston); the
-    other arguments are those of `has_rests`.
+    other arguments are as in `has_rests`.
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)

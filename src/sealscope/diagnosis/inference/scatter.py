@@ -11,16 +11,17 @@ coefficients to a thousandth; another changes by a tenth from run to run. With t
 with too wide a prior they are imprecise. Therefore y is computed for several widths, each weighted by its prior and
 by the likelihood of the healthy recordings, p(y_1 .. y_n).
 
-Leakage is proportional to the inverse of the oil's viscosity. Levels that are clearly above zero are therefore
-compared as logarithms: z = asinh(a / 2 c) of the level a = mean level + y, with c from the errors of a. For each
-width all z are normal about an unknown mean. Their covariance is sigma^2 on the diagonal plus one of several
-candidates. sigma has a log-uniform prior from a recording's standard error to a tenth of the flow, so five recordings
-that agree allow a smaller sigma than two do. Recordings of one session share oil and set-up (sessions are told by
-date; undated recordings form one session): the deviation tau of a session has a half-normal prior. If the oil's
-temperature T is known for all recordings, z has a slope in T with a prior, and a recording with oil outside of the
-known range is less certain. Otherwise the viscous pressure drop of the motion (`changes.viscous_drop`) may show the
-oil's viscosity, or tau covers its effect. Load and speed outside of the known range also make a recording less
-certain. The rise follows the mixture over all of these. The priors are in `priors.toml`.
+Leakage is proportional to the inverse of the oil's viscosity. Levels that are clearly above zero are therefore compared
+as logarithms: z = asinh(a / 2 c), where a = mean level + y is a recording's level and c, from the errors of a, the
+level below which z is linear. For each width all z are normal about an unknown mean. Their covariance is sigma^2 on the
+diagonal plus one of several candidates. sigma has a log-uniform prior from a recording's standard error to a tenth of
+the flow, so five recordings that agree allow a smaller sigma than two do. Recordings of one session share oil and
+set-up (sessions are told by date; undated recordings form one session): the deviation tau of a session has a
+half-normal prior. If the oil's temperature T is known for all recordings, z has a slope in T with a prior, and a
+recording with oil outside of the known range is less certain. Otherwise the viscous pressure drop of the motion
+(`changes.viscous_drop`) may show the oil's viscosity, or tau covers its effect. Load and speed outside of the known
+range also make a recording less certain. The rise follows the mixture over all of these. The priors are in
+`priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -116,8 +117,8 @@ class Rise(NamedTuple):
     def widen(self, variance: float) -> Rise:
         """Return the rise with an additional independent error of the given variance, in the square of its unit.
 
-        The variance is added to that of the rise and of each normal distribution of its mixture. The rise remains
-        unchanged if it has no mixture, or if the variance is not positive.
+        The variance is added to the variances of the rise and of each normal distribution of its mixture. The rise
+        remains unchanged if it has no mixture, or if the variance is not positive.
         """
         if self.mixture is None or not variance > 0.0:
             return self
@@ -218,8 +219,9 @@ class Rise(NamedTuple):
     def bound(self, probability: float = BOUND_PROBABILITY) -> float:
         """Compute the upper bound of the true rise of the leakage, in the unit of the estimate.
 
-        The true rise is below it with the given probability. A negative estimate counts as zero, so the bound is not
-        below that of an estimate of zero.
+        The true rise is below it with the given probability. A negative estimate counts as zero:
+
+            bound = max(value, 0) - threshold(probability) deviation.
         """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
@@ -464,7 +466,7 @@ class _LevelScale(NamedTuple):
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
     def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
-        """Convert a distribution of z to that of the leak coefficient, relative to the healthy mean `level`.
+        """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
         `predicted`: mixture of normal distributions of z, shape (s, g, nodes), whose weights are logarithms and whose
         centres are relative to `transformed` (s,), the z of the judged recording. Each normal distribution is split
@@ -500,9 +502,9 @@ def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
 class UnusualCondition(NamedTuple):
     """Operating condition of a recording that lies outside of the range `low` to `high` of the healthy recordings.
 
-    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: that of
-    the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0 for oil, since the
-    uncertain slope in temperature already covers it.
+    `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]); `value`: load, speed
+    or temperature in the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0
+    for oil, since the uncertain slope in temperature already covers it.
     """
 
     name: str
@@ -541,9 +543,9 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n of the amount by which the coefficient exceeds that of the other n - 1 recordings. `columns`: for
-    each equation the indices of its columns by role (leak, motion, left side). The other coefficients may differ
-    between recordings within their usual prior.
+    deviation = (n - 1)/n times the amount by which the coefficient exceeds the coefficient of the other n - 1
+    recordings. `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other
+    coefficients may differ between recordings within their usual prior.
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)
@@ -637,8 +639,8 @@ class Population:
         Returns
         -------
         Mixture
-            Log weights, deviations and centres of shape (s, g, nodes), for g candidate covariances. The centres are
-            relative to `values`.
+            Log weights, standard deviations and centres of shape (s, g, nodes), for g candidate covariances. The
+            centres are relative to `values`.
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -736,16 +738,16 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Estimate the log of the ratio of the flow that the piston's motion takes to that in healthy recordings.
+    """Estimate the logarithm of the flow that the piston's motion takes, over the flow in healthy recordings.
 
     Returns the logarithm and its standard error from the recording alone. The ratio differs from 1 if area over
     displacement changed: another machine, or another scale of a sensor.
 
     `judged`, `healthy`: Gram matrices (m, m) of the recording and of the sum of the healthy ones; `roles`: indices of
-    their columns by role (leak, motion, left side). The ratio is that of the mean coefficients of motion [m^2],
-    weighted by the sums of squares of their columns in the recording. The leak is fitted together with the motion,
-    which would otherwise absorb leakage in proportion to the speed. The other coefficients differ from the healthy ones
-    by a normal prior (`between` in `priors.toml`).
+    their columns by role (leak, motion, left side). The ratio is (mean coefficient of motion [m^2] in the recording) /
+    (mean coefficient in the healthy ones), with the sums of squares of the columns in the recording as weights. The
+    leak is fitted together with the motion, which would otherwise absorb leakage in proportion to the speed. The other
+    coefficients differ from the healthy ones by a normal prior (`between` in `priors.toml`).
     """
     motion = list(roles.motion)
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]

@@ -151,8 +151,8 @@ class Signals:
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
 
-        The pump then holds the load by replacing what leaks. `pump_volume` is that of `moving`. Without `rest_limits`
-        all flags are 0.
+        The pump then holds the load by replacing what leaks. `pump_volume` computes the increments of the pump's
+        volume, as in `moving`. Without `rest_limits` all flags are 0.
         """
         return self._find_states(pump_volume)[1]
 
@@ -323,7 +323,7 @@ def _conductance_term(
 ) -> Term:
     """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
 
-    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are those of `Term`.
+    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are as in `Term`.
     """
     return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
 
@@ -385,9 +385,9 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
 
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term of an external leak from one side of the cylinder: max(p, 0) dt times `weight`.
+    """Make the term weight max(p, 0) dt of an external leak, with the gauge pressure p of one side of the cylinder.
 
-    `weight`: effect of a flow out of that side on the volume balance, with its sign; `p`: gauge pressure of the side.
+    `weight`: effect of a flow out of that side on the volume balance, with its sign.
     """
     p = f"p_{side}"
 
@@ -449,9 +449,11 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     """Make the terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
     `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
-    command u that opens it. The flow is the gain times abs(u) times the signed root of the pressure drop, with a delay
-    from the lag of the spool, and reduced by the spool's overlap. The magnitude of the overlap's coefficient is the
-    gain times the dead band of u.
+    command u that opens it. With root = signed root of the pressure drop, the flow is
+
+        flow = (gain abs(u) - overlap) root,    overlap = gain (dead band of u),
+
+    and is delayed by the lag of the spool.
     """
 
     def unit_flow(s: Signals) -> Array:
@@ -587,8 +589,8 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 def with_rests(equation: Equation) -> Equation:
     """Return a pump's volume balance with three more terms, which tell rests of the pump or the piston from motion.
 
-    They are the leakage while the pump moves the piston, that while it only holds the load, and the flow offset in
-    motion (`STATES`). They are inserted before the terms of the leak.
+    They are the leakage while the pump moves the piston, the leakage while it only holds the load, and the flow offset
+    in motion (`STATES`). They are inserted before the terms of the leak.
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
@@ -616,7 +618,8 @@ def _pump_leakage_terms(
 ) -> tuple[Term, Term]:
     """Make the terms of a pump's leakage, driven by p_A - p_B, while it moves the piston and while it holds the load.
 
-    `pump_volume` computes the increments of the pump's volume [m^3]; `drift` is that of `Term`.
+    `pump_volume` computes the increments of the pump's volume [m^3]; `drift`: entry of `priors.toml` with the prior on
+    the drift of both coefficients, or "" (`Term`).
     """
 
     def turning(s: Signals) -> Array:

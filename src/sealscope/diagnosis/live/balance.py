@@ -1,8 +1,8 @@
 """The volume balance of a running machine: the leakage conductance in each block of a few seconds.
 
 The blocks are cut as in a recording (`balance.BlockStream`). All coefficients of the balance but the leak's are
-estimated recursively from the last blocks (`coefficients`). The conductance is that of piston and pump together,
-which lie in parallel; `sequential` tests it for a step.
+estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which lie in
+parallel; `sequential` tests it for a step.
 """
 
 from __future__ import annotations
@@ -150,8 +150,8 @@ def _estimate_leak(
     """Estimate the leak's coefficient in one block of a volume balance.
 
     `gram` (m, m) are the products of the balance's columns in the block. `column_order` (n + 2,) holds the indices of
-    these columns: n nuisances (terms other than the leak), the leak, and the left side. Other arguments and the
-    result are those of `coefficients.estimate_leak`.
+    these columns: n nuisances (terms other than the leak), the leak, and the left side. Other arguments and the result
+    are as in `coefficients.estimate_leak`.
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, rows, is_learned)  # type: ignore[no-any-return]
@@ -300,7 +300,8 @@ class LiveBalance:
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
 
-        Returns the four numbers (w, w g, w s, w^2 V) of `coefficients.estimate_leak`, each summed over the balances.
+        With the estimate g, its precision w, the shift s of the series of estimates, and the variance V of g due to the
+        other coefficients (`coefficients.estimate_leak`), returns (w, w g, w s, w^2 V), each summed over the balances.
         With `is_learned`, the block also updates the other coefficients.
         """
         rows, equation_parts = float(block.rows[0]), zip(self._models, block.gram[0], self._column_orders, strict=True)

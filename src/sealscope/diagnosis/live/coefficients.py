@@ -1,8 +1,8 @@
 """Estimate a volume balance's coefficients recursively, from sums over the last blocks; compiled.
 
-The columns are ordered as n nuisances (coefficients other than the leak's), leak, left side. C (n, n) are the
-products of the nuisances' columns with each other and m (n,) those with the left side, summed over the blocks, with
-the leak's column eliminated from both. Then
+The columns are ordered as n nuisances (coefficients other than the leak's), leak, left side. C (n, n) are the products
+of the nuisances' columns with each other and m (n,) those with the left side, summed over the blocks, with the leak's
+column eliminated from both. Then the nuisances c, and the leak's coefficient g_k in block k, are
 
     c = C^-1 m,    g_k = (n_k - b_k' c) / N_k,    Var g_k = s^2 / N_k,
 
@@ -193,10 +193,10 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
 def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block; with `is_learned`, also add the block to the earlier ones.
 
-    `model` is a `Coefficients`, whose `block` holds the block's products, and `rows` the number of equations in it.
-    Returns (w, w g, w s, w^2 V). g is the estimate and w its precision. Subtracting the shift s from g keeps the
-    series of estimates continuous while the other coefficients improve. V is the variance of g due to the errors of
-    these coefficients.
+    `model` is a `Coefficients`, whose `block` holds the block's products, and `rows` the number of equations in it. Let
+    g be the estimate, w its precision, s the shift that is subtracted from g to keep the series of estimates continuous
+    while the other coefficients improve, and V the variance of g due to the errors of these coefficients. Returns (w, w
+    g, w s, w^2 V).
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # columns: c; C^-1 b_k, for the variance due to c; C^-1 (b_k - its usual value)
@@ -230,8 +230,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
-    `square` is the sum of squares over the block's `rows` equations, and `numbers` are those of `Coefficients`.
-    Returns inf if only this block moved, and 1 if none moved.
+    `square` is the sum of squares over the block's `rows` equations, and `numbers` holds the sums over earlier blocks
+    (`Coefficients`). Returns inf if only this block moved, and 1 if none moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -295,8 +295,9 @@ class BaselineLearning:
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
         """Compute the baseline from the sums over blocks, which must contain at least `GROUP` blocks.
 
-        `version` and `hours` are those of the new `WatchBaseline`, and `end` is the end of the last block [s]. With
-        `states_lpm`, the baseline also states its level as a flow [L/min].
+        `version`: 1 for the first baseline, increased by one after each repair; `end`: end of the last block [s];
+        `hours`: operating time over which the baseline was learned [h]. With `states_lpm`, the baseline also states its
+        level as a flow [L/min].
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks

@@ -93,7 +93,7 @@ class SampleJoiner:
     newest : float
         Time of the newest sample [s].
     changed : bool
-        True if `rate` differs from that of the last run.
+        True if `rate` differs from the rate of the last run.
     counters : dict of str to int
         Numbers of dropped samples and of interruptions, by reason.
     """

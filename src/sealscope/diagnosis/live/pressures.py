@@ -241,7 +241,7 @@ class PressureEstimator:
     def relearn(self, since: float = math.inf) -> None:
         """Forget the learned parameters of the machine, after a repair or an exchange.
 
-        `since` has no effect; it is there for the same call as that of `LiveBalance`.
+        `since` has no effect; both estimators are called in the same way, and `LiveBalance` needs it.
         """
         if self._follower is not None:
             self._follower.interrupt(math.inf)

@@ -77,8 +77,8 @@ class LiveRise(NamedTuple):
 class LiveLeak:
     """The leakage of a watched machine, in the form that `decision.decide` judges.
 
-    The fields are those of the protocol `observable.LeakMeasure`, which explains them. `test` is the increase that a
-    test has detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
+    The protocol `observable.LeakMeasure` explains the fields. `test` is the increase that a test has detected, or a
+    step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
     """
 
     test: LiveRise

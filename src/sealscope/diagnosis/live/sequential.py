@@ -187,7 +187,8 @@ class StepDetector:
     def _step_log_ratios(self) -> Array:
         """Compute the log likelihood ratios (v, q, j) of a step of the coefficient against none.
 
-        There is one for each prior size v of the step, random walk q and onset j.
+        v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
+        and j the onset.
         """
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
@@ -197,8 +198,7 @@ class StepDetector:
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
-        There is one for each prior size v of the step, random walk q and onset j. The sum is M in the module's
-        docstring.
+        v, q and j are as in `_step_log_ratios`; the sum is M in the module's docstring.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
@@ -248,7 +248,7 @@ class StepDetector:
     def noise(self) -> float:
         """Variance of the estimates' prediction errors (innovations) over the variance that the estimates state.
 
-        It applies to the random walk whose variance per block is a tenth of that of the first block's estimate.
+        It applies to the random walk with a variance per block of a tenth of the first estimate's variance.
         """
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))

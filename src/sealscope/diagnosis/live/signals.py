@@ -1,7 +1,7 @@
 """Features of a running machine that no volume balance contains, block by block.
 
 They are duty (motion and load), noise, mains hum, the sense of p_A - p_B, and mean pressures. Features and tests are
-those of the blocks of a recording (`inference.changes`).
+the same as for the blocks of a recording (`inference.changes`).
 """
 
 from __future__ import annotations

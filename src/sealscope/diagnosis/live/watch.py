@@ -168,7 +168,7 @@ class Watch:
 
     @property
     def block_seconds(self) -> float:
-        """Approximate length of a block [s]; until samples have arrived, that of the volume balance."""
+        """Approximate length of a block [s]; until samples have arrived, the length for the volume balance."""
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
@@ -293,8 +293,8 @@ class Watch:
     def judge(self, result: BlockResult) -> BlockEstimate:
         """Test the conductances of a block for a leak, and return the estimate of the block.
 
-        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of
-        the first fit arrive together in one result, and count as one block; the estimate is that of the last of them.
+        `result` is the conductances, or the reason for none, which the returned estimate then states. The blocks of the
+        first fit arrive together in one result, and count as one block; the last of them is estimated.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -347,8 +347,8 @@ class Watch:
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        The duty is the mean pressure difference and pump flow; a change is one from known duties, those of the
-        baseline, to others or back. `row` is the block as an array with one row of `_BLOCK`.
+        The duty is the mean pressure difference and pump flow; a change is one from the duties of the baseline to
+        others, or back. `row` is the block as an array with one row of `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -422,7 +422,7 @@ class Watch:
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
         """Test the mean of the last `GROUP` blocks against the healthy machine, and raise the alarm if it is higher.
 
-        The healthy machine is that of the baseline or, until there is one, of the healthy recordings. Without either
+        The healthy mean is taken from the baseline or, until there is one, from the healthy recordings. Without either
         there is no test.
         """
         has_baseline = self.baseline is not None
@@ -462,9 +462,9 @@ class Watch:
     ) -> None:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance.
 
-        The increase was found at the end of `block`. `threshold` is that of the test, and `reason` the text of the
-        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is
-        by default that of the estimator. If there is an alarm already, its time and its conductance before the onset
+        The increase was found at the end of `block`. `threshold` is the test's threshold, and `reason` the text of the
+        alarm. `before` is the conductance before the onset, by default the mean of the blocks before it. `cause` is by
+        default what the estimator states. If there is an alarm already, its time and its conductance before the onset
         are kept.
         """
         raised_s = block.end
@@ -542,7 +542,7 @@ class Watch:
     def state(self) -> dict[str, Any]:
         """Return the state of the watch as plain values for JSON, which `from_state` restores.
 
-        ``"version"`` is that of the format.
+        ``"version"`` is the version of the format.
         """
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {

@@ -22,8 +22,8 @@ class NullPriors(PriorTable):
 class QuestionPriors(PriorTable):
     """Division of the false-alarm probability of a diagnosis among its tests.
 
-    - `within`: fraction of the test for a change within the recording. Without healthy recordings, it is the fraction
-      of the test of the leakage against the limit in the rig's file.
+    - `within`: fraction that the test for a change within the recording gets. Without healthy recordings, the test of
+      the leakage against the limit in the rig's file gets it.
     """
 
     within: float
@@ -32,7 +32,8 @@ class QuestionPriors(PriorTable):
 class ExplanationPriors(PriorTable):
     """Probabilities from which a leak is stated, excluded, or replaced by another explanation.
 
-    - `heading`: allowed probability of naming another event for a healthy recording, over that of a false leak.
+    - `heading`: allowed probability of naming another event for a healthy recording, over the allowed
+      probability of a false leak.
     - `leak`: probability from which a change is called a leak.
     - `named`: probability from which a cause other than a leak is named.
     - `sure`: a leak is excluded if its probability is below 1 - `sure`.

@@ -221,7 +221,8 @@ class HeldOilPriors(PriorTable):
     - `charge`: relative margin above the charge pressure from which no check valve feeds a side.
     - `resolved` [Pa]: margin in addition, below which a sensor does not tell a pressure from the charge pressure.
     - `steady` [s]: time over which a pressure is averaged before it is compared with the charge pressure.
-    - `air`, `air_deviation`: volume fraction of free air in the oil, and the same of it.
+    - `air`, `air_deviation`: volume fraction of free air in the oil, and the standard deviation of its
+      logarithm.
     """
 
     compressibility: float

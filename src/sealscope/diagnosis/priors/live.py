@@ -50,7 +50,7 @@ class CoefficientMemory(PriorTable):
 class StepPriors(PriorTable):
     """A step of the leak within the stream of blocks, and the random walk of a healthy machine's leakage.
 
-    Variances are divided by that of a block's estimate.
+    Variances are divided by the variance of a block's estimate.
 
     - `walks`: variances of the random walk in one block, each equally likely.
     - `sizes`: variances of the step, each equally likely.

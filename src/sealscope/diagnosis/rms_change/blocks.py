@@ -98,7 +98,7 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the chamber pressures that are not mostly clipped, or all of them if every one is clipped."""
+    """Return the chamber pressures with at most half of the samples clipped, or all if every one has more."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 

@@ -1,15 +1,15 @@
 """Estimate how the ringing of a machine changes, from the RMS of wavelet details, with the noise removed.
 
-The energy E_j of a detail d_j is the sum of two energies: that of white noise, which is equal in every detail (d1 is
-almost only noise), and that of the machine, E_j = (1 + g)^2 S_j + E_1. To first order the change g of the machine's
-amplitude follows from
+A detail d_j has the energy E_j = (1 + g)^2 S_j + E_1, with the machine's mean energy S_j in it, the relative change g
+of the machine's amplitude, and the energy E_1 of white noise, which is equal in every detail; d1 is almost only noise.
+To first order g follows from
 
     y = log RMS d_j - log sqrt(S_j + E_1) = w g + error,    w = S_j / (S_j + E_1),
 
-with E_1 of the same block or recording. A change of the noise therefore cancels, and where noise dominates the weight w
-is small. For d1, y is the log RMS itself. The effect of the duty (how the machine is moved and loaded) is eliminated: g
-follows powers of the duty's features (`blocks.DUTY`) with priors on the exponents (`priors.toml`). For a duty that does
-not repeat, g has a wider random walk.
+with E_1 measured in d1 of the same block or recording. A change of the noise therefore cancels, and where noise
+dominates the weight w is small. For d1, y is the log RMS itself. The effect of the duty (how the machine is moved and
+loaded) is eliminated: g follows powers of the duty's features (`blocks.DUTY`) with priors on the exponents
+(`priors.toml`). For a duty that does not repeat, g has a wider random walk.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ from sealscope.signals.details import QUANTITIES
 def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     """Compute the change of the log RMS of wavelet details without noise, and the noise-free fraction of energy.
 
-    The changes are y = log RMS - log sqrt(S_j + E_1), the fractions w = S_j / (S_j + E_1). `log_rms` (n, 5 per
-    chamber) are the values of n blocks or recordings. `healthy` (k, 5 per chamber) are those from which the machine's
-    mean energy S_j in each detail is estimated, as the energy that exceeds that of d1. The energy E_1 of d1 in the
-    same row is the noise. Both results have the shape of `log_rms`; for d1 itself y is the log RMS, and w is 1. The
-    product d3d4 changes as d3 and d4 together, with w = 1.
+    `log_rms` (n, 5 per chamber): values of n blocks or recordings; `healthy` (k, 5 per chamber): values from which the
+    machine's mean energy S_j in each detail d_j is estimated, as the energy of d_j minus the energy of d1. The energy
+    E_1 of d1 in the same row is the noise. The changes y and the fractions w are
+
+        y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1).
+
+    Both results have the shape of `log_rms`; for d1 itself y is the log RMS, and w is 1. The product d3d4 changes as d3
+    and d4 together, with w = 1.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -83,13 +86,14 @@ def estimate_rises(
 
     The effect of the duty, i.e. how the machine is moved and loaded, is corrected.
 
-    `log_rms` (5 per chamber,) and `duty` (4,) are those of the judged recording, `healthy` (n, 5 per chamber) and
-    `healthy_duty` (n, 4) those of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free
+    `log_rms` (5 per chamber,), `duty` (4,): values of the judged recording; `healthy` (n, 5 per chamber),
+    `healthy_duty` (n, 4): values of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free
     recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet quantity, and the
     fractions of their energy that are not noise, (5 per chamber,).
 
     The healthy values are modelled by a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over
-    time. The rate of this process is unknown. Its variance is that between sessions, which are separated by a pause.
+    time. The rate of this process is unknown. Its variance is the variance between sessions, which are separated by a
+    pause.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponents = np.array([vars(RMS_PRIORS.duty)[name] for name in DUTY])

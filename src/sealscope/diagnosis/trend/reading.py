@@ -119,7 +119,7 @@ def estimate_reading(
     """Estimate the leakage of a recording.
 
     `rig` states the sizes of the machine. If it is None, L/min are stated only for a known machine, as in `diagnose`.
-    `file` is the name of the recording, by default that of the file it was read from.
+    `file` is the name of the recording, by default the name of the file it was read from.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)

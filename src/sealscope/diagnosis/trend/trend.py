@@ -49,8 +49,8 @@ class Trend:
     Parameters
     ----------
     decision : Evidence
-        Verdict, reason, leak, bound and onset, as in a diagnosis. The verdict is `leak` if the level rose more than
-        that of a healthy machine may, a leak explains the rise, and no repair followed.
+        Verdict, reason, leak, bound and onset, as in a diagnosis. The verdict is `leak` if the level rose more than a
+        healthy machine's may, a leak explains the rise, and no repair followed.
     basis : str or None
         Method by which the levels were estimated: volume balance, pressure response, or the damping of the pressures'
         ringing.
@@ -78,7 +78,7 @@ class Trend:
     healthy : int
         Number of first recordings that were known to be healthy.
     dated : bool
-        True if the times are those of the recordings, False if equal intervals are assumed.
+        True if the recordings have dates, False if equal intervals are assumed.
 
     Examples
     --------

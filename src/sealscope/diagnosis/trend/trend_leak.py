@@ -1,9 +1,11 @@
 """Describe the increase of a machine's leakage over its recordings in the form that `decision.decide` judges.
 
-The sequential test of `wear` gives the chance that a healthy machine shows such an increase: the time between two
-recordings over the mean time to a false alarm. Other explanations are observed as in a diagnosis: terms of the volume
-balance in all recordings since the onset, and the ringing (RMS of the pressures' wavelet details) of the last
-recording.
+The sequential test of `wear` gives the chance that a healthy machine shows such an increase,
+
+    chance = time between two recordings / mean time to a false alarm.
+
+Other explanations are observed as in a diagnosis: terms of the volume balance in all recordings since the onset, and
+the ringing (RMS of the pressures' wavelet details) of the last recording.
 """
 
 from __future__ import annotations
@@ -34,8 +36,8 @@ MIN_RECORDINGS = 3
 class TrendLeak:
     """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
 
-    The fields are those of the protocol `LeakMeasure`, which explains them. Flows are in the unit of the trend. There
-    is no test for a step within a recording, and no history other than the trend itself.
+    The protocol `LeakMeasure` explains the fields. Flows are in the unit of the trend. There is no test for a step
+    within a recording, and no history other than the trend itself.
     """
 
     provider: str
@@ -104,7 +106,7 @@ def decide_trend(
     pressure : float or None
         Pressure difference at which L/min are stated [Pa], None if the levels are relative.
     interval : float
-        Typical time between two recordings [days].
+        Median time between two recordings [days].
     years : float
         Mean time between false alarms [machine-years].
 
@@ -133,9 +135,9 @@ def _measure_leak(
 ) -> TrendLeak:
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
-    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy
-    machine. The other arguments are those of `decide_trend`. The leak may be laminar or an orifice, so its flow is
-    proportional to the pressure to one of the powers `EXPONENTS`.
+    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy machine.
+    The other arguments are as in `decide_trend`. The leak may be laminar or an orifice, so its flow is proportional to
+    the pressure to one of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]

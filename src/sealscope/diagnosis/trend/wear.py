@@ -6,16 +6,15 @@ The level that recording i states at the time t_i is
 
 Here mu_l is the mean of the group l of comparable recordings, c a covariate with a normal prior on beta, and e_i the
 recording's own error of stated deviation s_i. The change g is a step, ``g = [t >= t_j]``, or a growth, ``g = max(t -
-t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this
-variance is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2
-((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is
-uniform on a few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several
-scales in units of tau. With L L' = cov(y), the rows of z = L^-1 y up to n are those of the first n recordings alone,
-so that one factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the
-likelihood ratio exp(b delta - a delta^2/2).
+t_(j-1), 0)``. The deviation d from recording to recording is normal with variance tau^2. A fraction r of this variance
+is correlated over time, half of it for an hour and half for a week, so that the covariance of d is ``tau^2 ((1 - r) [i
+= k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`), r is uniform on a
+few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of several scales in units
+of tau. With L L' = cov(y), the rows of z = L^-1 y up to n depend on the first n recordings alone, so that one
+factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has the likelihood
+ratio exp(b delta - a delta^2/2).
 
-The test is that of Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against
-none,
+The test is by Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
 
     R_n = sum_(j <= n) w_j LR_j(n),   w_j = min(t_j - t_(j-1), longest wait),   alarm where R_n > A.
 
@@ -106,7 +105,7 @@ class Levels:
 
     @property
     def interval(self) -> float:
-        """Typical time between two successive recordings [days]; 1 if there is only one."""
+        """Median of the times > 0 between successive recordings [days]; 1 if there is none."""
         steps = np.diff(self.t)
         return float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
 
@@ -114,9 +113,11 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        It is the root of a weighted mean of two variances. The first is that of the prior plus the mean square of the
-        stated errors; its weight is the prior's degrees of freedom. The second follows from the median change between
-        neighbours in a group; its weight is the number of these changes.
+        From the prior's `scale` and `freedom` f, and the n changes between neighbours in a group, it is
+
+            sqrt((f v_prior + n v_changes) / (f + n)),    v_prior = scale^2 + mean of error^2,
+
+        where v_changes is the variance of a level that the median change corresponds to.
         """
         prior = self.prior
         # the step of two neighbours has twice the variance of one
@@ -265,9 +266,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     `profiles` (n, m) are the effects of m changes of unit size on each recording. With `may_grow`, the level may have
     grown evenly since the first recording even without a change.
 
-    The levels have the covariance shared + tau^2 (r C + (1 - r) I) + error^2, where C is the correlation over the
-    time between recordings. Vectors are whitened by its Cholesky factor L: z is the levels, u the unit level of the
-    last group, and G the profiles. Up to each recording a = sum G^2 and b = sum G z.
+    With C the correlation over the time between recordings, `error` the standard errors that they state, and `shared`
+    what does not depend on tau (the wide priors on the level of each group and on the growth, and the prior on the
+    covariate's coefficient), the levels have the covariance
+
+        shared + tau^2 (r C + (1 - r) I) + error^2 = L L'.
+
+    Multiplied by L^-1, the levels become z, the profiles G, and the covariance of the levels with the level of the last
+    group u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
     """
     from scipy.linalg import solve_triangular
 

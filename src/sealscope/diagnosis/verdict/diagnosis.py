@@ -41,8 +41,8 @@ _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "ri
 class Diagnosis(Evidence):
     """Verdict on one recording: the combined evidence of all detectors.
 
-    It has the fields of `Evidence`, where `parts` is the evidence of every detector, that of the deciding one first.
-    Its other fields are:
+    It has the fields of `Evidence`, where `parts` is the evidence of every detector, with the deciding one first. Its
+    other fields are:
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Diagnosis(Evidence):
     unused : tuple of str
         Recorded pressures, positions, speeds and flows that were not read as channels.
     pressure_unit : str
-        Unit of pressures in texts: that of the log if it is known, else bar.
+        Unit of pressures in texts: the log's unit if it is known, else bar.
 
     Examples
     --------
@@ -98,8 +98,8 @@ class Diagnosis(Evidence):
     ) -> Diagnosis:
         """Make the diagnosis of a recording from the combined evidence and from statements in the recording's file.
 
-        `file` is the name of the recording, by default that of the file it was read from. `fields` are the remaining
-        fields of `Diagnosis`.
+        `file` is the name of the recording, by default the name of the file it was read from. `fields` are the
+        remaining fields of `Diagnosis`.
         """
         if evidence.relative is None:
             evidence = replace(evidence, relative=relative_leak(evidence, recording, machine))
@@ -203,7 +203,7 @@ class Diagnosis(Evidence):
 
     @property
     def known_healthy(self) -> bool:
-        """True if there is no leak and the leakage is known to be that of a healthy machine.
+        """True if there is no leak and the leakage is known to be as low as a healthy machine's.
 
         This is known from leak-free recordings, or from the healthy leakage that the rig states.
         """
@@ -301,7 +301,7 @@ class Diagnosis(Evidence):
         Parameters
         ----------
         ax : matplotlib.axes.Axes, optional
-            Axes to draw into; by default those of a new figure.
+            Axes to draw into; by default the axes of a new figure.
 
         Returns
         -------

@@ -148,7 +148,7 @@ class Evidence:
         Time of the last judged sample, as a fraction of the recording's duration. As a leak stays once it began, only
         the rest of the recording may hide one.
     detector : str
-        Name of the detector or of its test; for a combined verdict, that of the deciding detector, "" if none did.
+        Name of the detector or of its test; for a combined verdict, the name of the deciding detector, "" if none did.
     usable : bool
         Whether the recording had the channels and the length that the detector needs.
     chance : float, optional

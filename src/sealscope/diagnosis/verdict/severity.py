@@ -155,8 +155,8 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
     """Convert a leak in L/min to a fraction of the pump's flow and to a creep speed of the piston.
 
-    Displacement and piston area are those of `machine`. The result is None if no L/min are stated. The fraction is
-    None if neither speed nor angle of the pump is recorded.
+    `machine` states displacement and piston area. The result is None if no L/min are stated. The fraction is None if
+    neither speed nor angle of the pump is recorded.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None

@@ -241,7 +241,7 @@ def vanishing_moments(psi: Array, t: Array) -> int:
 def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 3.4: a signal in time, its spectrum, its short-time Fourier transform and its wavelet transform.
 
-    The signal is the tone of 100 Hz of eq. (3.3) before 0.5 s, that of 30 Hz after, and a pulse of one sample and
+    The signal is the tone of 100 Hz of eq. (3.3) before 0.5 s, its tone of 30 Hz after, and a pulse of one sample and
     height 8 at 0.75 s.
     """
     t = np.arange(round(RATE)) / RATE
@@ -288,8 +288,7 @@ def _width(t: Array, values: Array) -> float:
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the wavelet transform of a simulated, ringing chamber pressure p_A without and with a leak.
 
-    The transform is that of eqs. (3.4)-(3.6). It is drawn of p_A as recorded, and of p_A without the instruments'
-    noise.
+    The transform follows eqs. (3.4)-(3.6). It is drawn of p_A as recorded, and of p_A without the instruments' noise.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t

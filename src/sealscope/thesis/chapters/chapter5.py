@@ -130,7 +130,7 @@ class FigureView:
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the part of the test without the leak, after the start-up, and of that with it."""
+        """Return (mask, label) of the part without the leak, after the start-up, and of the part with the leak."""
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
 

@@ -69,7 +69,7 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 def conductance(lpm: float, rig: Rig) -> float:
     """Compute the leakage conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
-    The pressure difference is the load over the piston's area A_A.
+    It is flow / (LOAD / A_A), with the piston's area A_A.
     """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
@@ -172,9 +172,9 @@ class ControlledRig:
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        They are the damper's work over the electrical energy of the motor, and over the hydraulic energy. The latter
-        is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the supply's
-        pressure.
+        They are (work in the damper) / (electrical energy of the motor) and (work in the damper) / (hydraulic energy).
+        The latter is delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the
+        supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
         flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]

@@ -131,9 +131,10 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    `either_side`: True to count changes of either sign, False for one sign. The threshold is ``1.645 rms(log change
-    of d1)``, or 1.960 times this rms for either sign. d1 is noise and does not depend on the leak, so its changes
-    between the halves of a test are those of a rig without a leak. The other details scatter at least as much.
+    `either_side`: True to count changes of either sign, False for one sign. The threshold is ``1.645 rms(log change of
+    d1)``, or 1.960 times this rms for either sign. d1 is the finest wavelet detail of the pressure `chamber`, "p_A" or
+    "p_B". It is noise and does not depend on the leak, so its changes between the halves of a test are as in a rig
+    without a leak. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
     return float((WITHIN_95 if either_side else UPPER_95) * np.sqrt(np.mean(change**2)))

@@ -37,8 +37,8 @@ class ClaimEvidence:
 
     `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
     `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting
-    parameters; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of the ten tests whose figures
-    chapter 5 prints, by section; `no_leak_measures`: those of test 5.2a without its leak.
+    parameters; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of the ten tests whose figures chapter
+    5 prints, by section; `no_leak_measures`: measures of test 5.2a without its leak.
     """
 
     measured_sheet: DataSheet | None
@@ -177,7 +177,7 @@ def partial_correlation(x: Array, y: Array, controls: Array) -> float:
 def leave_one_out_r2(columns: Array, y: Array) -> float:
     """Compute the leave-one-out R^2 of a least-squares fit of `y` (n,) by `columns` (n, k).
 
-    ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2`` with residuals r and leverages h. Source: Allen,
+    With residuals r and leverages h it is ``1 - sum (r_i/(1 - h_i))^2 / sum (y_i - mean y)^2``. Source: Allen,
     Technometrics 16 (1974) 125-127, doi 10.1080/00401706.1974.10489157.
     """
     hat = columns @ np.linalg.pinv(columns)

@@ -96,12 +96,12 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
         yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
     def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        """Make the values that fill the braces of the claim's texts.
+        """Make the values that fill the braces of the claim's texts, by the names in the braces.
 
-        `where`: place of the claim in the thesis; `name`: the details and chambers that the rule of Table 5.1 tests;
-        `rates`: success rates that the thesis prints for this rule [%]; `product`: a remark on one printed rate, "" for
-        all other rules; `controls`: how often the rule fires in simulations without a leak. `sheet`: data sheet of
-        Appendix C, from which the rates are counted again.
+        The names are "where" (place of the claim in the thesis), "name" (details and chambers that the rule of Table
+        5.1 tests), "rates" (success rates that the thesis prints for it [%]), "product" (a remark on one printed rate,
+        "" for all other rules) and "controls" (how often the rule fires in simulations without a leak). `evidence`: has
+        the sheets of these simulations; `sheet`: data sheet of Appendix C, from which the rates are counted again.
         """
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (

@@ -161,14 +161,14 @@ def _empty_runs_folder(store: Path) -> Path:
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
     """Compute for each item a digest of all inputs of its products and files, by id.
 
-    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes
-    those of the items it needs.
+    `sheet_key`: digest of the data sheet; `is_published`: True if files are written. The digest of an item includes the
+    digests of the items it needs.
     """
     by_id, sources = {item.id: item for item in items}, sources_key()
 
     @cache
     def item_key(name: str) -> str:
-        """Compute the digest of one item, which includes those of the items it needs."""
+        """Compute the digest of one item, which includes the digests of the items it needs."""
         item = by_id[name]
         identity = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
         sheet = sheet_key if item.reads_sheet else ""
@@ -180,8 +180,7 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
     """Build the stored result of an item from JSON values; return None if it was made from other inputs.
 
-    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are not those of a
-    result.
+    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are no stored result.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")

@@ -53,7 +53,7 @@ class Panel:
     """One set of axes of a figure, with curves, or an image, or both.
 
     Labels have the unit in brackets, such as "p_A [MPa]". `marks`: (x, text) of vertical lines; `x_range`: limits of
-    the x axis, None for those of the curves.
+    the x axis, None for the limits of the curves.
     """
 
     x_label: str

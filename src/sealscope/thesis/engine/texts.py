@@ -28,7 +28,7 @@ def format_note(name: str, **values: Any) -> str:
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    `tests`: results, None for a test that cannot be made. The texts are those of `id` in `claims.toml`, or of `kind`
+    `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
     for claims that share texts. Values named `sheet` (finding by the thesis's data sheet), `simulation` (finding by
     simulation) and `why` (reason of the verdict) replace the text of that name.
     """

@@ -235,7 +235,7 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
     """Draw a curve into `ax` in the line style of its role.
 
     `n_before`: number of earlier curves with this role in the panel, which chooses other dashes; `is_only`: True for
-    the panel's only curve, which is drawn in colour even if its role is that of a reference.
+    the panel's only curve, which is drawn in colour even if its role is a reference.
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)

@@ -199,9 +199,10 @@ def _envelope_error(time: Array, residual: Array) -> float:
 def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
     """Compare the drifts of the low pressures with those of healthy recordings; yield a test for each explanation.
 
-    The explanations are a drift of the sensor of p_A, one of p_B, and a fall of the charge pressure, which lowers
-    both alike. The chance of the fall is that of the weighted mean of both drifts, divided by the chance of their
-    difference, which a fall does not explain.
+    The explanations are a drift of the sensor of p_A, one of p_B, and a fall of the charge pressure, which lowers both
+    alike. A fall does not explain a difference of the drifts:
+
+        chance of the fall = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
     scatter = PriorScatter(prior.scatter, prior.recordings)
@@ -233,8 +234,8 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
 def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
     """Compute the mean fall of the low pressures of both chambers [Pa/s], with its standard error.
 
-    It is minus the mean of their drifts, weighted by the inverse `variances` [Pa^2/s^2] of the sides "A" and "B".
-    None if the recording has no drift of these sides.
+    It is -sum(drift / variance) / sum(1 / variance), with the `variances` [Pa^2/s^2] of the sides "A" and "B". None if
+    the recording has no drift of these sides.
     """
     known = [
         (drift, 1.0 / variance) for side, variance in variances.items() if (drift := drifts.estimate(side)) is not None
@@ -255,6 +256,6 @@ def _difference(drifts: LowDrifts) -> Estimate:
 def _with_size(observable: Observable, size: StepSize) -> Observable:
     """Return the observable of a drift with its `advantage` set by the prior on the size of drifts.
 
-    The advantage is twice the log prior density of its size, relative to the maximum of that density.
+    advantage = 2 log(prior density of its size / largest prior density).
     """
     return replace(observable, advantage=-size_penalty(size, observable.size))

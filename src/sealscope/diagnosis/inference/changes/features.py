@@ -58,8 +58,8 @@ def time_in_motion(speeds: Array, max_speed: float) -> Array:
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
     """Flag the blocks (K,) in which the piston moves for long enough.
 
-    `fractions` (K,): fraction of each block's time in motion, from `time_in_motion`. It must be at least that of the
-    busiest block, times `features.busy` of `priors.toml`.
+    `fractions` (K,): fraction of each block's time in motion, from `time_in_motion`. It must be at least
+    `features.busy` (`priors.toml`) times the fraction of the busiest block.
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
@@ -152,10 +152,10 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 
 
 def _log_hum(blocks: Array, frequency: float) -> Array:
-    """Compute the log power (K,) of a spectral line in blocks (K, n), relative to that of the neighbouring bins.
+    """Compute the log power (K,) of a spectral line in blocks (K, n), relative to the power of the neighbouring bins.
 
-    `frequency`: that of the line, divided by the sampling rate. Ringing is wider than a line and raises the
-    neighbouring bins as well. The spectrum is Welch's estimate from both halves of each block.
+    `frequency`: frequency of the line over the sampling rate. Ringing is wider than a line and raises the neighbouring
+    bins as well. The spectrum is Welch's estimate from both halves of each block.
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)

@@ -99,7 +99,7 @@ def _low_drifts(summary: Summary) -> LowDrifts | None:
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    The logarithms are compared. The sign of the friction is that of most healthy recordings. A value that does not
+    The logarithms are compared. The friction has the sign that it has in most healthy recordings. A value that does not
     exceed its standard error with this sign is not used. Return None if the recording, or too many of the healthy ones,
     have no usable value.
     """
@@ -123,8 +123,10 @@ def _describe_drifts(drift_A: Observable, drift_B: Observable, difference_AB: Ob
     """Yield three alternative explanations of drifting pressures: by p_A alone, by p_B alone, and by both alike.
 
     `drift_A`, `drift_B`, `difference_AB`: tests of the drifts of p_A, p_B and p_A - p_B. The `chance` of a test is the
-    probability that a healthy machine scores as high (its p-value). A drift of both alike does not explain that of the
-    difference, so the third explanation gets the p-value chance_A chance_B / chance_difference, at most 1.
+    probability that a healthy machine scores as high (its p-value). A drift of both alike does not explain a drift of
+    the difference, so the third explanation gets
+
+        chance = min(1, chance_A chance_B / chance_difference).
     """
     yield drift_A
     yield drift_B

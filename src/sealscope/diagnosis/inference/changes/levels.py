@@ -1,20 +1,21 @@
 """Changes of friction, load and sensors, from the levels of the chamber pressures in either direction of motion.
 
-Four numbers are estimated in each block, during motion: the level of each chamber's pressure, and half its difference
-between the directions. The force of the piston also depends on speed, acceleration and position, in the same way
-throughout a recording,
+Four numbers are estimated in each block, during motion: of each chamber's pressure the level, and half its change from
+motion with v < 0 to motion with v > 0. The force of the piston also depends on speed, acceleration and position, in the
+same way throughout a recording,
 
     p_i = level_i + half_i sign(v) + b_i v + c_i dv/dt + d_i x,    i = A, B.
 
 A leak between the chambers changes none of them: the force that the piston needs determines their difference, the
 enclosed oil their mean. Another cause changes some of them at one instant in a known pattern: each pattern, a subspace
-of the four, is a hypothesis. With S the covariance of the differences of neighbouring blocks, which contain little of
-drifts and walks, the noise of the coordinates S^(-1/2) (..) is white: with F the relative decrease of the residual by
-the step in one direction of an orthonormal basis of m directions, over K = n blocks,
+of the four, is a hypothesis. Let S be the covariance of the differences of neighbouring blocks, which contain little of
+drifts and walks: the four numbers times S^(-1/2) have white noise. A pattern then has an orthonormal basis of m
+directions. In n blocks, score_j is twice the log likelihood ratio of a step in direction j alone, and F_j the residual
+sum of squares without that step over the one with it, minus 1:
 
-    rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log K,    F_j = exp(score_j / n) - 1,
+    F_j = exp(score_j / n) - 1,    rank = max over onsets of n log(1 + sum_j F_j) - (m - 1) log n.
 
-each further coefficient costs log K (G. Schwarz, Ann. Statist. 6 (1978) 461).
+Each further coefficient costs log n (G. Schwarz, Ann. Statist. 6 (1978) 461).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class PressureLevels(NamedTuple):
     """Levels of both chamber pressures in K blocks of a recording, at the times `time` (K,) [s].
 
     `values` (K, 4) [Pa] has the columns level_A and level_B, the mean of each pressure over both directions of motion,
-    and half_A and half_B, half its difference between the directions.
+    and half_A and half_B = (p for v > 0 - p for v < 0) / 2 of each pressure, at the same motion otherwise.
     """
 
     time: Array
@@ -121,7 +122,7 @@ def _central_difference(values: Array, half_length: int) -> Array:
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate in blocks the mean of each chamber pressure over both directions of motion, and half the difference.
+    """Estimate in blocks each pressure's mean over both directions of motion, and half its change with them.
 
     The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
     half difference are free in each block; the slopes b, c and d on speed, acceleration and position are common to
@@ -171,11 +172,11 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit the mean of p_A and p_B over both directions of motion, and half their difference, in each of K blocks.
+    """Fit the mean of each pressure over both directions of motion, and half its change with them, in K blocks.
 
-    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa]. It is None if a block has too few samples of
-    one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`: samples in a block;
-    `means` (2,) [Pa]: were subtracted from the pressures.
+    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa] (`PressureLevels`). It is None if a block has
+    too few samples of one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`:
+    samples in a block; `means` (2,) [Pa]: were subtracted from the pressures.
     """
     n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
     if n_free == 2:

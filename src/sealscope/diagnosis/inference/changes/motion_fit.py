@@ -5,8 +5,8 @@ A pressure, or p_A - p_B, is fitted by
     p = level(x) + half sign(v) + b v + c dv/dt + drift t/T,
 
 with the level free in each of some bins of the position and t/T the time over the recording's duration, by iteratively
-reweighted least squares (weights of Cauchy's law), so that contact with a workpiece does not count. Standard errors are
-those of residuals that are correlated within each of some parts of the recording (cluster-robust). Called for friction
+reweighted least squares (weights of Cauchy's law), so that contact with a workpiece does not count. Standard errors
+allow for residuals that are correlated within each of some parts of the recording (cluster-robust). Called for friction
 and drifts (`healthy_levels`) and for the viscous drop (`viscous_drop`).
 
 Sources: P. W. Holland, R. E. Welsch, Communications in Statistics A6 (1977) 813 (the weights); K.-Y. Liang, S. L.

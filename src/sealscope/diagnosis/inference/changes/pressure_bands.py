@@ -14,7 +14,7 @@ The ratios of an octave vary between healthy recordings by an unknown variance w
 vary together: a recording's ratios follow a multivariate t distribution. Its phases follow von Mises distributions,
 whose variance is learnt likewise and is larger where the pressures are hardly coherent; a fraction of the phases is
 uniform. The observable is the Bayes factor of a filter, averaged over the pairs, the filtered pressure, f_c and the
-noise; as its mean over healthy recordings is 1, that of a healthy one exceeds b with a probability of at most 1 / b
+noise; as its mean over healthy recordings is 1, a healthy recording exceeds b with a probability of at most 1 / b
 (Markov).
 
 Source: P. D. Welch, IEEE Transactions on Audio and Electroacoustics 15 (1967) 70; J. S. Bendat, A. G. Piersol, Random
@@ -62,8 +62,8 @@ MAX_VARIANCE = 4.0
 class Octaves(NamedTuple):
     """Spectra of two channels A and B of a recording in k octaves, (k,) each.
 
-    `log_A`, `log_B`: logarithms of the RMS of A and B, in their units; `phase`: that of the cross-spectrum [rad],
-    positive if A leads; `phase_variance`: variance of its error [rad^2].
+    `log_A`, `log_B`: logarithms of the RMS of A and B, in their units; `phase`: phase of the cross-spectrum [rad],
+    positive if A leads; `phase_variance`: variance of the error of the phase [rad^2].
     """
 
     log_A: Array
@@ -211,8 +211,8 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
     """Compute how a low-pass filter of one channel changes the spectra of healthy recordings.
 
     All cutoff frequencies and noises are tried, for each of the `sides`: 0 filters channel A, 1 filters channel B. The
-    sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of that of the
-    octave with the least power per frequency.
+    sensor's white noise is not filtered. Its power is a fraction (`filtered.noises` in `priors.toml`) of the power in
+    the octave with the least power per frequency.
     """
     from itertools import product
 

@@ -170,8 +170,8 @@ def _observable_name(term: Term) -> str:
 def _driving_pressure(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
     """Compute the root mean square of the pressure [Pa] that drives the term `name` of a volume balance.
 
-    It follows from the sums of squares of the term's column and of the flow offset's. If the balance has no flow
-    offset, the result is the mean of abs(p_A - p_B) instead.
+    It is sqrt(sum of squares of the term's column / sum of squares of the flow offset's column). If the balance has no
+    flow offset, the result is the mean of abs(p_A - p_B) instead.
     """
     if roles.bias is None:
         return float(np.mean(blocks.mean_pressure()))
@@ -192,10 +192,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 
 
 def _with_scale(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Return the blocks with column `index` replaced by the fitted volume of the piston's motion.
+    """Return the blocks with column `index` replaced by the volume that the piston's motion takes, as fitted.
 
-    A relative change of the scale of position or speed changes the coefficient of this column by as much. `columns`:
-    for each equation the indices of its columns by role (leak, motion, left side).
+    It is the sum of the columns of motion, each times its coefficient over the whole recording. A step of the new
+    column's coefficient by s is a relative change of the scale of position or speed by s. `columns`: for each equation
+    the indices of its columns by role (leak, motion, left side).
     """
     gram = blocks.gram.copy()
     for e, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

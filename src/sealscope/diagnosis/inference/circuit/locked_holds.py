@@ -5,15 +5,16 @@ Such a hold leaves each chamber a closed volume with leaks. From the beginning o
     m_A dx + V_A (dp_A/K - alpha p_0 d(1/p_A)) = -G I - e_A I_A,
    -m_B dx + V_B (dp_B/K - alpha p_0 d(1/p_B)) = +G I - e_B I_B,
 
-with the piston's areas m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk
-modulus K and free air alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are those of the
-pressures. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way, while
-a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The
-readings of all holds form one regression, each side of a hold about its mean. The logarithms of K, alpha and the
-volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is incompressible; the
-regression is linearised about the estimate, iteratively. The onset of the leak and the sensor offset z of p_A - p_B are
-those of the highest posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses,
-each with its probability.
+with G, e_A and e_B the coefficients of the leaks past the piston and to the outside from A and B, the piston's areas
+m_A and m_B as measured with the pump's assumed displacement, the volumes V of oil, their bulk modulus K and free air
+alpha. I is the time integral of a power of p_A - p_B - z; I_A and I_B are the time integrals of the gauge pressures;
+p_0 is the atmospheric pressure. A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the
+piston gives way, while a check valve may fill the other side. A reading is the mean of neighbouring samples of a hold
+(`LockedHold.edges`). The readings of all holds form one regression, each side of a hold about its mean. The logarithms
+of K, alpha and the volumes that are not recorded have normal priors (`held_oil` in `priors.toml`), so that no oil is
+incompressible; the regression is linearised about the estimate, iteratively. The onset of the leak and the sensor
+offset z of p_A - p_B have the highest posterior; a leak that has equalised the pressures determines z. The three leaks
+are hypotheses, each with its probability.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
@@ -91,11 +92,11 @@ class LockedHold(NamedTuple):
         return np.asarray(sums / np.diff(self.edges))
 
     def own_offset(self, offset: float) -> tuple[float, float]:
-        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given that of the recording, `offset` [Pa].
+        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
         The two differ where the gains of the sensors do, with the standard deviation s = `held_oil.gain`
         (`priors.toml`) times the pressure. The difference p_A - p_B at the end of the hold is either the own offset, if
-        a leak has equalised the pressures, or that of a load, of which all up to the higher pressure are equally
+        a leak has equalised the pressures, or due to a load, of which all up to the higher pressure are equally
         probable. The more probable of the two is assumed. Returns the own offset, and ((own - `offset`) / s)^2, its
         cost as -2 log of a relative probability density.
         """
@@ -189,8 +190,8 @@ class _OilRegression(NamedTuple):
     their logarithms (4,), with a normal prior about 0. `displaced` (r,): volume displaced by the piston [m^3];
     `strained` and `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air with the
     usual properties, in the stroke, and in the dead volumes of A and of B; `inflation`: number of readings over the
-    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to that of the noise, since
-    the model describes the compressed volume only to within a fraction.
+    number of independent ones; `misfit_variance`: variance of a reading [m^6] in addition to the variance of the noise,
+    since the model describes the compressed volume only to within a fraction.
     """
 
     displaced: Array
@@ -302,14 +303,15 @@ class HeldChambers:
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of the volumes that the piston displaces in holds on the properties of the oil.
+        """Regressions of displaced volumes on the oil's properties: without check valves, and with refilling ones.
 
-        The first is for chambers without check valves, the second for check valves that refill a chamber.
+        A displaced volume is what the piston displaces in a hold; the properties are compressibility, dead volumes of A
+        and B, and free air (`_OilRegression`).
         """
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
-        """Build the regression of the volumes that the piston displaces in holds on the properties of the oil.
+        """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
 
         Its rows are the readings of each hold, side A before side B, relative to their mean over the hold. A reading
         is a mean of several samples (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the
@@ -431,7 +433,7 @@ class HeldChambers:
         return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of the sensor offset [Pa] and of those of the holds near it."""
+        """Compute -2 log of the prior density of the sensor offset [Pa], and of the holds' own offsets near it."""
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:

@@ -1,8 +1,8 @@
 """External leakage, from the volume of an accumulator that replaces the lost oil, in blocks of whole cycles.
 
 The gas of the accumulator (volume V and polytropic exponent n at the charge pressure) expands by V dp/(n p) when oil is
-lost, when the rod extends, and when it warms. With the pressure p of the unloaded side, the volume delivered by the
-middle of block k is
+lost, when the rod extends, and when it warms. With the pressure p of the unloaded side, the position x and the piston's
+areas A_A and A_B, the volume delivered by the middle of block k is
 
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    `speed` (n,): speed or flow at the sampling `rate` [Hz]. Without regular strokes the period is that of the
-    strongest spectral line. Return None if the recording has fewer than `MIN_BLOCKS` of those periods.
+    `speed` (n,): speed or flow at the sampling `rate` [Hz]. Without regular strokes it is the period of the strongest
+    spectral line. Return None if the recording has fewer than `MIN_BLOCKS` of those periods.
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:

@@ -1,8 +1,8 @@
 """Balances of recordings without position or without flow: over whole cycles, or while the piston is held.
 
 A suitable test function removes the piston's displacement from the volume balance. A box of one cycle, convolved with
-itself, has a double zero at every harmonic of the cycle. Over it a piston that a control loop returns displaces
-nothing,
+itself, has a double zero at every harmonic of the cycle. With this test function phi, a piston that a control loop
+returns displaces nothing,
 
     integral of phi D dtheta = G integral of phi (p_A - p_B) dt + sum_j c_j integral of phi f_j dg_j,
 
@@ -177,9 +177,9 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 def _shrink_offset(values: Array, names: list[str]) -> None:
     """Reduce, in place, the columns of the leak in rows (r, c) by the part that sensor offsets may cause.
 
-    The rows are those of a volume balance; `names`: names of the columns. The mean pressure difference d of a row
-    becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote). The column of an
-    orifice is scaled by the same factor.
+    A row is the volume balance integrated with one test function; `names`: names of the columns. The mean pressure
+    difference d of a row becomes d - z^2/d, or 0 if it is smaller than the largest usual offset z (Breiman's garrote).
+    The column of an orifice is scaled by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

@@ -87,7 +87,7 @@ class Linearisation(NamedTuple):
     def cost(self, variance: float, prior: Normal) -> float:
         """Compute -2 log posterior of the parameters `theta`, up to a constant.
 
-        `variance`: that of the noise [Pa^2]; `prior`: prior on the parameters.
+        `variance`: variance of the noise [Pa^2]; `prior`: prior on the parameters.
         """
         deviations = prior.deviations(self.theta)
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
@@ -111,9 +111,9 @@ class Block(NamedTuple):
 class Joint:
     """Joint fit of the parameters in all K blocks of a recording.
 
-    `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p):
-    fitted deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): that of
-    the same deviations; `variance`: variance of the residual [Pa^2].
+    `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p): fitted
+    deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): prior precision
+    of the same deviations; `variance`: variance of the residual [Pa^2].
     """
 
     priors: Priors

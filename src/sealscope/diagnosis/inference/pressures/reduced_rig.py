@@ -87,11 +87,11 @@ def _advance_friction(
     Returns the friction force after the step and the friction of steady sliding at the speed v, both [N].
     `friction_0`, `steady_0`: the same two forces before the step.
 
-    Without the damping of the contact, which vanishes when it slides, the law is
-    compliance dF/dt = v - |v| F/magnitude. The step is L-stable and of order 2: with a = h |v|/(compliance magnitude)
-    and the steady friction F_s, or F_s0 before the step,
-    F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2). Numerator and denominator are both multiplied by
-    (compliance magnitude)^2.
+    Without the damping of the contact, which vanishes when it slides, the law of the friction force F is compliance
+    dF/dt = v - |v| F/magnitude, with the contact's compliance and the magnitude of the steady friction
+    (`_steady_friction`). The step is L-stable and of order 2: with a = h |v|/(compliance magnitude) and the steady
+    friction F_s, or F_s0 before the step, F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2). Numerator and
+    denominator are both multiplied by (compliance magnitude)^2.
     """
     steady, magnitude, speed = _steady_friction(v, theta, m)
     slip, stretch = h * speed, theta[COMPLIANCE] * magnitude  # [m]: path in h, deflection at full friction
@@ -189,7 +189,7 @@ def simulate_response(
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the rig's file.
 
-    `law`: law of friction, one of `LAWS`. The Coulomb friction is that at the charge pressure.
+    `law`: law of friction, one of `LAWS`. The Coulomb friction is taken at the charge pressure.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     of_difference = friction.coulomb_pressure == "difference"

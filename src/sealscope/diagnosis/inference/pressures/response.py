@@ -199,8 +199,8 @@ class Segment:
     def residual_variance(self, squares: float) -> float:
         """Compute the variance of a residual [Pa^2] from its sum of squares [Pa^2].
 
-        The sum is divided by the number of independent samples. 2 sqrt(pi) sigma is the correlation length of noise
-        that was smoothed by a Gaussian of width sigma [samples].
+        The sum is divided by the number of independent samples: smoothing by a Gaussian of width sigma [samples]
+        correlates the noise over 2 sqrt(pi) sigma samples.
         """
         count = max(self.n_samples - len(PARAMETERS), 1.0)
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
@@ -360,7 +360,7 @@ class Follower:
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
         """Compute the prior on the parameters in the next block, which is `block_s` [s] long.
 
-        `jumped`: index of a parameter that may have jumped; its variance is increased by that of the prior at the
+        `jumped`: index of a parameter that may have jumped; its variance is increased by its prior variance at the
         start.
         """
         variance = self.priors.wander_variance(block_s)

@@ -1,9 +1,9 @@
 """The distribution of p_A - p_B over a block, from which a sensor offset may be subtracted afterwards.
 
-Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but samples contain noise. In each stride of the
-weak form the deviations of the samples from these means, of variance v, are therefore multiplied by sqrt(max(v - s^2,
-0) / v). The variance s^2 of white noise is that of the sixth differences of the samples over 924, the sum of the
-squared coefficients of such a difference.
+Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but samples contain noise. In each stride of the weak
+form the deviations of the samples from these means, of variance v, are therefore multiplied by sqrt(max(v - s^2, 0) /
+v). The variance of white noise is s^2 = (variance of the sixth differences of the samples) / 924, where 924 is the sum
+of the squared coefficients of such a difference.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Huber's weights of the rows of blocks, and Gram matrices of the weighted rows.
 
 A row of a block is v = (fast columns, slow columns, left side). Coefficients of fast columns are free in each block;
-those of slow columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
+coefficients of slow columns are the same in all blocks, with a prior from the sums of earlier blocks. The weights are
 min(1, HUBER sigma / abs(residual)), where sigma follows from the median of abs(residual). Weights and fit depend on
 each other and are found by iteration. The functions are compiled and write to arrays of the caller. They allocate no
 memory, since a unit for other simulators (`fmu`) runs the same functions in C.

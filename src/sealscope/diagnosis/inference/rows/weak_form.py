@@ -1,6 +1,7 @@
 """The weak form of a volume balance: rows of a linear regression from samples, without derivatives or a cycle.
 
-A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions of compact support and integrated,
+A balance  dl = sum_j c_j f_j dg_j  is multiplied by test functions phi_i of compact support, with the middle t_i and
+the half-width h, and integrated,
 
     integral of phi_i dl = sum_j c_j integral of phi_i f_j dg_j,    phi_i(t) = (1 - s^2)^4 / norm,  s = (t - t_i) / h,
 

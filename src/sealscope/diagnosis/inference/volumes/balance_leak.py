@@ -75,9 +75,10 @@ class BalanceLeak:
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        Behind a servo valve it is the piston alone. The same holds if the leakage is measured while shut valves hold
-        the load, and either valves cut the pump off at rest or that leakage is too high for a healthy machine. If only
-        the creep of a held load is known, it may also be a valve or a line: "internal or external leak".
+        Behind a servo valve it is the piston alone. It also is the piston alone if the leakage is measured while shut
+        valves hold the load, and either valves cut the pump off at rest or the leakage is too high for a healthy
+        machine. If only the creep of a held load is known, it may also be a valve or a line: "internal or external
+        leak".
         """
         if self.balance.is_creep:
             return "internal or external leak"
@@ -201,7 +202,7 @@ class BalanceLeak:
         """Estimate the mean flow of the leak that shows while shut valves hold the load.
 
         It is averaged over the laws of the leak, weighted by their likelihoods. `rise`: rise of the leakage over
-        healthy recordings in these times, whose uncertainty is added to that of the fits.
+        healthy recordings in these times, whose variance is added to the variance of the fits.
         """
         laws, (low, high) = self._hold_laws(), rise.interval()
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laws.units[0]
@@ -269,10 +270,9 @@ class BalanceLeak:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
         With healthy recordings it bounds the leakage above theirs. A hold is a time in which shut valves hold the load.
-        If holds replace the rise from the whole recording (`rise`), the bound is that of `_hold_bound`, which combines
-        both. Without healthy recordings it bounds a leak that begins within the recording. It is widened by the
-        uncertainty of the scale of the flows (displacement, area or flow meter) and of the leak's law (laminar or
-        orifice).
+        If holds replace the rise from the whole recording (`rise`), `_hold_bound` computes the bound from both. Without
+        healthy recordings it bounds a leak that begins within the recording. It is widened by the uncertainty of the
+        scale of the flows (displacement, area or flow meter) and of the leak's law (laminar or orifice).
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:

@@ -115,7 +115,7 @@ class VolumeBalance:
     def balance(self, recording: Recording, odds: float = 0.0, *, is_locked: bool = False) -> RecordedBalance | None:
         """Set up the volume balance of a recording; None if its channels or its length allow none.
 
-        `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while it rests;
+        `odds`: log odds, from healthy recordings, that valves cut the pump off from the cylinder while the pump rests;
         `is_locked`: true if they certainly do, whatever this recording shows.
         """
         if not equations(self.rig, frozenset(recording.channels)):
@@ -320,7 +320,7 @@ def compare_motion(
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate the log of the ratio of the flow of motion in a recording to that in the healthy ones."""
+        """Estimate the logarithm of the flow of motion in a recording, over that flow in the healthy ones."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))

@@ -96,8 +96,8 @@ class RecordedBalance:
     each chamber behind a servo valve; `columns`: for each equation the indices of its columns by role (leak, motion,
     left side); `rig`: sizes of the machine; `oil_loss`: tests for external leaks by the volume of the accumulator, by
     the name of the term; `plain`: the blocks without the correction of the pressure offset, if they differ; `shut`:
-    true if valves cut the pump off at rest, so the leak is that of the piston alone (`regimes`); `locked`: true if the
-    times in which shut valves hold the load measure the leaks (`chambers`).
+    true if valves cut the pump off at rest, so that the piston alone leaks (`regimes`); `locked`: true if the times in
+    which shut valves hold the load measure the leaks (`chambers`).
     """
 
     blocks: Blocks
@@ -117,7 +117,7 @@ class RecordedBalance:
 
     @property
     def is_creep(self) -> bool:
-        """True if the flow is that by which a load creeps while valves hold it, and no pump's flow is known."""
+        """True if the balance's flow is the creep of a load that valves hold, as no pump's flow is known."""
         return self.equations[0].name == LOCKED
 
     @cached_property
@@ -142,7 +142,7 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """The same likelihood without columns that count only within a recording, as recordings are compared."""
+        """Likelihood of the leak's conductance without the columns that count only within a recording."""
         roles = self.columns[0]
         omitted = roles.within[0] if roles.within else None
         return information(self.running_blocks, self.columns, roles.leak, omitted)

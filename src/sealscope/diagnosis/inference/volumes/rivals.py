@@ -114,8 +114,9 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
     """Return the observable of an external leak with minus the penalty on its flow as `advantage` (`size_penalty`).
 
-    A large external leak is improbable, since oil outside is seen. The flow [m^3/s] is the observable's conductance
-    times the mean of abs(p_A - p_B) in the recording `judged`.
+    A large external leak is improbable, since oil outside is seen. With the recording `judged`,
+
+        flow [m^3/s] = conductance of the observable * mean of abs(p_A - p_B).
     """
     return replace(
         observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)

@@ -188,8 +188,8 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
     """Summarise the pressures and flows in the steady part of a run (`STEADY`) by a few numbers, by name.
 
-    They are in Pa: range and peak of each pressure, the lowest pressure, and mean and largest drop at the orifices.
-    The number `flows differ` is the rms of Q_A - Q_B over the rms of Q_A. All numbers are nan if the run diverged.
+    They are in Pa: range and peak of each pressure, the lowest pressure, and mean and largest drop at the orifices. The
+    number `flows differ` is rms(Q_A - Q_B) / rms(Q_A). All numbers are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}

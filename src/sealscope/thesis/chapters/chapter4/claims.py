@@ -1,7 +1,8 @@
 """Judge the testable sentences of chapter 4.
 
-Claims on the orifices are judged on converged runs under both interpretations ("readings") of the equations
-(`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for comparison.
+Claims on the orifices are judged on converged runs under both interpretations ("readings") of the throttles' equations,
+meter-out and as printed (`cases.Reading`); the results of RK4 at 1e-4 s, the thesis's solver, are stated for
+comparison.
 """
 
 from __future__ import annotations
@@ -217,9 +218,10 @@ def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> li
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> dict[Solver, dict[Reading, Rows]]:
-    """Simulate some cases, (command, closing [%]) each, under both interpretations and with both solvers.
+    """Simulate cases under both interpretations of the throttles' equations (`READINGS`), with both solvers.
 
-    Returns, by solver and interpretation, a list with the summary of each case's run (`summarise_run`).
+    A case is (command, closing): both throttles are closed by `closing` [%] of their area or diameter (`Reading`), 0
+    for open ones. Returns, by solver and interpretation, a list with the summary of each case's run (`summarise_run`).
     """
 
     def summarise(command: str, closed: float, reading: Reading, solver: Solver) -> dict[str, float]:
@@ -327,7 +329,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing True if the piston's drift differs from that without orifices.
+        """Yield for each closing True if the piston's drift differs from the drift without orifices.
 
         `row`: the drift [m] at each closing.
         """

@@ -113,7 +113,7 @@ def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> Figur
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
     """Build the curves of an output over time, one for each solver whose run did not diverge.
 
-    If they coincide, that of the thesis's solver is drawn as a few marks.
+    If they coincide, the curve of the thesis's solver is drawn as a few marks.
     """
     converged = runs["converged"]
     max_difference = _COINCIDENCE_FRACTION * steady_range(converged, name) * FIGURE_UNITS[name].scale
