@@ -157,7 +157,7 @@ def test_an_encoder_that_slips_is_no_leak(detector: VolumeBalance) -> None:
         result = judge(detector, with_channels(healthy, theta=np.cumsum(move)))
         assert result.verdict != "leak"
         if result.score is not None and result.threshold is not None and result.score > result.threshold:
-            assert "the scale of the position" in result.reason  # named, or said to compete with a leak
+            assert "scale of its position" in result.reason  # named, or said to compete with a leak
 
 
 @pytest.mark.parametrize(("channel", "towards"), few([("p_A", -1.0), ("p_B", 1.0)], 1, SLOW))
