@@ -26,7 +26,18 @@ from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.leak_law import law_shapes
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Information, StepTest, step_tests
-from sealscope.diagnosis.inference.terms import AIR, BIAS, LEAK, MADE_UP, ORIFICE, PUMP, SPEED_LOSS, Equation, Term
+from sealscope.diagnosis.inference.terms import (
+    AIR,
+    BIAS,
+    HOLDING,
+    LEAK,
+    MADE_UP,
+    ORIFICE,
+    PUMP,
+    SPEED_LOSS,
+    Equation,
+    Term,
+)
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -152,6 +163,8 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
         return False  # area and displacement change together, as a scale
     if term.name in (SPEED_LOSS, ORIFICE):
         return False  # zero within a recording; the orifice is tested by its shape
+    if term.name == HOLDING:
+        return False  # a piston that leaks raises it as well: the leak's step covers it
     if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
         return False  # free air changes them together
     return not (has_accumulator and term.name == BIAS)  # an accumulator's pressure drives what leaves its circuit
