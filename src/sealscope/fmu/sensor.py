@@ -174,9 +174,11 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 
     The memory is a record of doubles with the scalars `_SCALARS` and the following arrays.
 
-    Samples: `ring` has the last samples, a column each; `increments` those of all terms over one sample interval.
+    Samples: `ring` has the last samples, a column each; `increments` the increment of each term of the volume balance
+    over the last sampling interval.
 
-    Rows of the volume balance, each of which is a weighted integral over `SPAN` strides: `unfinished` has the
+    Rows of the volume balance, each of which is a weighted integral over `SPAN` strides (distances between the weight
+    functions of neighbouring rows): `unfinished` has the
     `SPAN` rows to which the present interval adds; `rows` the finished rows of the open blocks, that is the blocks
     not yet weighted; `ends` the index past the last row of each open block; `gram` their Gram matrices.
     `pressure_sums` has the sums of the last blocks (`_SUM`, `_NUMBER`); `slow_sums` the sums over earlier blocks
@@ -185,8 +187,8 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes
     (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
 
-    Results: `history` has those of the last blocks (`_G` ... `_PRESSURE`); `model` is a `Coefficients`; `workspace`
-    is a `Workspace`.
+    Results: `history` has leak, pressure and other results of each of the last blocks (`_G` ... `_PRESSURE`); `model`
+    is a `Coefficients`; `workspace` is a `Workspace`.
     """
     lengths, n_slow = _Lengths.from_rate(choice.rate), len(choice.column_order) - choice.n_fast - 1
     max_rows = SUPPORT * lengths.block_strides

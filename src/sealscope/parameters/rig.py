@@ -468,7 +468,8 @@ def _short_name(full_name: str) -> str:
 def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
     """Convert the entry of a parameter to a number in SI, or to the value of a choice.
 
-    Raises InputError for a wrong type or unit, a number that is not finite, an unknown option, or a missing source.
+    Raises InputError for a wrong type or unit, a number that is not finite, an unknown option, or an entry that
+    does not state the `source` of its value.
     """
     short_name, place = _short_name(full_name), entry.place
     if not isinstance(entry.source, str) or not entry.source.strip():

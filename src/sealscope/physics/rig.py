@@ -337,8 +337,9 @@ def implicit_flows(
 ) -> tuple[float, float]:
     """Compute the line flows Q_A, Q_B [m^3/s] at the end of an implicit stage of the solver.
 
-    On each side the flow solves d + g Q(d) = total, with `total` [Pa], `g` [Pa s/m^3] and d as in
-    `implicit_orifice_flow`. A filter in series with the throttle, p_1 - p_A = d + R Q, adds its resistance R to g.
+    On each side the pressure drop d of the throttle [Pa] solves d + g Q(d) = total: `total` [Pa] is the drop without
+    the flow of the stage, which lowers it by `g` [Pa s/m^3] times the flow (`implicit_orifice_flow`). A filter in
+    series with the throttle, p_1 - p_A = d + R Q at the pump's port 1, adds its resistance R to g.
     If it has a bypass valve, the flow is that of `filtered_flow`.
     """
     if len(p.filtered) > 0:

@@ -135,8 +135,8 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals -log(chance) of all changes within a healthy recording, by the key of the change.
 
-    The signals and the volume balance are tested; without a balance, or if it is uncertain that valves hold the load
-    (no channel of the flow), the pressure response as well.
+    The signals and the volume balance are tested. The pressure response is tested, too, if there is no balance, or if
+    the recording has no channel of the flow, so that valves or a control loop may hold the load.
     """
     surprisals, balance = _max_surprisals(observe_signals(recording)), VolumeBalance(rig)
     reports: Mapping[bool, Observed] = {}  # by whether the pump is cut off at rest

@@ -215,7 +215,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
         return max(max_step, 0.0)
 
     def excess_chance(fraction: float) -> float:
-        """Compute the probability of a step above `fraction` of `max_step`, minus that of a step above the bound."""
+        """Compute P(step > `fraction` * `max_step`) minus P(step > bound); its root gives the upper bound."""
         return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
 
     return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
@@ -418,8 +418,9 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
 
 
 def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
-    """Compute the residual sum of squares after the fit of a step up, for w random walks and o onsets, shape (w, o).
+    """Compute the residual sum of squares after the fit of a step up, shape (w, o).
 
+    It is computed for w assumed variances of the coefficient's random walk and o onsets; a step down counts as none.
     `total` (w,): sum of squares before the fit; `moments` and `energies` (w, o): products of the steps with the
     whitened values and with themselves.
     """

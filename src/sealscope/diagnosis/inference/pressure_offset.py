@@ -95,7 +95,10 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
         return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior of an offset, up to a constant; `position` as in `log_likelihood`."""
+        """Compute minus the log posterior of an offset, up to a constant.
+
+        `position`: asinh of the offset in units of its usual standard deviation.
+        """
         return 0.5 * offset_cost(usual * float(np.sinh(position))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)

@@ -40,8 +40,8 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
     piston, and the flow offset in motion (`terms.with_rests`). For open valves these columns are dropped from the Gram
     matrices. For shut valves the flow offset in motion replaces that of all times (`terms.shut_at_rest`). The leakage
-    of a pump that holds the load is distinguished only with `has_holds`, i.e. if it does so for seconds, and if it is
-    off at other times.
+    of a pump that holds the load has a column of its own only with `has_holds`, i.e. if it does so for seconds, and if
+    the pump is off at other times.
     """
     names = (*roles.names, "left")
     if not shut:

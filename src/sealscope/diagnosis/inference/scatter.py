@@ -485,8 +485,9 @@ class _LevelScale(NamedTuple):
 def _rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     """Estimate the rise of a judged value over the value that healthy recordings predict for it.
 
-    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of shape (s, ...), whose weights
-    are logarithms.
+    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape
+    (s, ...), for each of these estimates along the first axis, with log weights over all. The rise follows the mixture
+    over all estimates.
     """
     offset = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))
     logs, deviations, centres = (

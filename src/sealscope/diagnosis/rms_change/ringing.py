@@ -86,10 +86,10 @@ def estimate_rises(
 
     The effect of the duty, i.e. how the machine is moved and loaded, is corrected.
 
-    `log_rms` (5 per chamber,), `duty` (4,): values of the judged recording; `healthy` (n, 5 per chamber),
-    `healthy_duty` (n, 4): values of the leak-free recordings. `times` (n + 1,) are the start times of the leak-free
-    recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet quantity, and the
-    fractions of their energy that are not noise, (5 per chamber,).
+    `log_rms` (5 per chamber,), `duty` (4,), the quantities `DUTY`: values of the judged recording; `healthy` (n, 5 per
+    chamber), `healthy_duty` (n, 4): values of the leak-free recordings. `times` (n + 1,) are the start times of the
+    leak-free recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet
+    quantity, and the fractions of their energy that are not noise, (5 per chamber,).
 
     The healthy values are modelled by a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over
     time. The rate of this process is unknown. Its variance is the variance between sessions, which are separated by a

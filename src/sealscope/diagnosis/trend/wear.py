@@ -146,10 +146,11 @@ class Levels:
 
 
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
-    """Compute how far each leakage level is beyond the limit of outliers; this excess is ignored.
+    """Compute the part of each leakage level beyond the limit of outliers, which the fit of the wear subtracts.
 
-    The excess is the signed distance of a level from the median of the up to three levels before it, less `outlier`
-    standard deviations (`priors.toml`). It is 0 if the level before lies as far out on the same side. Returns two
+    It is 0 within the limit of `outlier` standard deviations (`priors.toml`) from the median of up to three levels
+    before. Beyond it, it is the distance from that median less the limit, with the sign of the distance. It is also 0
+    if the level before lies as far out on the same side. Returns two
     variants, each (n,). The first treats each level as the latest one. The second is also 0 for the last level, and for
     a level whose successor lies as far out on the same side.
     """

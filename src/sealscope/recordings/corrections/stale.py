@@ -63,9 +63,9 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
 def flag_stuck_rows(recording: Recording, name: str) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which the chamber pressure `name` repeats one value while the machine moves.
 
-    Motion is seen in the position, else in the pump's angle, else in the other chamber pressure, which may change
-    while valves hold the cylinder. If none of them is recorded, all such rows are flagged. Rows at the smallest or
-    largest value of the channel are clipped, and not flagged.
+    Motion is seen in the position, else in the pump's angle. Without both, a change of the other chamber pressure
+    counts as motion, though it may change while valves hold the cylinder. If none of them is recorded, all such rows
+    are flagged. Rows at the smallest or largest value of the channel are clipped, and not flagged.
     """
     values, flags = recording[name], np.zeros(len(recording), dtype=bool)
     known = np.flatnonzero(np.isfinite(values))

@@ -275,7 +275,7 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.6: the changes of the two chambers are negatively correlated."""
+    """Test claim 5.5.6: the changes of log RMS of the details of p_A and of p_B are negatively correlated."""
     for name in SENSITIVE:
         change_A, change_B = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
         r = float(np.corrcoef(change_A, change_B)[0, 1])

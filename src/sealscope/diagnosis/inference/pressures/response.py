@@ -413,7 +413,10 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     """
 
     def compute(recording: Recording) -> Joint | None:
-        """Track the parameters through all blocks, then fit all blocks together; None if no parameters fit."""
+        """Track the parameters of the pressure response through all blocks, then fit all blocks together.
+
+        Returns None if the fit fails or explains too little of the variance of p_A - p_B.
+        """
         edges = block_edges(recording)
         with np.errstate(over="ignore", invalid="ignore"):
             try:
