@@ -36,7 +36,6 @@ from sealscope.diagnosis.inference.terms import (
     RestLimits,
     Signals,
     equations,
-    find_rests,
     shut_at_rest,
     with_rests,
 )
@@ -267,9 +266,7 @@ class BlockStream:
                 name: _absolute_offset(samples[name][:n_samples]) for name in ("p_A", "p_B") if name in samples
             }
         if self._finds_rests and self._rest_limits is None:
-            signals = Signals(samples, self._rate)
-            pump, piston = self._balances[0].left(signals), signals.step("x")
-            self._rest_limits = RestLimits(max_rest_rate(pump, self._rate), max_rest_rate(piston, self._rate))
+            self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
 
     def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
         """Compute the rows of the volume balances' regressions, with their weights, in the blocks `first` to `end` - 1.
@@ -516,7 +513,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         return None
     columns = ColumnRoles(stream_balances[0])
 
-    has_holds = may_shut and _longest_hold(Signals(samples, recording.rate), balances[0]) >= INFERENCE.held_oil.shortest
+    has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def regime_blocks_about(shut: bool, offset: float) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa], for a pump that is cut off at rest (`shut`) or not."""
@@ -532,14 +529,23 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     return RecordedBlocks(open_regime, shut_regime, shut_odds(recorded, columns))
 
 
-def _longest_hold(signals: Signals, balance: Equation) -> float:
-    """Find the longest time [s] in which the piston rests while the pump turns, as to hold a load; 0 without any."""
-    pumped, moved = balance.left(signals), signals.step("x")
-    pump_rests, piston_rests = (
-        find_rests(values, signals.rate, max_rest_rate(values, signals.rate)) for values in (pumped, moved)
-    )
-    lengths = find_runs(piston_rests & ~pump_rests)[:, 1]  # [samples]
-    return float(lengths.max(initial=0)) / signals.rate
+def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
+    """Find the longest time [s] in which the piston rests while the pump turns, as to hold a load; 0 without any.
+
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    """
+    signals = Signals(samples, rate, rest_limits=_find_rest_limits(samples, rate, balance))
+    lengths = find_runs(signals.holding(balance.left) > 0.0)[:, 1]  # [samples]
+    return float(lengths.max(initial=0)) / rate
+
+
+def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
+    """Compute the flow of the pump and the speed of the piston below which they count as resting.
+
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    """
+    signals = Signals(samples, rate)
+    return RestLimits(max_rest_rate(balance.left(signals), rate), max_rest_rate(signals.step("x"), rate))
 
 
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:

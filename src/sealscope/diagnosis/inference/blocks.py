@@ -186,7 +186,8 @@ class ColumnRoles:
     - `nuisance`: terms whose coefficients are unknown in any machine;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
     - `motion`: motion of the piston, or flow of the valve's edges;
-    - `within`: terms that a comparison of recordings leaves out (`terms.HOLDING`);
+    - `hold_leak`: leakage of a pump that holds the load (`terms.HOLDING`), which a comparison of recordings leaves out,
+      or None;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,): `drift_rate`, drift relative to the coefficient [1/min];
@@ -200,7 +201,8 @@ class ColumnRoles:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
-        self.within = tuple(k for k, term in enumerate(equation.terms) if term.nuisance and term.name == HOLDING)
+        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
+        self.hold_leak = self.names.index(HOLDING) if is_shut else None
         self.leak = self.names.index(LEAK)
         drift_priors = vars(INFERENCE.drift)
         self.drift_rate = np.array([drift_priors[term.drift] if term.nuisance else 0.0 for term in equation.terms])
@@ -212,7 +214,7 @@ class ColumnRoles:
         )
         self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
         self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
-        # rests are told from motion here, but not each of their kinds: they would hide outliers
+        # one leakage for all rests: one for each kind of rest would follow outliers
         states = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *states)
         self.bias = self.names.index(BIAS) if BIAS in self.names else None

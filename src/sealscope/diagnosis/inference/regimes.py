@@ -34,7 +34,7 @@ from sealscope.recordings.recording import Array
 NEGLIGIBLE = 1e-6
 
 
-def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool = True) -> Blocks:
+def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
@@ -71,10 +71,10 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if the pump rests in any block.
+    """Return True if the pump or the piston rests in any block.
 
     `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
-    piston, and the flow offset in motion (`terms.with_rests`). A pump that only holds the load counts as resting.
+    piston, and the flow offset in motion (`terms.with_rests`).
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 

@@ -783,15 +783,15 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
 def _eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as the flow's offset, from each equation.
 
-    They are those without a prior on differences between recordings. Columns that count only within a recording
-    (`ColumnRoles.within`) are left out. `gram` (E, m, m): Gram matrices of E equations; `columns`: for each equation
-    the indices of its columns by role (leak, motion, left side). The result is the Schur complement of the same shape,
-    in which the rows and columns of the eliminated coefficients are zero.
+    They are those without a prior on differences between recordings. The leakage of a pump that holds the load, which
+    counts only within a recording (`ColumnRoles.hold_leak`), is left out. `gram` (E, m, m): Gram matrices of E
+    equations; `columns`: for each equation the indices of its columns by role (leak, motion, left side). The result is
+    the Schur complement of the same shape, in which the rows and columns of the eliminated coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
-        for k in roles.within:
-            reduced[e][k] = reduced[e][:, k] = 0.0
+        if roles.hold_leak is not None:
+            reduced[e][roles.hold_leak] = reduced[e][:, roles.hold_leak] = 0.0
         unshared = [k for k in roles.compared if k != roles.leak and not np.isfinite(roles.between_deviation[k])]
         cross = reduced[e][:, unshared].copy()
         reduced[e] -= cross @ solve(reduced[e][np.ix_(unshared, unshared)], cross.T)

@@ -381,7 +381,7 @@ class HeldChambers:
         sign = 1.0 if is_A else -1.0
         differences = [sign * (hold.p_A - hold.p_B - hold.own_offset(0.0)[0]) for hold in self.holds]
         flows = [np.maximum(difference, 0.0) for difference in differences]
-        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0), is_refilled=True)
+        return UnitLeak(flows, (1.0, 0.0) if is_A else (0.0, 1.0))
 
     def _fit(self, columns: Array, is_refilled: bool) -> _LeakRegression:
         """Fit the coefficients of c leaks together with the properties of the oil.

@@ -142,10 +142,9 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """Likelihood of the leak's conductance without the columns that count only within a recording."""
+        """Likelihood of the conductance of the leak as recordings are compared: with one leakage of all rests."""
         roles = self.columns[0]
-        omitted = roles.within[0] if roles.within else None
-        return information(self.running_blocks, self.columns, roles.leak, omitted)
+        return information(self.running_blocks, self.columns, roles.leak, roles.hold_leak)
 
     @cached_property
     def test(self) -> StepTest | None:
