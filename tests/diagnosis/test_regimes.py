@@ -73,6 +73,21 @@ def press(
 
 
 @cache
+def metered_press(seed: int, leak: float = 0.0, since: float = 0.0) -> Recording:
+    """Record the press with a flow meter beyond its valve, which lets through 0.4 % of the flow while it is closed.
+
+    In motion the meter reads too much in proportion to p_A - p_B.
+    """
+    recording = press(seed, leak=leak, since=since)
+    omega = recording["omega"]
+    is_closed = find_rests(DISPLACEMENT * omega / RATE, RATE, 1e-6)
+    flow = DISPLACEMENT * omega * ~is_closed - 0.004 * DISPLACEMENT * 60.0 * is_closed
+    x = recording["x"] + np.cumsum((flow - DISPLACEMENT * omega) * is_closed) / (RATE * AREA)
+    channels = {"q_pump": flow, "x": x, "p_A": recording["p_A"], "p_B": recording["p_B"]}
+    return Recording(recording.t, channels, {name: CHANNEL_UNITS[name] for name in channels}, RATE)
+
+
+@cache
 def balance(seed: int, odds: float = 0.0, **options: Any) -> RecordedBalance:
     judged = VolumeBalance(RIG).balance(press(seed, **options), odds)
     assert judged is not None
@@ -101,6 +116,20 @@ def test_behind_a_shut_valve_the_leak_is_the_pistons_alone() -> None:
     assert own.conductance.value == pytest.approx(2e-13, rel=0.01)
 
 
+@pytest.mark.parametrize("odds", [10.0, -10.0])
+def test_the_pressure_of_its_own_side_drives_an_external_leak(odds: float) -> None:
+    """The machine is fed at 100 bar, so that p_A and p_B exceed their difference."""
+    recording = press(0)
+    channels = {**recording.channels, "p_A": recording["p_A"] + 1e7, "p_B": recording["p_B"] + 1e7}
+    judged = VolumeBalance(RIG).balance(Recording(recording.t, channels, recording.units, RATE), odds)
+    assert judged is not None and judged.shut == (odds > 0.0)
+    assert judged.mean_pressure() < 6e6
+    for side in "AB":
+        expected = float(channels[f"p_{side}"].mean()) * judged.size.scale
+        assert expected > 1.5e7
+        assert judged.outside_unit_flows()[f"external leak {side}"] == pytest.approx(expected, rel=0.1)
+
+
 @pytest.mark.parametrize("shut", [True, False])
 def test_rests_are_no_step_and_hide_none(shut: bool) -> None:
     for seed in range(3):
@@ -120,6 +149,16 @@ def test_a_drive_that_no_longer_turns_in_holds_is_no_leak_that_ends() -> None:
         leaking = balance(seed, odds=10.0, holds_until=50.0, leak=0.5e-13, since=60.0).test
         assert leaking is not None and leaking.chance < 1e-4
         assert leaking.onset().low < 60.0 < leaking.onset().high
+
+
+def test_behind_a_flow_meter_a_load_that_creeps_by_a_leak_does_not_move_by_the_valve() -> None:
+    for seed in range(3):
+        measured = VolumeBalance(RIG).balance(metered_press(seed, leak=2e-13, since=50.0), 10.0)
+        assert measured is not None and measured.shut and measured.test is not None
+        assert measured.test.chance < 1e-4
+        assert measured.test.onset().low < 50.0 < measured.test.onset().high
+        assert measured.test.fitted.size == pytest.approx(2e-13, rel=0.1)
+        assert measured.conductance.value == pytest.approx(2e-13 * 46.0 / 96.0, rel=0.1)
 
 
 def test_a_machine_that_is_switched_on_does_not_leak_from_then_on() -> None:

@@ -356,12 +356,12 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     return moment / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
 
 
-def max_rest_rate(increments: Array, rate: float) -> float:
+def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is a fraction of the mean speed in motion (`rest.share` in `priors.toml`), or three standard deviations of the
-    noise of an averaged speed if that is larger. `increments` (n,): increments of the position [m] or of the pump's
-    volume [m^3] between samples; `rate`: sampling rate [Hz].
+    It is a fraction of the mean speed in motion, or three standard deviations of the noise of an averaged speed if that
+    is larger. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples; `rate`:
+    sampling rate [Hz].
     """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
@@ -369,7 +369,6 @@ def max_rest_rate(increments: Array, rate: float) -> float:
     differences = np.abs(np.diff(flow, 6))  # of white noise: 924 times its variance
     # 1.4826: standard deviation of normal values over the median of their magnitudes
     noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
-    fraction: float = INFERENCE.rest.share
     return max(fraction * mean_speed, 3.0 * noise / math.sqrt(max(1.0, AVERAGING_TIME * rate)))
 
 
@@ -542,9 +541,13 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    A flow meter measures what enters the cylinder. If little does, the valves are closed: a piston that moves all the
+    same creeps because of a leak, which must not count as motion. `samples`: arrays by channel name at the `rate` [Hz];
+    `balance`: volume balance, whose left side is the flow of the pump or of the meter.
     """
     signals = Signals(samples, rate)
+    if flow_source(samples) == "q_pump":
+        return RestLimits(max_rest_rate(balance.left(signals), rate, INFERENCE.rest.moves), -math.inf)
     return RestLimits(max_rest_rate(balance.left(signals), rate), max_rest_rate(signals.step("x"), rate))
 
 

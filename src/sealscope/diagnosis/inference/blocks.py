@@ -171,6 +171,20 @@ class Blocks:
         """
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
+    def driving_pressure(self, names: Sequence[str], term: str) -> float:
+        """Estimate the root mean square of the pressure that drives a term [Pa], such as p_B for a leak out of side B.
+
+        `names`: names of the columns, in the order of `gram`. With s = sqrt(sum of squares of a column), over the
+        equations that contain the term,
+
+            pressure = root mean square of p_A - p_B * s of the term / s of the leak.
+        """
+        squares = np.einsum("keii->ei", self.gram)
+        squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)
+        ratio = squares[names.index(term)] / max(squares[names.index(LEAK)], np.finfo(float).tiny)
+        mean_squares = ((self.pressures - self.zero[:, None]) ** 2).mean(axis=1)  # of p_A - p_B, in each block
+        return float(np.sqrt(np.average(mean_squares, weights=np.maximum(self.rows, 1e-9)) * ratio))
+
     @classmethod
     def join(cls, parts: Sequence[Blocks]) -> Blocks:
         """Concatenate the blocks of consecutive `parts` of one recording."""

@@ -2,12 +2,13 @@
 
 If they are open, the leakage of pump and piston is in the volume balance at rest as in motion. If they are shut, the
 pump's flow offset counts in motion only, and its leakage has a coefficient of its own while it moves the piston: at
-rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The
-leakage of all holds then has a third coefficient within a recording, else a drive that is switched off would look like
-a leak that ends. Between recordings one coefficient is compared for all rests, since many machines show the piston's
-leak in such holds alone. Both balances select from the same columns, so one set of Gram matrices serves both. Let g be
-the leakage coefficient (of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from
-block to block. With open valves r scatters about g; with shut valves and a healthy piston, about zero:
+rest only the piston leaks. A pump may also turn slowly to hold the load for seconds, and is then connected. The leakage
+of all holds then has a third coefficient within a recording, else a drive that is switched off would look like a leak
+that ends. Where a flow meter measures the flow to the cylinder, its flow alone tells motion from rest. Between
+recordings one coefficient is compared for all rests, since many machines show the piston's leak in such holds alone.
+Both balances select from the same columns, so one set of Gram matrices serves both. Let g be the leakage coefficient
+(of p_A - p_B) in motion and r that at rest; their covariance allows for errors that differ from block to block. With
+open valves r scatters about g; with shut valves and a healthy piston, about zero:
 
     log odds = log N(r; 0, V_r + (s g)^2) - log N(r - g; 0, V_(r - g) + (w g)^2),
 

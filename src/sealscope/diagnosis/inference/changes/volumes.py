@@ -84,11 +84,12 @@ def volume_observables(
         if name.startswith(LEAK) or name == PUMP:
             advantage = -leak_disadvantage
         else:
-            advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0], volume_ratio)
+            advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
-            unit_flow = 1.0 if name == OUTSIDE else _driving_pressure(recorded, columns[0], name.removesuffix(MADE_UP))
+            term = name.removesuffix(MADE_UP)
+            unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
             flow = step.fitted.size * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
@@ -97,20 +98,23 @@ def volume_observables(
     return tuple(sorted(observables, key=lambda observable: -observable.score))
 
 
-def _size_penalty(name: str, size: float, blocks: Blocks, roles: ColumnRoles, volume_ratio: float) -> float:
+def _size_penalty(
+    name: str, size: float, blocks: Blocks, names: Sequence[str], volume_ratio: float, flow_scale: float
+) -> float:
     """Compute how improbable the size of a step of the term `name` is: -2 log(prior density / largest density).
 
-    `size`: size of the step, in the unit of the coefficient; `volume_ratio`: measured over assumed ratio of area to
-    displacement. The result is 0 for a term without a prior on the size.
+    `size`: size of the step, in the unit of the coefficient; `names`: names of the columns of `blocks`; `volume_ratio`:
+    measured over assumed ratio of area to displacement; `flow_scale`: true flow over the flow of the balance. The
+    result is 0 for a term without a prior on the size.
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
     if name == AIR:
         return size_penalty(INFERENCE.free_air, size / volume_ratio, above=True)
     if name == OUTSIDE:
-        return size_penalty(INFERENCE.outside, size, above=True)
+        return size_penalty(INFERENCE.outside, size * flow_scale, above=True)
     if name.startswith("external leak"):
-        return size_penalty(INFERENCE.outside, size * _driving_pressure(blocks, roles, name), above=True)
+        return size_penalty(INFERENCE.outside, size * flow_scale * blocks.driving_pressure(names, name), above=True)
     return 0.0
 
 
@@ -178,18 +182,6 @@ def _observable_name(term: Term) -> str:
     if term.name != BIAS:
         return term.name
     return OUTSIDE if term.cause == "external leak" else "zero of the flow"
-
-
-def _driving_pressure(blocks: Blocks, roles: ColumnRoles, name: str) -> float:
-    """Compute the root mean square of the pressure [Pa] that drives the term `name` of a volume balance.
-
-    It is sqrt(sum of squares of the term's column / sum of squares of the flow offset's column). If the balance has no
-    flow offset, the result is the mean of abs(p_A - p_B) instead.
-    """
-    if roles.bias is None:
-        return float(np.mean(blocks.mean_pressure()))
-    energy = np.einsum("keii->i", blocks.gram)
-    return float(np.sqrt(energy[roles.names.index(name)] / energy[roles.bias]))
 
 
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:

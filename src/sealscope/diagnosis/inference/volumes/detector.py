@@ -303,7 +303,9 @@ class VolumeBalance:
         observables = balance.observables
         if healthy and len(balance.columns) == 1 and has_position:
             observables += tuple(compare_motion(balance.recording_sums, healthy, balance.columns[0]))
-            observables += rival_rises(balance.recording_sums, healthy, balance.columns, balance.volume_ratio)
+            observables += rival_rises(
+                balance.recording_sums, healthy, balance.columns, balance.volume_ratio, balance.outside_unit_flows()
+            )
         return Observed(self.name, observables, leak, share=share, judged_until=float(judged_until))
 
 

@@ -324,6 +324,15 @@ class RecordedBalance:
         """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, without the sensor offset."""
         return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), since)
 
+    def outside_unit_flows(self) -> dict[str, float]:
+        """Compute the mean flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by its term."""
+        names, recorded = self.columns[0].names, self.blocks if self.plain is None else self.plain
+        return {
+            name: recorded.driving_pressure(names, name) * self.size.scale
+            for name in names
+            if name.startswith("external leak")
+        }
+
     @cached_property
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow over the recording [m^3/s].

@@ -9,7 +9,7 @@ alike. The likelihood ratio of the two is therefore stated with the observable.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +32,7 @@ def rival_rises(
     healthy: Sequence[RecordingSums],
     columns: Sequence[ColumnRoles],
     volume_ratio: float = 1.0,
+    unit_flows: Mapping[str, float] | None = None,
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
 
@@ -48,13 +49,16 @@ def rival_rises(
         For each equation the indices of its columns by role (leak, motion, left side).
     volume_ratio : float
         Measured over assumed ratio of the piston's area to the pump's displacement, by which volumes of air scale.
+    unit_flows : mapping of str to float, optional
+        Mean flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. By default it
+        is the mean of abs(p_A - p_B).
 
     Returns
     -------
     tuple of Observable
         One for each rival that can be compared.
     """
-    names, hold_rivals = columns[0].names, held_rivals(judged, healthy)
+    names, hold_rivals = columns[0].names, held_rivals(judged, healthy, unit_flows)
     turning = (TURNING,) if SPEED_LOSS in names else ()  # a flow meter is downstream of the pump
     columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
     if hold_rivals is not None:
@@ -84,16 +88,19 @@ def rival_rises(
         elif not is_air:
             fit = compare_with_leak(judged, healthy, columns, names[k])
             log_ratio_to_leak = None if fit is None else INFERENCE.size.readings * fit
-            observable = replace(_penalise_size(observable, judged), log_ratio_to_leak=log_ratio_to_leak)
+            observable = _penalise_size(observable, judged, unit_flows)
+            observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
         observables.append(observable)
     return (*observables, *(hold_rivals or ()))
 
 
-def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tuple[Observable, ...] | None:
+def held_rivals(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], unit_flows: Mapping[str, float] | None = None
+) -> tuple[Observable, ...] | None:
     """Test for external leaks of chambers A and B, while shut valves hold the load, above those of healthy recordings.
 
     Such a time is a hold. Return one observable for each chamber that can be compared, or None if the recording
-    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any.
+    `judged` has no holds or fewer than `MIN_WITH_HOLDS` healthy recordings have any. `unit_flows` as in `rival_rises`.
     """
     healthy_leaks = [recording.held for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -107,20 +114,19 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
         observable = compare_with_healthy(
             f"external leak {side}", RISE, float(judged.held[leak]), coefficients, error, above=True
         )
-        observables += [] if observable is None else [_penalise_size(observable, judged)]
+        observables += [] if observable is None else [_penalise_size(observable, judged, unit_flows)]
     return tuple(observables)
 
 
-def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
+def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
     """Return the observable of an external leak with minus the penalty on its flow as `advantage` (`size_penalty`).
 
-    A large external leak is improbable, since oil outside is seen. With the recording `judged`,
-
-        flow [m^3/s] = conductance of the observable * mean of abs(p_A - p_B).
+    A large external leak is improbable, since oil outside is seen. Its flow [m^3/s] is the conductance, the size of the
+    observable, times the flow for a conductance of 1 (`unit_flows`), or times the mean of abs(p_A - p_B) of the
+    recording `judged`.
     """
-    return replace(
-        observable, advantage=-size_penalty(INFERENCE.outside, observable.size * judged.pressure, above=True)
-    )
+    flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
+    return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
 
 
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
