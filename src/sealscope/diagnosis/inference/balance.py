@@ -269,10 +269,12 @@ class BlockStream:
             self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
 
     def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
-        """Compute the rows of the volume balances' regressions, with their weights, in the blocks `first` to `end` - 1.
+        """Compute the rows of each volume balance in the blocks `first` to `end` - 1, and their weights.
 
-        `samples`: arrays by channel name. The result also contains, for each block, the mean magnitude of the first
-        balance's left side as a flow [m^3/s], and the means of equal parts of the sorted samples of p_A - p_B [Pa].
+        A row contains the integrals of a balance's terms and left side, each with one test function of the weak form; a
+        regression of the left side on the terms later gives the coefficients. `samples`: arrays by channel name. For
+        each block the result also contains the mean magnitude of the first balance's left side as a flow [m^3/s], and
+        the means of equal parts of the sorted samples of p_A - p_B [Pa].
         """
         length = self._strides * self._stride
         # samples of the blocks; the test functions of the last rows extend beyond them, to SPAN strides
@@ -318,19 +320,24 @@ class _BlockRows(NamedTuple):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,) against a mean of zero, corrected for overlapping rows.
+    """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
 
-    There is one product for each row of the regression, i.e. for each test function of the weak form.
+    z = sum(products) / sqrt(OVERLAP sum(products^2)). There is one product for each row of the regression. Neighbouring
+    rows overlap, which increases the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
 def _sign_log_odds(z: float, other_cause: float) -> float:
-    """Compute the log odds that a flow has the correct sign, given the z score `z` of a symptom of correct wiring.
+    """Compute the log odds that a flow has the correct sign, from the z score `z` of one symptom of correct wiring.
 
-    `BlockStream._left_side_signs` lists the three symptoms. `other_cause`: probability that something other than the
-    sign causes the score.
+    With the standard normal distribution Phi and c = `other_cause`, the probability that something other than the sign
+    causes the score,
+
+        log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
+
+    `BlockStream._left_side_signs` lists the three symptoms.
     """
     from scipy.special import ndtr
 
@@ -359,9 +366,9 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 def max_rest_rate(increments: Array, rate: float) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is a fraction of the mean speed in motion (`rest.share` in `priors.toml`), or three standard deviations of the
-    noise of an averaged speed if that is larger. `increments` (n,): increments of the position [m] or of the pump's
-    volume [m^3] between samples; `rate`: sampling rate [Hz].
+    It is a fraction (`rest.share` in `priors.toml`) of the mean speed in motion, sum(v^2) / sum(abs(v)). If that is
+    larger, it is three standard deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. `increments`
+    (n,): increments of the position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
@@ -442,7 +449,10 @@ def _hold_missing(values: Array) -> Array:
 
 
 def min_samples_for_step(rate: float) -> int:
-    """Compute the minimum number of samples at a `rate` [Hz] to test for a step, i.e. those of `MIN_BLOCKS` blocks."""
+    """Compute the minimum number of samples to test a recording for a leak that begins within it.
+
+    These are the samples of `MIN_BLOCKS` blocks at the sampling `rate` [Hz].
+    """
     stride = stride_samples(rate)
     return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
@@ -530,7 +540,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
-    """Find the longest time [s] in which the piston rests while the pump turns, as to hold a load; 0 without any.
+    """Find the longest time [s] for which the piston rests while the pump turns, as to hold a load; 0 if there is none.
 
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
     """
@@ -551,9 +561,9 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the recorded blocks. If it is large, the blocks are computed again after subtracting it, and the
-    rest is removed.
+    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is estimated
+    from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations
+    of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is removed.
     """
     columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
     blocks = remove_pressure_offset(plain, columns)

@@ -56,10 +56,11 @@ class Motion(NamedTuple):
 
 
 def select_motion(recording: Recording) -> Motion | None:
-    """Select the samples in which the piston moves, and build the design matrix of their fit.
+    """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
 
-    If they are many, they are thinned out. Returns None if a chamber pressure or a signal of the motion is not
-    recorded, or if fewer than `MIN_ROWS` samples move.
+    The piston moves if its speed exceeds a fraction (`healthy.slowest` in `priors.toml`) of the 99 % quantile of its
+    speed. If they are many, the samples are thinned out. Returns None if a chamber pressure or a signal of the motion
+    is not recorded, or if fewer than `MIN_ROWS` samples move.
     """
     if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
@@ -102,7 +103,8 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
-    The weights are 1/sqrt(1 + (residual/scale)^2). Returns the coefficients and the weights (n,).
+    The weights are 1/sqrt(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
+    plus `MIN_RESIDUAL`. Returns the coefficients and the weights (n,).
     """
     equations, weight = stack_equations(design, values), np.ones(len(values))
     for _ in range(ITERATIONS):

@@ -102,7 +102,7 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
 
 
 def _octave_edges(count: int) -> Array:
-    """Return the limits (`count` + 1,) of the octaves [Hz]."""
+    """Return the limits (`count` + 1,) of `count` octaves of frequency [Hz], upwards from `octaves.lowest`."""
     edges: Array = CHANGES.octaves.lowest * np.exp2(np.arange(count + 1.0))
     return edges
 

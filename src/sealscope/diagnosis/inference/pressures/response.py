@@ -206,7 +206,10 @@ class Segment:
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number."""
+        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number n.
+
+        The limit is n + c sqrt(2 n), i.e. c standard deviations above the mean (`follow.unexplained` of `priors.toml`).
+        """
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
@@ -450,9 +453,11 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute the likelihood of each parameter of the response in K blocks, by the name of the parameter.
+    """Compute the likelihood of each parameter of the pressure response in K blocks, by the name of the parameter.
 
-    `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the recording [s].
+    It is Gaussian in the K values of the parameter, stated by precision matrix and information vector (`Information`),
+    with all other parameters eliminated. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`:
+    length of the recording [s].
     """
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk since the time that the priors state
     wander = growth * joint.priors.wander

@@ -224,10 +224,11 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
-        """Return True unless a control loop may hold the load, in a volume balance without the pump (`terms.locked`).
+        """Return True if valves, not a control loop, hold the load in a volume balance without a pump (`terms.locked`).
 
-        With a recorded command valves hold it. Without one the load must creep in the healthy recordings with these
-        `summaries`: a control loop would replace what leaks, and slow motions are no creep.
+        Any other balance counts as True. With a recorded command valves hold the load. Without one the load must creep
+        in the healthy recordings, by the sum of the log odds in their `summaries`: a control loop would replace what
+        leaks, and slow motions are no creep.
         """
         if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
@@ -320,7 +321,7 @@ def compare_motion(
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate the logarithm of the flow of motion in a recording, over that flow in the healthy ones."""
+        """Estimate log(flow per speed of the piston in a recording / the same in the healthy ones), with its error."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))

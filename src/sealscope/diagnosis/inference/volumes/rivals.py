@@ -112,9 +112,11 @@ def held_rivals(judged: RecordingSums, healthy: Sequence[RecordingSums]) -> tupl
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums) -> Observable:
-    """Return the observable of an external leak with minus the penalty on its flow as `advantage` (`size_penalty`).
+    """Return the observable of an external leak with an `advantage` that falls with its flow, from 0 for usual sizes.
 
-    A large external leak is improbable, since oil outside is seen. With the recording `judged`,
+    A large external leak is improbable, since oil outside is seen. The advantage is 2 log(prior density / largest prior
+    density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`). With the recording
+    `judged`,
 
         flow [m^3/s] = conductance of the observable * mean of abs(p_A - p_B).
     """
