@@ -200,12 +200,12 @@ class BlockStream:
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
-        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy,
-        so p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with
-        the flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load
-        does work in strokes that do not return; therefore the mean of p_A - p_B over the flow is subtracted first.
-        Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
-        which something else causes it.
+        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy, so
+        p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with the
+        flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load does
+        work in strokes that do not return; therefore the mean of p_A - p_B, weighted by the magnitude of the flow, is
+        subtracted first. Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a
+        fraction of machines in which something else causes it.
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
@@ -345,10 +345,11 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
 
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient by least squares; 0 if the rows do not determine it.
+    """Compute the z score of the leak's coefficient by least squares, under the hypothesis that it is zero.
 
-    `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role (leak,
-    motion, left side).
+    A positive score means that oil flows from high to low pressure. It is 0 if the rows do not determine the
+    coefficient. `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role
+    (leak, motion, left side).
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -381,7 +382,7 @@ def max_rest_rate(increments: Array, rate: float) -> float:
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute the difference of absolute and gauge pressure [Pa] for the samples (n,) [Pa] of a sensor.
+    """Compute the difference absolute - gauge pressure [Pa] from the samples (n,) [Pa] of a sensor.
 
     It is the atmospheric pressure, or more if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
     """
@@ -424,10 +425,11 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is the decay exp(-t/lag) of the drive's
-    initial state. The pump's speed "omega" [rad/s] is added if the command u is the only channel that shows it: it is
-    the drive's response to u, NaN where u is missing. With `loaded` the drive responds to the load p_A - p_B as well.
-    Otherwise the droop of the real speed under load counts as leakage.
+    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) since the first sample: the
+    effect of the drive's unknown initial state decays with the time constant lag. The pump's speed "omega" [rad/s] is
+    added if the command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing.
+    With `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load
+    counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -526,7 +528,10 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def regime_blocks_about(shut: bool, offset: float) -> Blocks:
-        """Compute the blocks after subtracting `offset` [Pa], for a pump that is cut off at rest (`shut`) or not."""
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for one assumption on the valves.
+
+        `shut`: true if valves cut the pump off from the cylinder while it rests, false if they do not.
+        """
         blocks = blocks_about(offset)
         assert blocks is not None  # as many samples as for `recorded`
         return apply_regime(blocks, columns, shut, has_holds) if may_shut else blocks

@@ -249,8 +249,9 @@ class ColumnRoles:
         """Compute the prior standard deviation of the error of a regression column due to a pressure sensor's offset.
 
         `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for the column of
-        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The deviation of
-        the pressure is at most its mean over `blocks`, since recordings may be in counts.
+        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The standard
+        deviation of the offset itself is at most the mean of abs(p_A - p_B) over `blocks`, since recordings may be in
+        counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -344,7 +345,7 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, repla
 
     `columns`: for each equation the indices of its columns by role (leak, motion, left side); the likelihoods of the
     equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its
-    scale. `replaces`: index of a column to omit, whose place the tested one takes; None to omit none.
+    scale. `replaces`: index of another column that is left out of the regression, None for none.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)

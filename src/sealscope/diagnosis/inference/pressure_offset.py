@@ -75,9 +75,10 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
 
         z = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
-    where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
-    near zero and logarithmic for large offsets.
+    where q S S' is the random walk of the leak's coefficient. Column k of `leak_steps` and `offset_steps` is the change
+    of z by a unit step, from block k on, of the leak's coefficient and of the constant flow. The likelihood is
+    maximised over size > 0, k, kappa and q, not averaged; `offset_cost` is the prior on the offset. The search is over
+    asinh of the offset, which is linear near zero and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
     # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains

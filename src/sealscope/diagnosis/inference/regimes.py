@@ -58,9 +58,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    In a recording without rests the column of the turning pump's leakage equals the column of the leak, and the column
-    of the holding pump's leakage is zero. `names` (m - 1,): names of the columns without the left side. The result has
-    the shape (E, m + 2, m + 2).
+    The two new columns precede the column of the leak. Without rests the leakage of the turning pump has the same
+    column as the leak, and the leakage of the pump that holds the load has a column of zeros. `names` (m - 1,): names
+    of the old columns without the left side. The result has the shape (E, m + 2, m + 2).
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]

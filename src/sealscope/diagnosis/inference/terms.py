@@ -611,11 +611,11 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's volume balance with three more terms, one for each state of pump and piston (`STATES`).
+    """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
 
     Their increments are (p_A - p_B) dt while the pump moves the piston, (p_A - p_B) dt while it turns and the piston
-    rests (a held load), and dt while pump and piston move. Each is 0 outside of its state. They are inserted before the
-    terms of the leak.
+    rests (a held load), and dt while pump and piston move. Otherwise each is 0. They are inserted before the terms of
+    the leak.
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")

@@ -145,10 +145,10 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
 
 
 def _regressors(recording: Recording, source: str) -> Array:
-    """Compute the columns of the fit (n, 2 or 3): positive and negative flow of the pump, and the recorded position.
+    """Compute the regressors of a low pressure, (n, 2 or 3): positive and negative flow of the pump, and the position.
 
-    The flow is relative to its largest magnitude, the position to its mean. `source`: channel of the pump, "theta" or
-    "omega".
+    The flow is relative to its largest magnitude, the position, if recorded, to its mean. `source`: channel of the
+    pump, "theta" or "omega".
     """
     drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive

@@ -248,8 +248,9 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
-    `time` (K,): times of the blocks [s]. Vectors and levels are whitened, as the module's docstring explains. Return
-    None if no direction of the subspace can be tested.
+    `time` (K,): times of the blocks [s]. Vectors and levels are multiplied by the `_whitening_matrix`, so that the
+    errors of the c numbers of a block are independent and have unit variance. Return None if no direction of the
+    subspace can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]

@@ -175,9 +175,10 @@ class _FilterFactor(NamedTuple):
 
 
 def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a filter of the pressures of a `pair` of channels.
+    """Compute the Bayes factor of a filter to none, by the spectra of a `pair` of channels.
 
-    Return None for too few healthy recordings with as many octaves, or if the factor is not finite.
+    It is averaged over filters of each pressure in the pair. Return None for too few healthy recordings with as many
+    octaves, or if the factor is not finite.
     """
     from scipy.special import logsumexp
 

@@ -220,13 +220,21 @@ class _OilRegression(NamedTuple):
 
 
 def _oil_factors(logs: Array) -> tuple[float, float, Array]:
-    """Convert logarithms of the oil's properties (4,) to factors of compressibility, free air, and volumes (3,)."""
+    """Convert logarithms (4,) of the oil's properties to factors on their usual values.
+
+    `logs`: of compressibility, dead volume of A, dead volume of B, and free air. Returns the factor on the
+    compressibility, the one on free air, and those on three volumes (3,): the stroke's, which is always 1, and the dead
+    volumes.
+    """
     compressibility, dead_A, dead_B, air = np.exp(logs)
     return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
 
 
 def _oil_deviations() -> Array:
-    """Return the prior standard deviations of the logarithms of the oil's properties (4,)."""
+    """Return the prior standard deviations (4,) of the logarithms of the oil's properties.
+
+    They are compressibility, dead volume of A, dead volume of B, and free air.
+    """
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
@@ -644,7 +652,8 @@ class HeldChambers:
     def probability_after_holds(self) -> float:
         """Prior probability that a leak begins after the last hold, so that no hold shows it.
 
-        A hold is a time in which shut valves hold the load.
+        A hold is a time in which shut valves hold the load. The probability is (1 - `held_oil.from_start`), that of a
+        leak that begins within the recording, times the fraction of the recording's time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)

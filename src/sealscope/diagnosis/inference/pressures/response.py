@@ -112,7 +112,8 @@ class Segment:
     def residual_squares(self, sets: Array) -> Array:
         """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
 
-        It is taken about the mean, and has the shape (m,). It is infinite for a set whose simulation diverges.
+        The residual is recorded minus simulated p_A - p_B, without its mean and the mains hum. The result (m,) is
+        infinite for a set whose simulation diverges.
         """
         simulated, _ = self.machine.simulate(self.command, sets, self.states[:, np.zeros(len(sets), dtype=int)])
         residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
@@ -215,7 +216,8 @@ class Segment:
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        They include the scores, i.e. products with the derivative by the conductance, in each second.
+        They include the scores: the products of the residual, and of the model's derivatives by all parameters, with
+        its derivative by the conductance, summed over each second.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))

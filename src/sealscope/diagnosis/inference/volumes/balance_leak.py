@@ -252,7 +252,7 @@ class BalanceLeak:
     def excess(self) -> float | None:
         """Total leakage minus the limit in the rig's file, over the standard deviation of the leakage (no unit).
 
-        None if the file states no limit, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
+        None without a limit in the file, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
         channel measures the flow, or if healthy recordings are compared instead.
         """
         balance = self.balance

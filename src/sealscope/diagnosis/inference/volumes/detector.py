@@ -166,10 +166,10 @@ class VolumeBalance:
 
         The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
         and `scale`, the factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`). If the
-        machine rests, it also contains `shut_sums`, the Gram matrices if the pump is cut off at rest, and `shut_odds`,
-        the log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks while shut
-        valves hold the load, and `held_odds`, the log odds from these. If no pump's flow is recorded (`is_creep`):
-        `creep_odds`, the log odds that the load creeps by leakage.
+        machine rests, it also contains `shut_sums`, the Gram matrices for a pump that valves cut off at rest, and
+        `shut_odds`, the log odds that they do, from the leakage at rest. If it holds a load at rest: `held`, the leaks
+        while shut valves hold the load, and `held_odds`, the same log odds from these leaks. If no pump's flow is
+        recorded (`is_creep`): `creep_odds`, the log odds that the load creeps by leakage.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
