@@ -200,12 +200,12 @@ class BlockStream:
 
         `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form.
 
-        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy,
-        so p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with
-        the flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load
-        does work in strokes that do not return; therefore the mean of p_A - p_B over the flow is subtracted first.
-        Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a fraction of machines in
-        which something else causes it.
+        The log odds of a correct sign are the sum over three symptoms of correct wiring. Friction dissipates energy, so
+        p_A - p_B correlates with the flow into A; oil leaks from high to low pressure; the position x grows with the
+        flow into A. The last one counts only if it is positive, since x itself may be reversed. A constant load does
+        work in strokes that do not return; therefore the mean of p_A - p_B, weighted by the magnitude of the flow, is
+        subtracted first. Each symptom has a z score, with the probability Phi(z) of a correct sign, except for a
+        fraction of machines in which something else causes it.
         """
         signs = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
@@ -269,10 +269,12 @@ class BlockStream:
             self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
 
     def _compute_rows(self, samples: Mapping[str, Array], first: int, end: int) -> _BlockRows:
-        """Compute the rows of the volume balances' regressions, with their weights, in the blocks `first` to `end` - 1.
+        """Compute the rows of each volume balance in the blocks `first` to `end` - 1, and their weights.
 
-        `samples`: arrays by channel name. The result also contains, for each block, the mean magnitude of the first
-        balance's left side as a flow [m^3/s], and the means of equal parts of the sorted samples of p_A - p_B [Pa].
+        A row contains the integrals of a balance's terms and left side, each with one test function of the weak form; a
+        regression of the left side on the terms later gives the coefficients. `samples`: arrays by channel name. For
+        each block the result also contains the mean magnitude of the first balance's left side as a flow [m^3/s], and
+        the means of equal parts of the sorted samples of p_A - p_B [Pa].
         """
         length = self._strides * self._stride
         # samples of the blocks; the test functions of the last rows extend beyond them, to SPAN strides
@@ -318,19 +320,24 @@ class _BlockRows(NamedTuple):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,) against a mean of zero, corrected for overlapping rows.
+    """Compute the z score of the sum of `products` (r,) under the hypothesis that their mean is zero.
 
-    There is one product for each row of the regression, i.e. for each test function of the weak form.
+    z = sum(products) / sqrt(OVERLAP sum(products^2)). There is one product for each row of the regression. Neighbouring
+    rows overlap, which increases the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
 def _sign_log_odds(z: float, other_cause: float) -> float:
-    """Compute the log odds that a flow has the correct sign, given the z score `z` of a symptom of correct wiring.
+    """Compute the log odds that a flow has the correct sign, from the z score `z` of one symptom of correct wiring.
 
-    `BlockStream._left_side_signs` lists the three symptoms. `other_cause`: probability that something other than the
-    sign causes the score.
+    With the standard normal distribution Phi and c = `other_cause`, the probability that something other than the sign
+    causes the score,
+
+        log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
+
+    `BlockStream._left_side_signs` lists the three symptoms.
     """
     from scipy.special import ndtr
 
@@ -338,10 +345,11 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 
 
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient by least squares; 0 if the rows do not determine it.
+    """Compute the z score of the leak's coefficient by least squares, under the hypothesis that it is zero.
 
-    `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role (leak,
-    motion, left side).
+    A positive score means that oil flows from high to low pressure. It is 0 if the rows do not determine the
+    coefficient. `gram` (m, m): Gram matrix of `n_rows` rows of the regression; `roles`: indices of its columns by role
+    (leak, motion, left side).
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -359,9 +367,9 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is a fraction of the mean speed in motion, or three standard deviations of the noise of an averaged speed if that
-    is larger. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples; `rate`:
-    sampling rate [Hz].
+    It is a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)). If that is larger, it is three standard
+    deviations of the noise of a speed that is averaged over `AVERAGING_TIME`. `increments` (n,): increments of the
+    position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     flow = increments[np.isfinite(increments)] * rate
     speed = np.abs(flow)
@@ -373,7 +381,7 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
 
 def _absolute_offset(pressure: Array) -> float:
-    """Compute the difference of absolute and gauge pressure [Pa] for the samples (n,) [Pa] of a sensor.
+    """Compute the difference absolute - gauge pressure [Pa] from the samples (n,) [Pa] of a sensor.
 
     It is the atmospheric pressure, or more if a sample would otherwise be below `MIN_ABSOLUTE_PRESSURE`.
     """
@@ -416,10 +424,11 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is the decay exp(-t/lag) of the drive's
-    initial state. The pump's speed "omega" [rad/s] is added if the command u is the only channel that shows it: it is
-    the drive's response to u, NaN where u is missing. With `loaded` the drive responds to the load p_A - p_B as well.
-    Otherwise the droop of the real speed under load counts as leakage.
+    `rig`: states the drive; `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) since the first sample: the
+    effect of the drive's unknown initial state decays with the time constant lag. The pump's speed "omega" [rad/s] is
+    added if the command u is the only channel that shows it: it is the drive's response to u, NaN where u is missing.
+    With `loaded` the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load
+    counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -441,7 +450,10 @@ def _hold_missing(values: Array) -> Array:
 
 
 def min_samples_for_step(rate: float) -> int:
-    """Compute the minimum number of samples at a `rate` [Hz] to test for a step, i.e. those of `MIN_BLOCKS` blocks."""
+    """Compute the minimum number of samples to test a recording for a leak that begins within it.
+
+    These are the samples of `MIN_BLOCKS` blocks at the sampling `rate` [Hz].
+    """
     stride = stride_samples(rate)
     return MIN_BLOCKS * max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride + (SPAN - 1) * stride + 1
 
@@ -515,7 +527,10 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.held_oil.shortest
 
     def regime_blocks_about(shut: bool, offset: float) -> Blocks:
-        """Compute the blocks after subtracting `offset` [Pa], for a pump that is cut off at rest (`shut`) or not."""
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for one assumption on the valves.
+
+        `shut`: true if valves cut the pump off from the cylinder while it rests, false if they do not.
+        """
         blocks = blocks_about(offset)
         assert blocks is not None  # as many samples as for `recorded`
         return apply_regime(blocks, columns, shut, has_holds) if may_shut else blocks
@@ -529,7 +544,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
-    """Find the longest time [s] in which the piston rests while the pump turns, as to hold a load; 0 without any.
+    """Find the longest time [s] for which the piston rests while the pump turns, as to hold a load; 0 if there is none.
 
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
     """
@@ -554,9 +569,9 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], blocks_about: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the recorded blocks. If it is large, the blocks are computed again after subtracting it, and the
-    rest is removed.
+    `blocks_about(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is estimated
+    from the recorded blocks and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations
+    of its prior, the blocks are instead computed again after subtracting it, and the remaining offset is removed.
     """
     columns, plain = tuple(ColumnRoles(balance) for balance in balances), blocks_about(0.0)
     blocks = remove_pressure_offset(plain, columns)

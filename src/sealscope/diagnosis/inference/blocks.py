@@ -120,7 +120,8 @@ class Blocks:
     def moving_flow(self) -> float:
         """Mean flow while the machine moves [m^3/s].
 
-        It is the mean of `flow` over the blocks, weighted by the flow itself, so that standstills do not contribute.
+        It is sum(flow^2) / sum(flow) over the blocks, i.e. the mean of `flow` weighted by itself, so that standstills
+        do not contribute.
         """
         return float(self.flow @ self.flow) / max(float(self.flow.sum()), np.finfo(float).tiny)
 
@@ -128,16 +129,16 @@ class Blocks:
     def is_moving(self) -> NDArray[np.bool_]:
         """Flags (K,) of the blocks in which the machine moves.
 
-        Their mean flow is at least a fraction of `moving_flow` (`rest.moves` in `priors.toml`), which exceeds the
-        flow that holds a load.
+        Their mean flow is at least the fraction `rest.moves` (`priors.toml`) of `moving_flow`. The flow of a pump that
+        only holds a load is smaller.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
-        """Return at most `max_blocks` blocks, each the sum or weighted mean of equally many neighbouring ones.
+        """Return at most `max_blocks` blocks, each the sum or weighted mean of several neighbouring ones.
 
-        Gram matrices and numbers of rows are added; flow and pressures are averaged with the numbers of rows as
-        weights.
+        Every result but the last combines equally many. Gram matrices and numbers of rows are added; flow and pressures
+        are averaged with the numbers of rows as weights; `zero` is that of the first block.
         """
         group = -(-len(self) // max_blocks)
         if group <= 1:
@@ -238,7 +239,8 @@ class ColumnRoles:
     def replace_leak(self, name: str) -> ColumnRoles:
         """Return a copy of these column roles in which the term `name` is tested instead of the leak.
 
-        The leak becomes an ordinary term, with a prior on its differences between recordings (`between.pump`).
+        The leak becomes an ordinary term, whose coefficient differs between recordings within the prior `between.pump`
+        of `priors.toml`.
         """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
@@ -246,7 +248,7 @@ class ColumnRoles:
         return roles
 
     def leak_deviation(self, test: int, blocks: Blocks) -> float:
-        """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in its own unit.
+        """Compute the prior standard deviation of a leak's coefficient in a healthy machine, in the coefficient's unit.
 
         `test`: index of the coefficient's column. For a flow through an orifice, the prior gives the same mean flow
         over `blocks` as the prior of a laminar leak. The result is infinite for columns that no pressure drives, or
@@ -261,8 +263,9 @@ class ColumnRoles:
         """Compute the prior standard deviation of the error of a regression column due to a pressure sensor's offset.
 
         `test`: index of the column. The result is in Pa for the column of a laminar leak, in Pa^0.5 for the column of
-        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The deviation of
-        the pressure is at most its mean over `blocks`, since recordings may be in counts.
+        an orifice. It is 0 for columns that no pressure drives, or in an equation without flow offset. The standard
+        deviation of the offset itself is at most the mean of abs(p_A - p_B) over `blocks`, since recordings may be in
+        counts.
         """
         driver = self.drivers[test] if test < self.left and self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -356,7 +359,7 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, repla
 
     `columns`: for each equation the indices of its columns by role (leak, motion, left side); the likelihoods of the
     equations are multiplied. `test`: index of the coefficient's column, or of the left side to test a change of its
-    scale. `replaces`: index of a column to omit, whose place the tested one takes; None to omit none.
+    scale. `replaces`: index of another column that is left out of the regression, None for none.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -553,10 +556,14 @@ def _eliminate_nuisance(
     """Compute the likelihood of the tested coefficient in K blocks by one equation: precision (K, K) and vector (K,).
 
     `gram` (K, m, m): Gram matrices of the blocks; `roles`: indices of the columns by role (leak, motion, left side);
-    `test`: index of the tested column; `nuisance`: indices of the columns to eliminate. The precision is the Schur
-    complement (N - C (G + P)^-1 C') / s^2: N is the diagonal matrix of the tested column's sums of squares, G the Gram
-    matrix of the nuisance columns, P their prior precision, C their products with the tested column, and s^2 the
-    residual variance of a row.
+    `test`: index of the tested column; `nuisance`: indices of the columns to eliminate. With the residual variance s^2
+    of a row, the results are the Schur complements
+
+        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (m + P mu)) / s^2.
+
+    N is the diagonal matrix of the tested column's sums of squares, n its products with the left side, and C its
+    products with the nuisance columns. G is the Gram matrix of the nuisance columns, m their products with the left
+    side, P their prior precision and mu their prior mean.
     """
     normal, fit, _ = _fit_equation(gram, blocks, roles, test, nuisance)
     right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
@@ -574,8 +581,10 @@ def _nuisance_columns(roles: ColumnRoles) -> list[int]:
 def offset_cost(offset: float) -> float:
     """Compute -2 log of the prior density of a sensor offset of p_A - p_B [Pa], relative to that of no offset.
 
-    The prior is a normal density for good sensors or, with small odds, a wide one for sensors that are far off
-    (`zero` in `priors.toml`); the more favourable of the two counts.
+    The prior is a normal density of standard deviation s for good sensors or, with small odds o, a wide one of standard
+    deviation w for sensors that are far off (`zero` in `priors.toml`). The more favourable of the two counts:
+
+        cost = min((offset / s)^2, (offset / w)^2 + 2 log(w / (s o))).
     """
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return float(min((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds)))
@@ -655,9 +664,10 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 
 
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Compute the Gram matrix of a whole recording for each equation, over the residual variance of a row, (E, m, m).
+    """Compute the Gram matrix of a whole recording for each of E equations, divided by the residual variance of a row.
 
-    `columns`: for each of E equations the indices of its columns by role (leak, motion, left side).
+    The result has the shape (E, m, m), where the m columns are the terms of the volume balance and, last, its left
+    side. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
     """
     grams = []
     for e, roles in enumerate(columns):

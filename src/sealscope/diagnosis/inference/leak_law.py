@@ -40,11 +40,12 @@ _TINY = np.finfo(float).tiny
 
 
 def law_shapes(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
-    """Compute the apparent conductance in each of K blocks of a leak with the flow |p_A - p_B|^e.
+    """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
-    It is the regression coefficient of this flow on p_A - p_B, r^(2 (1 - e)), with r from the Gram matrices for an
-    orifice, e = 1/2, and thus 1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array
-    (K,). `columns`: for each equation the indices of its columns by role (leak, motion, left side).
+    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, it is r from
+    the Gram matrices; for the other exponents it is taken as r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The
+    result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)]. `columns`: for each equation the indices
+    of its columns by role (leak, motion, left side).
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)
@@ -77,10 +78,10 @@ def law_priors() -> Array:
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B| (its law).
 
-    The test of the law with the smallest p-value (`chance`) is returned. The prior probability of a law is its fraction
-    of the false-alarm probability. The step's size is the mean change of the conductance. `columns`: for each equation
-    the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the leak's coefficient in the
-    blocks. Return None if too few blocks have information.
+    There is one test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of
+    the law, and the test with the smallest p-value is returned. The step's size is the mean change of the conductance.
+    `columns`: for each equation the indices of its columns by role (leak, motion, left side); `leak`: likelihood of the
+    leak's coefficient in the blocks. Return None if too few blocks have information.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)
     tests = []

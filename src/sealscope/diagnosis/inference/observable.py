@@ -102,8 +102,8 @@ class Remark(NamedTuple):
 class LeakRise(NamedTuple):
     """Rise of the leakage, i.e. the leakage above that of healthy recordings, and its agreement with a step.
 
-    `step_log_ratio`: log likelihood ratio of two sizes of the rise: the size that the step found within the recording
-    would cause, and zero.
+    `step_log_ratio`: log likelihood ratio, by the estimated rise, of the rise that the step found within the recording
+    would cause to no rise. It is positive if the rise agrees with the step.
     """
 
     rise: Rise
@@ -132,7 +132,7 @@ class DatedTest(RiseTest, Protocol):
         """Return the most likely onset of the leak [s] with its 95 % interval."""
 
     def detectable_step(self, chance: float) -> float:
-        """Return the smallest step of the leak's conductance [m^3/(s Pa)] that is reliably detected.
+        """Return the smallest step of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
 
         A step is a sudden, lasting increase. `chance`: false-alarm probability of the test.
         """

@@ -173,16 +173,18 @@ class StepTest:
         return bound_steps(self.weights, self.size, self.deviation, probability)
 
     def share_alarms(self, share: float) -> StepTest:
-        """Return this test with the fraction `share` of the false alarms, as one of several of which the best counts.
+        """Return this test with its p-value divided by `share`, as one of several tests of which the best counts.
 
-        Its `chance` is divided by this fraction.
+        `share`: fraction of the total false-alarm probability that this test may use. It also applies to the
+        distribution of the score (`law`).
         """
         return replace(self, chance=min(1.0, self.chance / share), law=self.law._replace(share=share))
 
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
         """Compute the step that is detected with the probability `power`, at a false-alarm probability `chance`.
 
-        The result is in the unit of the coefficient.
+        It is (sqrt(threshold of the score) + normal quantile of `power`) times the median standard error over all
+        onsets, in the unit of the coefficient.
         """
         from scipy.special import ndtri
 
@@ -215,7 +217,7 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
         return max(max_step, 0.0)
 
     def excess_chance(fraction: float) -> float:
-        """Compute P(step > `fraction` * `max_step`) minus P(step > bound); its root gives the upper bound."""
+        """Compute P(step > `fraction` * `max_step`) - (1 - `probability`) P(step > 0); the upper bound is its root."""
         return float(weights @ ndtr((size - fraction * max_step) / deviation)) - (1.0 - probability) * probability_up
 
     return max_step * find_root(excess_chance, 0.0, 1.0) if excess_chance(1.0) < 0.0 else max_step
@@ -428,13 +430,14 @@ def _residual_squares(total: Array, moments: Array, energies: Array) -> Array:
 
 
 class _Whitened(NamedTuple):
-    """Whitened values z (n,) of a coefficient, i.e. with independent noise of variance 1, without level and slope.
+    """Whitened values z (n,) of a coefficient, i.e. with independent noise of variance 1.
 
-    They are along the eigenvectors of the random walk's covariance.
+    A constant and a linear change of the coefficient over the blocks (level and slope) do not change z, as these
+    directions are projected out. The components of z are along the eigenvectors of the random walk's covariance.
 
     `transform` (n, K): matrix from the coefficient in K blocks to z; `eigen` (n,): eigenvalues of the random walk's
-    covariance, times the scale `unit`; `positions` (o,): possible onsets, counted in blocks; `onsets` (o,): their
-    times [s]; `walk_log_priors` (w,): log prior of each variance in `WALKS`.
+    covariance, times the scale `unit`; `positions` (o,): possible onsets, counted in blocks; `onsets` (o,): their times
+    [s]; `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
 
     z: Array
@@ -474,10 +477,10 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
 class _Whitening(NamedTuple):
     """Matrices that whiten the estimates of a coefficient in K blocks (`whiten`); they depend on the precision only.
 
-    `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their
-    eigenvectors; `complement` (n, r + s): directions orthogonal to level and slope, with s = 1 if a prior on the
-    slope adds a reading, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. The other fields are
-    those of `_Whitened`.
+    `root` (r,) and `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
+    `complement` (n, r + s): directions orthogonal to level and slope, where s = 1 if a prior on the slope adds one more
+    value, else 0; `basis` (n, n): eigenvectors of the random walk's covariance. The other fields are those of
+    `_Whitened`.
     """
 
     root: Array
@@ -491,10 +494,10 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, time: Array, vector: Array) -> _Whitened:
-        """Transform the estimates of a coefficient in K blocks to independent values, and project out level and slope.
+        """Transform the estimates of a coefficient in K blocks to independent values of variance 1.
 
-        `time` (K,): middles of the blocks [s]; `vector` (K,): precision matrix times the estimates, as in
-        `Information`.
+        Their level and slope over the blocks are projected out. `time` (K,): middles of the blocks [s]; `vector` (K,):
+        precision matrix times the estimates, as in `Information`.
         """
         z = (self.vectors.T @ vector) / self.root
         z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # the prior on the slope is one more reading
@@ -510,9 +513,10 @@ class _Whitening(NamedTuple):
 
 
 def _whiten_blocks(information: Information) -> _Whitened | None:
-    """Transform the estimates of a coefficient in blocks to independent values of variance 1, without level and slope.
+    """Transform the estimates of a coefficient in blocks to independent values of variance 1.
 
-    Return None if too few blocks have information, or if the precision is not finite.
+    Their level and slope over the blocks are projected out. Return None if too few blocks have information, or if the
+    precision is not finite.
     """
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
@@ -528,7 +532,8 @@ def _whiten_blocks(information: Information) -> _Whitened | None:
 def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
     """Build the matrices that whiten `count` blocks with independent estimates of variance 1; None if too few.
 
-    `slope`, `walk`: scales of the priors, as in `Information`. The result is cached, since many tests share it.
+    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks, in units of the
+    standard deviation 1 of an estimate (`Information`). The result is cached, since many tests share it.
     """
     return _build_whitening(np.eye(count), slope, walk)
 
@@ -536,7 +541,8 @@ def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
 def _build_whitening(precision: Array, slope: float, walk: float) -> _Whitening | None:
     """Build the matrices that whiten K blocks with a given precision (K, K); None if too few have information.
 
-    `slope`, `walk`: scales of the priors on the linear change and on the random walk, as in `Information`.
+    `slope`, `walk`: scales of the priors on the linear change and on the random walk over all blocks, in the unit of
+    the coefficient (`Information`).
     """
     count = len(precision)
     # z = Lambda^(-1/2) eta, restricted to the eigenvectors with information

@@ -75,9 +75,10 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
 
         z = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
-    where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q, not averaged; `offset_cost` is the prior on the offset. The search is over asinh of the offset, which is linear
-    near zero and logarithmic for large offsets.
+    where q S S' is the random walk of the leak's coefficient. Column k of `leak_steps` and `offset_steps` is the change
+    of z by a unit step, from block k on, of the leak's coefficient and of the constant flow. The likelihood is
+    maximised over size > 0, k, kappa and q, not averaged; `offset_cost` is the prior on the offset. The search is over
+    asinh of the offset, which is linear near zero and logarithmic for large offsets.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far
     # no larger random walk than fits without an offset: else offset and walk describe changes that no leak explains
@@ -87,15 +88,16 @@ def _find_relative_offset(leak_steps: Array, offset_steps: Array, z: Array) -> f
     independent = min(1.0, INFERENCE.size.readings / len(z))
 
     def log_likelihood(position: float) -> float:
-        """Compute the log likelihood of a sensor offset, maximised over the leak's step and the random walk.
+        """Compute the log likelihood of a sensor offset, maximised over the leak's step and random walk.
 
-        The step is maximised over onset and size, the random walk of the leak's coefficient over its variance.
-        `position`: asinh of the offset in units of its usual standard deviation.
+        It is maximised over the block in which the leak steps up, the size of that step, and the variance of the random
+        walk of the leak's coefficient. It is scaled to the number of independent residuals. `position`: asinh of the
+        offset in units of its usual standard deviation.
         """
         return independent * float(_walk_likelihoods(leak_steps - np.sinh(position) * offset_steps, z, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior of an offset, up to a constant.
+        """Compute minus the log posterior density of a sensor offset, up to a constant.
 
         `position`: asinh of the offset in units of its usual standard deviation.
         """
@@ -124,11 +126,11 @@ class _WhitenedSteps(NamedTuple):
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> _WhitenedSteps | None:
     """Whiten the residuals of leak and constant flow in blocks, and their changes by unit steps of both.
 
-    `roles`: indices of the columns of the first equation by role (leak, motion, left side). With the precision P of
-    leak and constant flow in K blocks, (2 K, 2 K), the readings z = P^(-1/2) vector have unit noise, and P^(1/2)
-    converts changes of the coefficients to changes of z. Slow changes are projected out: level and slope of the leak,
-    and a quadratic drift of the constant flow (F and B of the module). Return None if the blocks have too little
-    information.
+    `roles`: indices of the columns of the first equation by role (leak, motion, left side). With the precision P (2 K,
+    2 K) and the vector of the joint likelihood of leak and constant flow in K blocks, z = P^(-1/2) vector has unit
+    noise, and P^(1/2) converts changes of the coefficients to changes of z. Slow changes are projected out: level and
+    slope of the leak, and a quadratic drift of the constant flow (F and B of the module). Return None if the blocks
+    have too little information.
     """
     count = len(blocks)
     precision, vector, pressure = estimate_leak_and_bias(blocks, roles)

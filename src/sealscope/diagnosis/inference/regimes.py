@@ -59,9 +59,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, has_holds: bool
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    In a recording without rests the column of the turning pump's leakage equals the column of the leak, and the column
-    of the holding pump's leakage is zero. `names` (m - 1,): names of the columns without the left side. The result has
-    the shape (E, m + 2, m + 2).
+    The two new columns precede the column of the leak. Without rests the leakage of the turning pump has the same
+    column as the leak, and the leakage of the pump that holds the load has a column of zeros. `names` (m - 1,): names
+    of the old columns without the left side. The result has the shape (E, m + 2, m + 2).
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
@@ -74,8 +74,9 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if the pump or the piston rests in any block.
 
-    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
-    piston, and the flow offset in motion (`terms.with_rests`).
+    More than the fraction `NEGLIGIBLE` of the sum of squares of p_A - p_B must then lie outside of motion. `roles`:
+    indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the piston, and
+    the flow offset in motion (`terms.with_rests`).
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
@@ -83,8 +84,8 @@ def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B that lies outside of some states of the machine.
 
-    `states`: names of the columns of p_A - p_B in these states, such as `TURNING` (the pump moves the piston); the
-    other arguments are as in `has_rests`.
+    `states`: names of columns that are p_A - p_B in one state and 0 outside of it, such as `TURNING` (the pump moves
+    the piston); `blocks`: blocks whose Gram matrices have these columns; `roles`: indices of the columns by role.
     """
     leak, *columns = (roles.names.index(name) for name in (LEAK, *states))
     energies = np.diagonal(blocks.gram[:, 0], axis1=1, axis2=2).sum(axis=0)
@@ -94,9 +95,10 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while it rests.
 
-    `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump that moves or holds the
-    piston, and the flow offset in motion (`terms.with_rests`). Positive log odds mean that valves cut the pump off.
-    They are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says nothing about the valves.
+    They compare the leakage at rest with zero and with the leakage in motion (`rest_log_odds`). Positive log odds mean
+    that valves cut the pump off. They are limited to +-`rest.most` of `priors.toml`, and 0 if the recording says
+    nothing about the valves. `roles`: indices of the columns of `blocks` by role; they include the leakage of a pump
+    that moves or holds the piston, and the flow offset in motion (`terms.with_rests`).
     """
     if not has_rests(blocks, roles) or len(blocks) < 2:
         return 0.0
@@ -116,9 +118,13 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 def rest_log_odds(value: float, variance: float, motion: float, difference_variance: float) -> float:
     """Compute the log odds that the leakage at rest is about zero rather than about equal to the leakage in motion.
 
-    `value`, `variance`: estimated leakage at rest and the variance of its error; `motion`: leakage in motion;
-    `difference_variance`: variance of the error of `value` - `motion`. All leakages are conductances [m^3/(s Pa)], or
-    all are flows [m^3/s].
+    With the leakage r = `value` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
+
+        log odds = log N(r; variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
+
+    `variance` and `difference_variance` are those of the errors of r and of r - g; s and w are the prior scatters over
+    g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances [m^3/(s Pa)], or all are flows
+    [m^3/s].
     """
     prior = INFERENCE.rest
     shut = _normal_log_density(value, variance + (prior.shut * motion) ** 2)

@@ -179,8 +179,8 @@ class Rise(NamedTuple):
     def log_ratio_within(self, rise: float, tail: float) -> float:
         """Compute the log likelihood ratio of a true rise by `rise` to no rise, robust to outlying estimates.
 
-        Neither density may fall below the density at the quantiles `tail` and 1 - `tail` of a healthy recording. Thus
-        an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
+        Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
+        recording. Thus an estimate that neither a healthy recording nor the rise predicts is evidence for neither.
         """
         tail_rises = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(rise) for rise in tail_rises)
@@ -221,7 +221,10 @@ class Rise(NamedTuple):
 
         The true rise is below it with the given probability. A negative estimate counts as zero:
 
-            bound = max(value, 0) - threshold(probability) deviation.
+            bound = max(value, 0) - threshold(probability) deviation,
+
+        where threshold(probability), usually negative, is the score that a healthy recording exceeds with this
+        probability.
         """
         return max(self.value, 0.0) - self.threshold(probability) * self.deviation
 
@@ -258,10 +261,12 @@ class RecordingSums(NamedTuple):
         start_s: float | None = None,
         oil_degC: float | None = None,
     ) -> RecordingSums:
-        """Summarise a recording from its `blocks`: add up the Gram matrices, and average flow and pressure.
+        """Summarise a recording from its `blocks`: sum of the Gram matrices, mean flow and mean pressure.
 
-        `columns`: for each equation the indices of its columns by role (leak, motion, left side); `start_s`: date [s
-        since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they are.
+        The sum is divided by the residual variance of a row, and the flow's offset is eliminated. The means are
+        weighted by the numbers of rows. `columns`: for each equation the indices of its columns by role (leak, motion,
+        left side); `start_s`: date [s since 1970] and `oil_degC`: oil temperature, None if unknown, are stored as they
+        are.
         """
         weights = np.maximum(blocks.rows, 1e-9)
         flow, pressure = (
@@ -303,11 +308,11 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
-    """Estimate the rise of the leakage past the piston over healthy recordings, while shut valves hold the load.
+    """Estimate the rise of the leakage past the piston over healthy recordings, from the times of a held load (holds).
 
-    Such times are holds. `judged`: the recording; `baseline`: the healthy ones. The leak may have begun within the
-    recording, whose mean then contains only a part of it. Return None if the judged recording has no holds, or fewer
-    than `MIN_WITH_HOLDS` healthy ones have any.
+    In a hold shut valves keep the load in place. `judged`: summary of the recording; `baseline`: those of the healthy
+    ones. The leak may have begun within the recording, whose mean then contains only a part of it. Return None if the
+    judged recording has no holds, or fewer than `MIN_WITH_HOLDS` healthy ones have any.
     """
     baseline = [recording for recording in baseline if recording.held is not None]
     if judged.held is None or len(baseline) < MIN_WITH_HOLDS:
@@ -544,9 +549,9 @@ def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingS
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    deviation = (n - 1)/n times the amount by which the coefficient exceeds the coefficient of the other n - 1
-    recordings. `columns`: for each equation the indices of its columns by role (leak, motion, left side). The other
-    coefficients may differ between recordings within their usual prior.
+    deviation = (n - 1)/n (its coefficient - the common coefficient of the other n - 1 recordings). The coefficients of
+    all other terms may differ between recordings within the usual prior. `columns`: for each equation the indices of
+    its columns by role (leak, motion, left side).
     """
     usual_width = np.ones(1)
     all_sums = np.sum([recording.sums for recording in recordings], axis=0)
@@ -739,7 +744,7 @@ def _leak_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, flo
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
-    """Estimate the logarithm of the flow that the piston's motion takes, over the flow in healthy recordings.
+    """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
 
     Returns the logarithm and its standard error from the recording alone. The ratio differs from 1 if area over
     displacement changed: another machine, or another scale of a sensor.
@@ -768,8 +773,11 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
     """Make a rise by `value` whose error follows Student's t, scaled by the scatter of n healthy recordings.
 
-    `deviations` (n,): deviation of each healthy recording from the mean of the others; `prior_scatter`: prior
-    standard deviation of a recording. All are in the unit of `value`.
+    `deviations` (n,): deviation d_j of each healthy recording from the mean of the others; `prior_scatter`: prior
+    standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). All
+    are in the unit of `value`. With m + n - 1 degrees of freedom,
+
+        deviation^2 = (m s^2 + ((n - 1)/n)^2 sum d_j^2) / (m + n - 1) (1 + 1/n).
     """
     prior, count = INFERENCE.scatter, len(deviations)
     sum_of_squares = prior.freedom * prior_scatter * prior_scatter
@@ -803,8 +811,9 @@ class LawFit(NamedTuple):
     """Comparison of an orifice's law with the laminar law, for leakage above that of healthy recordings.
 
     `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all other
-    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak, from the residual sums of
-    squares. It is for one independent reading, of which a recording counts as `size.readings` (`priors.toml`).
+    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak for one independent residual,
+    -log(residual sum of squares with the orifice / the same with the laminar leak) / 2. A recording counts as
+    `size.readings` independent residuals (`priors.toml`).
     """
 
     regression: float
@@ -844,12 +853,15 @@ def compare_with_leak(
 ) -> float | None:
     """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
-    Returns the log likelihood ratio of the rival to the leak, for one independent reading (a recording counts as
-    `size.readings` of `priors.toml`), from the residual sums of squares under the coefficients of the healthy
-    recordings, `baseline`. `columns`: for each equation the indices of its columns by role (leak, motion, left side).
-    While the rival (for example an external leak) is fitted, the leak may differ as it does between healthy recordings.
-    Return None if the balance has no column of that name, or the recording has no information on the leak or on the
-    rival.
+    Each is fitted in turn to the residual of the recording under the coefficients of the healthy recordings,
+    `baseline`. Returns the log likelihood ratio of the rival to the leak for one independent residual,
+
+        -log(residual sum of squares with the rival / the same with the leak) / 2.
+
+    A recording counts as `size.readings` independent residuals (`priors.toml`). While the rival (for example an
+    external leak) is fitted, the leak may differ as it does between healthy recordings. `columns`: for each equation
+    the indices of its columns by role (leak, motion, left side). Return None if the balance has no column of that name,
+    or the recording has no information on the leak or on the rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None

@@ -87,7 +87,7 @@ class Signals:
 
     @property
     def time_step(self) -> Array:
-        """Sampling interval [s] of each increment, shape (n - 1,)."""
+        """Sampling interval dt [s], repeated for each pair of consecutive samples, shape (n - 1,)."""
         return np.full(len(next(iter(self._channels.values()))) - 1, self.dt)
 
     @cached_property
@@ -107,7 +107,10 @@ class Signals:
 
     @cached_property
     def absolute(self) -> Mapping[str, Array]:
-        """Absolute pressure [Pa] of each chamber at each sample, at least `MIN_ABSOLUTE_PRESSURE`."""
+        """Absolute pressure [Pa] of each chamber at each of n samples, by the names "p_A" and "p_B".
+
+        Values below `MIN_ABSOLUTE_PRESSURE` are replaced by it.
+        """
         return {
             name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)
             for name in ("p_A", "p_B")
@@ -123,14 +126,16 @@ class Signals:
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """Flags (n,) of the samples, 1 if side A carries the load (p_A > p_B without the sensor offset), else 0."""
+        """Flags (n,) of the samples: 1 if side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def directed_step(self, outward: bool, by_A: bool) -> Array:
         """Return the increments of the position x [m] in one direction while one side has the higher pressure.
 
-        `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true while p_A > p_B.
-        Elsewhere the increments (n - 1,) are 0; an interval in which direction or side changes counts half.
+        An increment is the change of x between consecutive samples. `outward`: true for motion towards B or standstill,
+        false for motion towards A; `by_A`: true while p_A is higher than p_B, the sensor offset subtracted, false
+        otherwise. The result (n - 1,) is 0 with the other direction or side. If direction or side changes within an
+        interval, half of its increment counts.
         """
         is_counted = (self._is_outward == outward) & (self.carried_by_A == by_A)
         return _interval_means(is_counted.astype(float)) * self.step("x")
@@ -141,23 +146,27 @@ class Signals:
         return np.asarray(self.speed >= 0.0)
 
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Flag each sampling interval in which pump and piston move: 1 there, else 0; shape (n - 1,).
+        """Flag each sampling interval in which both pump and piston move: 1 there, else 0; shape (n - 1,).
 
-        `pump_volume` computes the increments of the pump's volume [m^3] from these signals. Without `rest_limits` all
-        flags are 1.
+        `pump_volume` computes from these signals the volume [m^3] that the pump delivers in each interval. All flags
+        are 1 if this object has no `rest_limits`, i.e. speeds below which the machine counts as resting.
         """
         return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Flag each sampling interval in which the pump turns and the piston rests: 1 there, else 0; shape (n - 1,).
 
-        The pump then holds the load by replacing what leaks. `pump_volume` computes the increments of the pump's
-        volume, as in `moving`. Without `rest_limits` all flags are 0.
+        The pump then holds the load by replacing what leaks. `pump_volume` computes from these signals the volume [m^3]
+        that the pump delivers in each interval. All flags are 0 if this object has no `rest_limits`.
         """
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Compute the flags of `moving` and `holding`, once: all terms of a balance have the same `pump_volume`."""
+        """Return two sets of flags (n - 1,) of the sampling intervals: pump and piston move, and only the pump moves.
+
+        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. The flags are computed only
+        once, since all terms of a balance have the same `pump_volume`.
+        """
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)
@@ -253,9 +262,9 @@ class Term(NamedTuple):
 
     @property
     def compared(self) -> bool:
-        """True if the term serves only to compare recordings.
+        """True for a term that is left out of the fit of a single recording.
 
-        It is fitted when recordings with different motion and load are compared, and left out within one recording.
+        Its coefficient is fitted only when recordings with different motion and load are compared.
         """
         return self.drift == "speed"
 
@@ -323,7 +332,9 @@ def _conductance_term(
 ) -> Term:
     """Make a term of a flow that is an unknown conductance [m^3/(s Pa)] times a pressure.
 
-    `increments` computes that pressure times the sampling interval [Pa s]; the other parameters are as in `Term`.
+    `increments` computes from `Signals` that pressure times the sampling interval [Pa s], shape (n - 1,). Fields of
+    `Term`: `name`; `cause`, what a sudden change of the conductance means; `needs`, the channels it is computed from;
+    `drift`, the prior on its drift.
     """
     return Term(name, "m^3/(s Pa)", increments, cause, drift, needs, "pressure")
 
@@ -337,16 +348,19 @@ _LEAKS = (
 def _motion_term(outward: bool, by_A: bool) -> Term:
     """Make the term dx of the piston's motion in one direction while one side has the higher pressure.
 
-    `outward`: true for motion towards B; `by_A`: true while p_A > p_B. The coefficient is an area [m^2].
+    dx is the change of the position between samples; the unknown coefficient is the area of the piston [m^2].
+    `outward`: true for motion towards B, false for motion towards A; `by_A`: true for p_A > p_B, false otherwise.
     """
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
     return Term(name, "m^2", lambda s: s.directed_step(outward, by_A), "sensor fault", "motion", ("x",))
 
 
 def _chamber_terms(side: str) -> tuple[Term, ...]:
-    """Make the terms of the compliance of one chamber, `side` "A" or "B", and of the air in its oil.
+    """Make the four terms of one chamber, `side` "A" or "B": two of its compliance, and two of the air in its oil.
 
-    Their increments are dp and x dp (compliance), d(1/p) (free air) and d ln p (air that dissolves).
+    With the pressure p of the chamber, the position x of the piston, and changes d over a sampling interval, the
+    increments are dp and x dp (compliance, constant and over the stroke), d(1/p) (free air) and d ln p (air that
+    dissolves). p is absolute in the last two.
     """
     p, name = f"p_{side}", f"compliance {side}"
     cause: Cause = "air in the oil"
@@ -361,8 +375,9 @@ def _chamber_terms(side: str) -> tuple[Term, ...]:
 def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    w is the weight of chamber A in the volume balance, computed by `weight_A`; V_A and V_B are the volumes of the
-    chambers at the current position, from the rig's file.
+    d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
+    the current position, from the rig's file. `weight_A` computes w from `Signals`: the weight, 0 to 1, of chamber A in
+    the volume balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -371,7 +386,11 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
     areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
 
     def expansion(s: Signals, side: str) -> Array:
-        """Compute V d(1/p) [m^3/Pa] of one chamber, shape (n - 1,)."""
+        """Compute V d(1/p) [m^3/Pa] of the chamber `side`, "A" or "B", in each sampling interval, shape (n - 1,).
+
+        p is the absolute pressure, d(1/p) the change of its inverse over the interval, and V the volume of the chamber
+        at the mean position in the interval.
+        """
         # at least a tenth of the volume at mid-stroke: x of an unknown origin may exceed the stroke
         volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
         return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
@@ -385,14 +404,15 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
 
 
 def _external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term weight max(p, 0) dt of an external leak, with the gauge pressure p of one side of the cylinder.
+    """Make the term of an external leak from one side of the cylinder: its increments are `weight` max(p, 0) dt [Pa s].
 
-    `weight`: effect of a flow out of that side on the volume balance, with its sign.
+    p is the gauge pressure of the `side`, "A" or "B", and dt the sampling interval. `weight`: effect of a flow out of
+    that side on the volume balance, with its sign: 1 or 0 for A, -1 or 0 for B.
     """
     p = f"p_{side}"
 
     def lost_volume(s: Signals) -> Array:
-        """Compute the increments max(p, 0) dt of the term, times `weight` [Pa s], shape (n - 1,)."""
+        """Compute the increments `weight` max(p, 0) dt of the term [Pa s], shape (n - 1,)."""
         return np.asarray(weight * np.maximum(s.mean(p), 0.0) * s.dt)
 
     return _conductance_term(f"external leak {side}", lost_volume, "external leak", (p,))
@@ -406,7 +426,10 @@ def _compensated_leak_term(side: str) -> Term:
     """
 
     def lost_volume(s: Signals) -> Array:
-        """Compute the increments of the term [Pa s], 0 while the other side has the higher pressure, (n - 1,)."""
+        """Compute the increments of the term [Pa s], shape (n - 1,).
+
+        They are max(p, 0) dt for A or -max(p, 0) dt for B while that side has the higher pressure, else 0.
+        """
         weight = _interval_means(s.carried_by_A) - float(side == "B")
         return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
 
@@ -446,14 +469,14 @@ _CYLINDER = (
 
 
 def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float) -> tuple[Term, ...]:
-    """Make the terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
+    """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
     `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
-    command u that opens it. With root = signed root of the pressure drop, the flow is
+    command u that opens the edge, 1 or -1. With dp = upstream pressure - downstream pressure, the flow is
 
-        flow = (gain abs(u) - overlap) root,    overlap = gain (dead band of u),
+        flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain (dead band of u),
 
-    and is delayed by the lag of the spool.
+    delayed by the lag of the spool. Up to their signs, the unknown coefficients are gain, gain times lag, and overlap.
     """
 
     def unit_flow(s: Signals) -> Array:
@@ -480,11 +503,12 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
 
 
 def _chamber_equation(side: str, rig: Rig) -> Equation:
-    """Make the volume balance of one chamber of a cylinder behind a servo valve.
+    """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
-    The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An
-    overlap of the edges reduces the flow in both directions, just as a leak does under the pressure of friction. Only
-    the prior on a healthy piston separates a leak from an overlap and from a change of friction.
+    The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
+    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if p_A - p_B reverses with
+    the motion as friction does. Only the prior on a healthy piston separates a leak from an overlap and from a change
+    of friction.
     """
     area, is_A = (rig.cylinder.A_A, True) if side == "A" else (rig.cylinder.A_B, False)
     sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
@@ -504,9 +528,9 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded channels.
 
-    Behind a servo valve there is one for each chamber. Otherwise there is one of the cylinder, with the pump's flow
-    from its angle, its speed, a flow meter or, without these, the command. `channels`: names of the recorded
-    channels. The result is empty if they do not suffice.
+    Behind a servo valve there is one balance for each chamber. Otherwise there is one of the cylinder, in which the
+    pump's flow is computed from its angle, its speed, a flow meter or, without these, the command. `channels`: names of
+    the recorded channels. The result is empty if they do not suffice.
     """
     if rig.circuit.valve_controlled and {"x", "u", "p_1", "p_2"} <= channels:
         if not channels.issuperset(_PRESSURES):
@@ -548,13 +572,13 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a load that is held by shut valves.
+    """Return the volume balance of a load that is held by shut valves; None if circuit or channels allow none.
 
     The piston moves only as far as oil leaks from the loaded side. The left side of the balance is minus the volume
-    that the loaded side of the piston displaces. The channels do not separate leaks of seal, valve and line. A constant
-    command means shut valves. If no channel shows a command or a flow, a slow piston may be held by valves or by a
-    control loop that replaces what leaks. x grows as A fills. Return None for a circuit without such valves, as a
-    pump-controlled one, or if position or a pressure is missing.
+    that the loaded side of the piston displaces; x is assumed to grow as A fills. Leaks of seal, valve and line cannot
+    be separated. The balance needs the position and both pressures. If a command or a flow is recorded, the circuit
+    must have valves that hold the load, and the command must be recorded: it is constant while they are shut. If
+    neither is recorded, a slow piston may be held by valves or by a control loop that replaces what leaks.
     """
     if not {"x", *_PRESSURES} <= channels:
         return None
@@ -570,11 +594,11 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
 
 
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
-    """Return a function that computes the increments of the pump's delivered volume [m^3] from `Signals`.
+    """Return a function that computes the volume [m^3] delivered by the pump in each sampling interval, from `Signals`.
 
-    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command,
-    whichever is recorded; return None if none is. If a flow meter has different scale errors in the two directions,
-    the fitted areas of the two directions differ.
+    The volume follows from the pump's angle, its speed, a flow meter, or the speed derived from the command, whichever
+    is recorded; return None if none is. If a flow meter has different scale errors in the two directions, the fitted
+    piston areas of the two directions differ.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -587,10 +611,11 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Return a pump's volume balance with three more terms, which tell rests of the pump or the piston from motion.
+    """Return a pump's volume balance with three more terms, which are zero in some states of the machine (`STATES`).
 
-    They are the leakage while the pump moves the piston, the leakage while it only holds the load, and the flow offset
-    in motion (`STATES`). They are inserted before the terms of the leak.
+    Their increments are (p_A - p_B) dt while the pump moves the piston, (p_A - p_B) dt while it turns and the piston
+    rests (a held load), and dt while pump and piston move. Otherwise each is 0. They are inserted before the terms of
+    the leak.
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
@@ -598,10 +623,10 @@ def with_rests(equation: Equation) -> Equation:
 
 
 def shut_at_rest(equation: Equation) -> Equation:
-    """Return a pump's volume balance for valves that cut the pump off from the cylinder while it rests.
+    """Return a pump's volume balance for valves that cut the pump off from the cylinder while the pump rests.
 
-    The pump's leakage has two terms of its own, one while it moves the piston and one while it only holds the load.
-    The flow offset counts in motion only.
+    Two terms are added for the leakage of the pump, driven by p_A - p_B: while it moves the piston, and while it only
+    holds the load. The constant flow (`BIAS`) counts only while pump and piston move.
     """
     left = equation.left
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
@@ -618,12 +643,13 @@ def _pump_leakage_terms(
 ) -> tuple[Term, Term]:
     """Make the terms of a pump's leakage, driven by p_A - p_B, while it moves the piston and while it holds the load.
 
-    `pump_volume` computes the increments of the pump's volume [m^3]; `drift`: entry of `priors.toml` with the prior on
-    the drift of both coefficients, or "" (`Term`).
+    `pump_volume` computes from `Signals` the volume [m^3] that the pump delivers in each interval; `drift`: entry of
+    `priors.toml` with the prior on the drift of both coefficients, or "" for terms that not every recording is fitted
+    with.
     """
 
     def turning(s: Signals) -> Array:
-        """Compute (p_A - p_B) dt [Pa s] in intervals of motion, else 0, shape (n - 1,)."""
+        """Compute (p_A - p_B) dt [Pa s] in intervals in which pump and piston move, else 0, shape (n - 1,)."""
         return s.moving(pump_volume) * s.pressure_difference * s.dt
 
     def holding(s: Signals) -> Array:

@@ -126,7 +126,11 @@ class ChargeTrend(NamedTuple):
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
-    """Estimate how fast the charge pressure of a closed circuit falls; None if it does not show (`LowDrifts`)."""
+    """Estimate how fast the charge pressure of a closed circuit falls, with its standard error.
+
+    The fall is the weighted mean over the chambers whose lowest pressures show it. Return None if there is no such
+    chamber, or if a pressure or the pump's angle or speed is not recorded.
+    """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
         return None
@@ -141,10 +145,10 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
 
 
 def _regressors(recording: Recording, source: str) -> Array:
-    """Compute the columns of the fit (n, 2 or 3): positive and negative flow of the pump, and the recorded position.
+    """Compute the regressors of a low pressure, (n, 2 or 3): positive and negative flow of the pump, and the position.
 
-    The flow is relative to its largest magnitude, the position to its mean. `source`: channel of the pump, "theta" or
-    "omega".
+    The flow is relative to its largest magnitude, the position, if recorded, to its mean. `source`: channel of the
+    pump, "theta" or "omega".
     """
     drive = average_over(CHANGES.charge.seconds, recording[source], recording.rate)
     flow = np.gradient(drive) if source == "theta" else drive
@@ -200,9 +204,9 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     """Compare the drifts of the low pressures with those of healthy recordings; yield a test for each explanation.
 
     The explanations are a drift of the sensor of p_A, one of p_B, and a fall of the charge pressure, which lowers both
-    alike. A fall does not explain a difference of the drifts:
+    alike. A fall does not explain a difference of the drifts, so its p-value (`chance`) is
 
-        chance of the fall = min(1, chance of the weighted mean of both drifts / chance of their difference).
+        chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
     prior = CHANGES.charge
     scatter = PriorScatter(prior.scatter, prior.recordings)

@@ -30,10 +30,10 @@ _NEIGHBOURS = _PRIORS.neighbours
 
 
 def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step.
+    """Test the amplitudes of command and motion for a step, a sudden lasting change.
 
-    Returns a test for each of the two that is recorded; none if either is constant. A change of what the machine is
-    commanded to do (its duty) changes both alike; a leak changes one of them, in open or closed loop.
+    Returns a test for each of the two that is recorded; the list is empty if either is constant. A change of what the
+    machine is commanded to do (its duty) changes both alike; a leak changes one of them, in open or closed loop.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -90,7 +90,11 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 
 
 def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
-    """Test the log amplitudes of command and motion, (K,) at times (K,) [s], for a step; [] if either is constant."""
+    """Test the log amplitudes of command and motion in K blocks for a step; return one test for each.
+
+    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) by the names "command" and "motion". The
+    list is empty if one of them is constant, has missing values or too few blocks.
+    """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
     return [test for test in tests if test is not None] if None not in tests else []
 
@@ -181,9 +185,9 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
 
 
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
-    """Test a feature's values (K,) in blocks at times (K,) [s] for a step.
+    """Test the values (K,) of a feature in K blocks at times (K,) [s] for a step up or down.
 
-    Return None if they are constant or missing, or too few.
+    Return None if they are constant, if one is missing, or for fewer than `MIN_BLOCKS` blocks.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None

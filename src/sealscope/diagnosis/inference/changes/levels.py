@@ -122,12 +122,12 @@ def _central_difference(values: Array, half_length: int) -> Array:
 
 
 def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate in blocks each pressure's mean over both directions of motion, and half its change with them.
+    """Estimate each pressure's mean over both directions of motion, and half its change with the direction, in blocks.
 
     The samples in motion are fitted by least squares with p = level + half sign(v) + b v + c dv/dt + d x. Level and
-    half difference are free in each block; the slopes b, c and d on speed, acceleration and position are common to
+    half difference are free in each block; the slopes b, c and d on speed v, acceleration and position x are common to
     the recording. Without a recorded motion the levels are means and the half differences zero. Return None if a
-    pressure is missing, or if no length of the blocks has enough samples of both directions in each.
+    pressure is missing, or if some block has too few samples of one direction, whichever length of blocks is tried.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -172,11 +172,12 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit the mean of each pressure over both directions of motion, and half its change with them, in K blocks.
+    """Fit each pressure's mean over both directions of motion, and half its change with the direction, in K blocks.
 
-    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa] (`PressureLevels`). It is None if a block has
-    too few samples of one direction. `gram` (K, m, m): Gram matrices of the rows of `pressure_level_rows`; `length`:
-    samples in a block; `means` (2,) [Pa]: were subtracted from the pressures.
+    The result (K, 4) contains level_A, level_B, half_A and half_B [Pa], with half = (p for v > 0 - p for v < 0) / 2
+    (`PressureLevels`). It is None if a block has too few samples of one direction. `gram` (K, m, m): Gram matrices of
+    the rows of `pressure_level_rows`; `length`: samples in a block; `means` (2,) [Pa]: were subtracted from the
+    pressures.
     """
     n_free = min(2, gram.shape[1] - 2)  # constant and sign(v) are free in each block, unless no motion is recorded
     if n_free == 2:
@@ -230,8 +231,8 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 def _whitening_matrix(values: Array) -> Array:
     """Compute the matrix (c, 4) that transforms pressure levels to numbers with independent errors of unit variance.
 
-    It is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): levels in K
-    blocks, c of which vary.
+    It is S^(-1/2), with the covariance S of the differences between neighbouring blocks. `values` (K, 4): the four
+    levels in each of K blocks (`PressureLevels`); c is the number of these levels that vary at all.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)
     change = np.diff(values[:, varying], axis=0)
@@ -247,8 +248,9 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `name`: name of the pattern; `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks;
-    `time` (K,): times of the blocks [s]. Vectors and levels are whitened, as the module's docstring explains. Return
-    None if no direction of the subspace can be tested.
+    `time` (K,): times of the blocks [s]. Vectors and levels are multiplied by the `_whitening_matrix`, so that the
+    errors of the c numbers of a block are independent and have unit variance. Return None if no direction of the
+    subspace can be tested.
     """
     basis, triangle = np.linalg.qr(rows.T)
     basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]

@@ -56,10 +56,11 @@ class Motion(NamedTuple):
 
 
 def select_motion(recording: Recording) -> Motion | None:
-    """Select the samples in which the piston moves, and build the design matrix of their fit.
+    """Select the samples in which the piston moves, and build the design matrix of their fit (`Motion`).
 
-    If they are many, they are thinned out. Returns None if a chamber pressure or a signal of the motion is not
-    recorded, or if fewer than `MIN_ROWS` samples move.
+    The piston moves if its speed exceeds a fraction (`healthy.slowest` in `priors.toml`) of the 99 % quantile of its
+    speed. If they are many, the samples are thinned out. Returns None if a chamber pressure or a signal of the motion
+    is not recorded, or if fewer than `MIN_ROWS` samples move.
     """
     if len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
@@ -87,13 +88,11 @@ def stack_equations(design: Array, values: Array) -> Array:
 
 
 def solve_weighted(equations: Array, weight: Array) -> Array:
-    """Solve a weighted least-squares problem by a QR decomposition; returns the coefficients (m,).
+    """Solve a weighted least-squares problem by a QR decomposition; returns the coefficients c (m,).
 
-    The triangular factor has the singular values of the weighted design matrix. If that has not full rank, the solution
-    is the shortest, as that of `numpy.linalg.lstsq`, which decomposes all rows into singular values.
-
-    `equations` (m + 1, n): columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of
-    the rows.
+    They minimise sum((weight (values - design c))^2). If the weighted design matrix has not full rank, they are the
+    shortest of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the design and values
+    (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
     factor = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)[1]
     return np.asarray(np.linalg.lstsq(factor[:-1, :-1], factor[:-1, -1], rcond=ROUNDING * len(weight))[0])
@@ -102,7 +101,8 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
-    The weights are 1/sqrt(1 + (residual/scale)^2). Returns the coefficients and the weights (n,).
+    The weights are 1/sqrt(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
+    plus `MIN_RESIDUAL`. Returns the coefficients and the weights (n,).
     """
     equations, weight = stack_equations(design, values), np.ones(len(values))
     for _ in range(ITERATIONS):
@@ -116,12 +116,11 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
 def cluster_errors(design: Array, residual: Array, columns: Sequence[int]) -> Array:
     """Compute standard errors of the coefficients `columns` of a weighted least-squares fit.
 
-    The residuals (n,), in the order of time, are correlated within each of P parts of the recording. With the influence
-    of a part's residuals on a coefficient,
+    The residuals (n,), in the order of time, are correlated within each of P = `PARTS` parts of the recording:
 
-        error^2 = P / (P - 1) sum over parts of influence^2.
+        error^2 = P / (P - 1) sum over parts of influence^2,    influence = (X' X)^-1 (X' residual of the part).
 
-    `design` (n, m), `residual`: both multiplied by the weights.
+    X = `design` (n, m) and `residual` are both multiplied by the weights.
     """
     edges = np.linspace(0, len(residual), PARTS + 1).astype(int)[:-1]
     scores = np.add.reduceat(design * residual[:, None], edges, axis=0)

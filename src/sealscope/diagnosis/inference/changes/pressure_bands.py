@@ -102,7 +102,7 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
 
 
 def _octave_edges(count: int) -> Array:
-    """Return the limits (`count` + 1,) of the octaves [Hz]."""
+    """Return the limits (`count` + 1,) of `count` octaves of frequency [Hz], upwards from `octaves.lowest`."""
     edges: Array = CHANGES.octaves.lowest * np.exp2(np.arange(count + 1.0))
     return edges
 
@@ -175,9 +175,10 @@ class _FilterFactor(NamedTuple):
 
 
 def _compare_pair(judged: Octaves, healthy: Sequence[Octaves], pair: tuple[str, str]) -> _FilterFactor | None:
-    """Compute the Bayes factor of a filter of the pressures of a `pair` of channels.
+    """Compute the Bayes factor of a filter to none, by the spectra of a `pair` of channels.
 
-    Return None for too few healthy recordings with as many octaves, or if the factor is not finite.
+    It is averaged over filters of each pressure in the pair. Return None for too few healthy recordings with as many
+    octaves, or if the factor is not finite.
     """
     from scipy.special import logsumexp
 

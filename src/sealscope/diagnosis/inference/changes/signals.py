@@ -62,8 +62,9 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable of the step of the duty (motion and load) if command and motion change by similar ratios.
 
-    Otherwise nothing is yielded: a leak changes only one of them. `tests`: step tests of the log amplitudes of command
-    and motion (`duty_tests`).
+    The smaller step of the two log amplitudes must be at least `_MIN_STEP_RATIO` of the larger one. Otherwise nothing
+    is yielded: a leak changes only one of them. `tests`: step tests of the log amplitudes of command and motion
+    (`duty_tests`).
     """
     steps = np.abs([test.fitted.size for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():

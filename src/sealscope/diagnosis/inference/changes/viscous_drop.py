@@ -15,7 +15,7 @@ from sealscope.recordings.recording import Array, Recording
 def estimate_viscous_drop(recording: Recording) -> Array | None:
     """Estimate the logarithm of the ratio of viscous pressure drop [Pa] to speed, and its standard error, (2,).
 
-    A drop that is not clearly positive counts as its own standard error. Returns None without enough motion.
+    A drop below its standard error, also a negative one, is replaced by this error. Returns None without enough motion.
     """
     fit = fit_difference(recording)
     if fit is None:

@@ -185,10 +185,11 @@ def _observable_name(term: Term) -> str:
 
 
 def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> float:
-    """Compute twice the log likelihood ratio of an external leak to none, by the accumulator's data.
+    """Compute twice the log likelihood ratio of an external leak to none, by the oil that the accumulator lost.
 
-    `balance_test`: test for a step of the leak by the volume balance; `accumulator_test`: the same by the oil that
-    the accumulator lost.
+    With the size a of the leak by the accumulator, its standard error s, and the size b by the volume balance, it is
+    (a/s)^2 - ((a - b)/s)^2, at the onset by the balance. `balance_test`, `accumulator_test`: tests for a step of the
+    leak by the volume balance and by the accumulator.
     """
     nearest = int(np.abs(accumulator_test.onsets - balance_test.onsets[balance_test.best]).argmin())
     sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])

@@ -201,12 +201,18 @@ class _OilRegression(NamedTuple):
     misfit_variance: float
 
     def leaked(self, logs: Array) -> Array:
-        """Compute the volume that left each chamber (r,): the displaced minus the compressed, for given `logs` (4,)."""
+        """Compute the volume [m^3] that left each chamber by each reading (r,): the displaced minus the compressed one.
+
+        `logs` (4,): logarithms of the oil's properties.
+        """
         oil, air, volumes = _oil_factors(logs)
         return self.displaced - (oil * self.strained + air * self.aired) @ volumes
 
     def slopes(self, logs: Array) -> Array:
-        """Compute the derivatives of the compressed volumes by the logarithms of the oil's properties, (r, 4)."""
+        """Compute the derivatives (r, 4) of the compressed volumes [m^3] by the logarithms of the oil's properties.
+
+        `logs` (4,): values of these logarithms.
+        """
         oil, air, volumes = _oil_factors(logs)
         strained, aired = oil * self.strained * volumes, air * self.aired * volumes
         dead = strained[:, 1:] + aired[:, 1:]
@@ -214,13 +220,21 @@ class _OilRegression(NamedTuple):
 
 
 def _oil_factors(logs: Array) -> tuple[float, float, Array]:
-    """Convert logarithms of the oil's properties (4,) to factors of compressibility, free air, and volumes (3,)."""
+    """Convert logarithms (4,) of the oil's properties to factors on their usual values.
+
+    `logs`: of compressibility, dead volume of A, dead volume of B, and free air. Returns the factor on the
+    compressibility, the one on free air, and those on three volumes (3,): the stroke's, which is always 1, and the dead
+    volumes.
+    """
     compressibility, dead_A, dead_B, air = np.exp(logs)
     return float(compressibility), float(air), np.array([1.0, dead_A, dead_B])
 
 
 def _oil_deviations() -> Array:
-    """Return the prior standard deviations of the logarithms of the oil's properties (4,)."""
+    """Return the prior standard deviations (4,) of the logarithms of the oil's properties.
+
+    They are compressibility, dead volume of A, dead volume of B, and free air.
+    """
     prior = INFERENCE.held_oil
     return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
 
@@ -297,25 +311,29 @@ class HeldChambers:
 
     @property
     def n_readings(self) -> float:
-        """Effective number of independent readings (means of neighbouring samples) in all holds."""
+        """Effective number of independent readings (means of neighbouring samples) in all holds.
+
+        Each of the two sides of a hold counts as `held_oil.independent` readings (`priors.toml`).
+        """
         independent: float = INFERENCE.held_oil.independent
         return independent * 2.0 * len(self.holds)  # on both sides of each hold
 
     @cached_property
     def _regressions(self) -> tuple[_OilRegression, _OilRegression]:
-        """Regressions of displaced volumes on the oil's properties: without check valves, and with refilling ones.
+        """Two regressions on the oil's properties: without check valves, and with check valves that refill a chamber.
 
-        A displaced volume is what the piston displaces in a hold; the properties are compressibility, dead volumes of A
-        and B, and free air (`_OilRegression`).
+        The left side of each is the volume that the piston displaces in holds. The four unknowns are the logarithms of
+        compressibility, dead volume of A, dead volume of B, and free air, each relative to its usual value.
         """
         return self._build_regression(False), self._build_regression(True)
 
     def _build_regression(self, is_refilled: bool) -> _OilRegression:
         """Build the regression of displaced volumes on the oil's properties from all holds (`_OilRegression`).
 
-        Its rows are the readings of each hold, side A before side B, relative to their mean over the hold. A reading
-        is a mean of several samples (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the
-        charge pressure, so displacement counts only while the chamber's pressure is higher.
+        The properties are compressibility, dead volumes of A and B, and free air. The rows are the readings of each
+        hold, side A before side B, relative to their mean over the hold. A reading is a mean of several samples
+        (`LockedHold.edges`). With `is_refilled`, check valves keep a chamber at the charge pressure, so displacement
+        counts only while the chamber's pressure is higher.
         """
         prior, stroke = INFERENCE.held_oil, self.sides.high - self.sides.low
         displaced, strained, aired = list[Array](), list[Array](), list[Array]()
@@ -354,10 +372,10 @@ class HeldChambers:
         return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved)
 
     def _unit_piston_leak(self, offset: float, exponent: float = 1.0) -> UnitLeak:
-        """Compute the flow in the holds of a leak past the piston with a coefficient of 1, in Pa^`exponent`.
+        """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^`exponent`.
 
-        It is sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. The sensor offset z of a hold is near `offset` [Pa]
-        (`LockedHold.own_offset`).
+        It is sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. z is the sensor offset in the hold, which may differ a
+        little from the `offset` [Pa] of the recording (`LockedHold.own_offset`).
         """
         differences = [hold.p_A - hold.p_B - hold.own_offset(offset)[0] for hold in self.holds]
         return UnitLeak([np.sign(values) * np.abs(values) ** exponent for values in differences], (1.0, -1.0))
@@ -426,14 +444,14 @@ class HeldChambers:
     def fit_piston_leak(self, onset: float, offset: float, exponent: float = 1.0) -> LeakFit:
         """Fit a leak past the piston that begins at `onset` [s] to the times in which shut valves hold the load.
 
-        Its flow is its coefficient times sign(dp) |dp|^`exponent` of dp = p_A - p_B - `offset` [Pa]. The likelihood
-        includes the prior on the offset.
+        Its flow is its coefficient times sign(dp) |dp|^`exponent` of dp = p_A - p_B - z. In each hold z is about
+        `offset` [Pa], the sensor offset in the recording. The likelihood includes the prior on the offset.
         """
         fit = self._fit_leak(self._unit_piston_leak(offset, exponent), onset)
         return fit._replace(likelihood=fit.likelihood - 0.5 * self._offset_cost(offset))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of the sensor offset [Pa], and of the holds' own offsets near it."""
+        """Compute -2 log of the prior density of the sensor offset [Pa] and of each hold's deviation from it."""
         return offset_cost(offset) + sum(hold.own_offset(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
@@ -550,7 +568,8 @@ class HeldChambers:
     def piston_fit(self) -> PistonFit:
         """Most probable onset [s] of a leak past the piston, and most probable sensor offset of p_A - p_B [Pa].
 
-        Both are found by a grid search that is refined once.
+        They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
+        once.
         """
         grid = self._offset_grid
         best = int(np.argmax([self._find_onset(float(offset))[1] for offset in grid]))
@@ -633,7 +652,8 @@ class HeldChambers:
     def probability_after_holds(self) -> float:
         """Prior probability that a leak begins after the last hold, so that no hold shows it.
 
-        A hold is a time in which shut valves hold the load.
+        A hold is a time in which shut valves hold the load. The probability is (1 - `held_oil.from_start`), that of a
+        leak that begins within the recording, times the fraction of the recording's time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)

@@ -160,7 +160,7 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
     indices = np.arange(n_samples + 1)
 
     def integrate(values: Array) -> Array:
-        """Integrate values (n,) over the triangular window about each of the r `centres`, shape (r,)."""
+        """Average values (n,) with the weights of a triangular window about each of the r `centres`, shape (r,)."""
         integral = np.concatenate([[0.0], np.cumsum(values)])
         double_integral = np.concatenate([[0.0], np.cumsum(0.5 * (integral[1:] + integral[:-1]))])
         before, middle, after = (

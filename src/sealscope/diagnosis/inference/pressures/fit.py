@@ -52,7 +52,10 @@ class Priors(NamedTuple):
 
     @property
     def unit(self) -> Array:
-        """Units of the parameters, shape (p,), fractions of their prior widths that suit finite differences."""
+        """Units (p,) in which the parameters are counted, small enough for finite differences.
+
+        They are `_DIFFERENCE` times the smaller of `width` and `wander`.
+        """
         return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
 
     @property
@@ -166,7 +169,7 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     """Compute the joint prior precision of the parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
     The parameters are in units of `priors.unit`. Each is a random walk from block to block, and its mean over the
-    blocks has the prior of the machine.
+    blocks has the prior standard deviation `priors.width`.
     """
     steps = np.diff(np.eye(n_blocks), axis=0)
     walks = np.kron(steps.T @ steps, np.diag(1.0 / priors.wander_variance(block_s)))

@@ -29,7 +29,7 @@ def conductance_scale_error() -> float:
     """Compute the relative standard deviation of the scale error that all fitted conductances share.
 
     The response of the pressures determines G M/A^2, so errors of the stated mass M and piston area A scale the
-    conductance G.
+    conductance G: the result is sqrt(s_M^2 + (2 s_A)^2) with their relative standard deviations.
     """
     return math.hypot(PRESSURE.scale.mass, 2.0 * PRESSURE.scale.area)
 

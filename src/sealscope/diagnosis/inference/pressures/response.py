@@ -112,7 +112,8 @@ class Segment:
     def residual_squares(self, sets: Array) -> Array:
         """Compute the residual sum of squares of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
 
-        It is taken about the mean, and has the shape (m,). It is infinite for a set whose simulation diverges.
+        The residual is recorded minus simulated p_A - p_B, without its mean and the mains hum. The result (m,) is
+        infinite for a set whose simulation diverges.
         """
         simulated, _ = self.machine.simulate(self.command, sets, self.states[:, np.zeros(len(sets), dtype=int)])
         residual, _, amplitudes = self._project_on_waves(self.dp - sets[:, SCALE, None] * simulated)
@@ -206,13 +207,17 @@ class Segment:
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number."""
+        """Return True if a fit explains the samples: its chi-squared `cost` hardly exceeds their number n.
+
+        The limit is n + c sqrt(2 n), i.e. c standard deviations above the mean (`follow.unexplained` of `priors.toml`).
+        """
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to the sums for the joint fit of all blocks (`fit.Joint`).
 
-        They include the scores, i.e. products with the derivative by the conductance, in each second.
+        They include the scores: the products of the residual, and of the model's derivatives by all parameters, with
+        its derivative by the conductance, summed over each second.
         """
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))
@@ -450,9 +455,11 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
-    """Compute the likelihood of each parameter of the response in K blocks, by the name of the parameter.
+    """Compute the likelihood of each parameter of the pressure response in K blocks, by the name of the parameter.
 
-    `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`: length of the recording [s].
+    It is Gaussian in the K values of the parameter, stated by precision matrix and information vector (`Information`),
+    with all other parameters eliminated. `joint`: fit of all blocks; `time` (K,): middles of the blocks [s]; `seconds`:
+    length of the recording [s].
     """
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)  # of a random walk since the time that the priors state
     wander = growth * joint.priors.wander

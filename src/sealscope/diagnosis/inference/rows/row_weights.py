@@ -230,8 +230,9 @@ def block_gram_matrices(
     """Compute the Gram matrices (K, m, m) of K blocks from rows with Huber's weights, and update `earlier_sums`.
 
     `values` (r, m): rows of all blocks; `ends` (K,): index past the last row of each block; `fast`: indices of the
-    columns whose coefficients are free in each block; `slow`: indices of those with coefficients common to all
-    blocks, the left side last. `earlier_sums` and `update_fraction` are as in `weigh_rows`.
+    columns whose coefficients are free in each block; `slow`: indices of those with coefficients common to all blocks,
+    the left side last. `earlier_sums`: sums over earlier blocks for the slow columns, the prior of the fit; they move
+    towards the sums of these blocks by the fraction `update_fraction` of the difference (`weigh_rows`).
     """
     column_order = np.concatenate([fast, slow])
     workspace = Workspace(*map(np.empty, workspace_shapes(len(values), len(ends), len(column_order), len(slow) - 1)))

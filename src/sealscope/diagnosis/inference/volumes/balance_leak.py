@@ -111,10 +111,10 @@ class BalanceLeak:
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
-        """Add to a flow's standard error the uncertainty of the leak's law and of averaged pressures.
+        """Add to a flow's standard error the uncertainty of how the leak's flow depends on the pressure (its law).
 
-        The law lies between laminar flow and an orifice. The uncertainty is the fraction `size.law` (`priors.toml`) of
-        the flow.
+        The law lies between laminar flow and an orifice. Its uncertainty, which includes the error of averaged
+        pressures, is the fraction `size.law` (`priors.toml`) of the flow; the two errors are added in quadrature.
         """
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
@@ -230,10 +230,10 @@ class BalanceLeak:
         Returns for each law its mean flow if the leak's coefficient rises by 1, and its log weight. A law with an
         exponent e of `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
-            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one reading),
+            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N (log likelihood ratio of one residual),
 
-        where a recording counts as N = `size.readings` (`priors.toml`) independent readings. If the laws cannot be
-        compared, each has the laminar flow and the log weight 0.
+        with the ratio of orifice to laminar leak, and N = `size.readings` (`priors.toml`) independent residuals in a
+        recording. If the laws cannot be compared, each has the laminar flow and the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -252,7 +252,7 @@ class BalanceLeak:
     def excess(self) -> float | None:
         """Total leakage minus the limit in the rig's file, over the standard deviation of the leakage (no unit).
 
-        None if the file states no limit, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
+        None without a limit in the file, if no flow can be stated in L/min (`Size.stated`), behind a servo valve, if no
         channel measures the flow, or if healthy recordings are compared instead.
         """
         balance = self.balance
@@ -347,7 +347,7 @@ class BalanceLeak:
         return None if leaks is None else held_rise(self.balance.recording_sums._replace(held=leaks), self.healthy)
 
     def _fraction_after(self, step: StepTest) -> float:
-        """Compute the fraction (0 to 1) of the information on the mean leakage from blocks after a step's onset.
+        """Compute the fraction, 0 to 1, of the information on the mean leakage that lies after a step's onset.
 
         The information of a block is the sum of its row of the precision matrix (`onset.Information`).
         """
@@ -357,9 +357,10 @@ class BalanceLeak:
 
     @property
     def lpm_per_flow(self) -> float | None:
-        """Factor from a flow computed with the machine's assumed sizes [m^3/s] to the true flow [L/min].
+        """Factor from a flow [m^3/s] computed with assumed dimensions of the machine to the true flow [L/min].
 
-        None if no flow can be stated in L/min (`Size.stated`).
+        The dimensions are the pump's displacement or the piston's areas. None if no flow can be stated in L/min
+        (`Size.stated`).
         """
         size = self.balance.size
         return size.scale / LITRE_PER_MINUTE if size.stated else None

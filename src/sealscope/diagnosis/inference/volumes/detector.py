@@ -166,10 +166,10 @@ class VolumeBalance:
 
         The summary contains the fields of `scatter.RecordingSums` that are known, the names of the balance's `terms`,
         and `scale`, the factor from computed to true flows, 0 if no flow can be stated in L/min (`Size`). If the
-        machine rests, it also contains `shut_sums`, the Gram matrices if the pump is cut off at rest, and `shut_odds`,
-        the log odds that it is, from the balance at rest. If it holds a load at rest: `held`, the leaks while shut
-        valves hold the load, and `held_odds`, the log odds from these. If no pump's flow is recorded (`is_creep`):
-        `creep_odds`, the log odds that the load creeps by leakage.
+        machine rests, it also contains `shut_sums`, the Gram matrices for a pump that valves cut off at rest, and
+        `shut_odds`, the log odds that they do, from the leakage at rest. If it holds a load at rest: `held`, the leaks
+        while shut valves hold the load, and `held_odds`, the same log odds from these leaks. If no pump's flow is
+        recorded (`is_creep`): `creep_odds`, the log odds that the load creeps by leakage.
         """
         recorded = self._recorded(recording) if equations(self.rig, frozenset(recording.channels)) else None
         balance = self.balance(recording) if recorded is None else self._balance(recording, recorded.open)
@@ -224,10 +224,11 @@ class VolumeBalance:
         return (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _is_held_by_valves(self, balance: RecordedBalance, summaries: Sequence[Summary]) -> bool:
-        """Return True unless a control loop may hold the load, in a volume balance without the pump (`terms.locked`).
+        """Return True if valves, not a control loop, hold the load in a volume balance without a pump (`terms.locked`).
 
-        With a recorded command valves hold it. Without one the load must creep in the healthy recordings with these
-        `summaries`: a control loop would replace what leaks, and slow motions are no creep.
+        Any other balance counts as True. With a recorded command valves hold the load. Without one the load must creep
+        in the healthy recordings, by the sum of the log odds in their `summaries`: a control loop would replace what
+        leaks, and slow motions are no creep.
         """
         if not balance.is_creep or flow_source(balance.recording.channels) is not None:
             return True
@@ -322,7 +323,7 @@ def compare_motion(
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate the logarithm of the flow of motion in a recording, over that flow in the healthy ones."""
+        """Estimate log(flow per speed of the piston in a recording / the same in the healthy ones), with its error."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))

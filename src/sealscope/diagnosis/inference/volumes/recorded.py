@@ -142,7 +142,11 @@ class RecordedBalance:
 
     @cached_property
     def compared_leak(self) -> Information:
-        """Likelihood of the conductance of the leak as recordings are compared: with one leakage of all rests."""
+        """Likelihood of the leak's conductance in each of `running_blocks`, as it is compared between recordings.
+
+        If the volume balance has a separate term for the leakage of a pump that holds the load, that term is left out.
+        All rests then have one common leakage, unlike in `leak`.
+        """
         roles = self.columns[0]
         return information(self.running_blocks, self.columns, roles.leak, roles.hold_leak)
 
@@ -241,9 +245,9 @@ class RecordedBalance:
     def locked_odds(self) -> float | None:
         """Compute the log odds that valves really shut off the chambers in holds; None without holds.
 
-        A hold is a time in which shut valves hold the load. The leaks in holds are compared with the total leakage:
-        with open valves the holds would show the leakage of pump and piston, too. The log odds are limited to
-        +-`rest.most` of `priors.toml`.
+        A hold is a time in which shut valves are supposed to hold the load. The leaks in holds are compared with the
+        total leakage of pump and piston, which holds would show if the valves were open. Positive log odds mean that
+        the valves are shut. They are limited to +-`rest.most` of `priors.toml`.
         """
         if self.chambers is None:
             return None
@@ -272,10 +276,10 @@ class RecordedBalance:
     def _signed_areas(self) -> tuple[float, float]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion,
-        weighted by the sums of squares of their columns. If the rig's file states the areas, they are used, scaled to
-        the flows of the volume balance. A side that never carries the load takes the area of the other. Both are zero
-        if nothing moves.
+        They are negative if the position x is reversed. The area of a side is the mean of its coefficients of motion in
+        the volume balance, weighted by the sums of squares of their columns. If the rig's file states the areas, they
+        are used instead, scaled to the flows of the volume balance. A side that never carries the load takes the area
+        of the other side. Both are zero if nothing moves.
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -357,7 +361,7 @@ class RecordedBalance:
 
     @cached_property
     def size(self) -> Size:
-        """Factor from the flows of this balance, computed with assumed sizes, to the machine's true flows (`Size`)."""
+        """True flow over the flow computed with assumed dimensions, such as the pump's displacement (`Size`)."""
         return _flow_scale(self)
 
     @cached_property
@@ -385,7 +389,10 @@ class RecordedBalance:
 
     @cached_property
     def total_history(self) -> History:
-        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance."""
+        """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
+
+        It includes a step of the leakage if a test finds one with a p-value below `RAREST`.
+        """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None
         total = information(self.blocks, self.columns, roles.leak, pump)
@@ -453,8 +460,8 @@ class _Area(NamedTuple):
 def _loaded_area(balance: RecordedBalance, motion: list[int]) -> _Area:
     """Estimate the piston area of the loaded side, as a weighted mean over directions of motion and loaded sides.
 
-    `motion`: indices of the columns of motion. Their weights are the sums of their squares, so that a side counts by
-    the motion under its load.
+    `motion`: indices of the columns of the piston's motion, one for each direction and loaded side. The weight of a
+    column is its sum of squares, so that each side counts by the motion under its load.
     """
     roles, cylinder = balance.columns[0], balance.rig.cylinder
     energy = np.einsum("kii->i", balance.blocks.gram[:, 0])[motion]

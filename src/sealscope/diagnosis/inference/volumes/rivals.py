@@ -119,11 +119,12 @@ def held_rivals(
 
 
 def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Mapping[str, float] | None) -> Observable:
-    """Return the observable of an external leak with minus the penalty on its flow as `advantage` (`size_penalty`).
+    """Return the observable of an external leak with an `advantage` that falls with its flow, from 0 for usual sizes.
 
-    A large external leak is improbable, since oil outside is seen. Its flow [m^3/s] is the conductance, the size of the
-    observable, times the flow for a conductance of 1 (`unit_flows`), or times the mean of abs(p_A - p_B) of the
-    recording `judged`.
+    A large external leak is improbable, since oil outside is seen. The advantage is 2 log(prior density / largest prior
+    density) of the flow, and 0 for flows below the centre of the prior (`outside` in `priors.toml`). The flow [m^3/s]
+    is the conductance of the observable times the flow for a conductance of 1 (`unit_flows`), or without that, times
+    the mean of abs(p_A - p_B) of the recording `judged`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
