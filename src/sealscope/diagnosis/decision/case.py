@@ -117,7 +117,11 @@ class Case:
         return probability_of(self.explanations, cause="external leak", data_kind=self._data_kind(alarm))
 
     def _data_kind(self, alarm: LeakTest) -> str:
-        """Return the kind of data (`Observable.data`) by which a test raised its alarm."""
+        """Return the kind of data (`Observable.data`) by which a test raised its alarm.
+
+        It is `RISE`, the difference from healthy recordings, if the alarm is from the comparison with them and leakage
+        is measured. Otherwise it is the kind of data that the judging detector tests for changes.
+        """
         is_rise = alarm.name == AGAINST and self.leak is not None
         return RISE if is_rise else self.judge.observables[0].data
 
@@ -223,7 +227,9 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    It is the test of the rarest of its observables that a leak changes; empty if a leak changes none of them.
+    The detector has a test for each of its observables. Of the tests of observables that a leak changes, the one with
+    the smallest p-value is taken; the result is empty if a leak changes none of them. The threshold is the score that
+    would have the allowed p-value if the score were proportional to log p.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

@@ -127,10 +127,10 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the noise and the probabilities of the random walks after a block.
+        """Update the scale of the noise and the probability of each size of the random walk after a block.
 
-        Each of the q walks has a Kalman filter with an innovation e of variance S. `variance` (q, 1) is S, and
-        `square` (q, 1) is e^2 / S.
+        For each of the sizes, q in number, a Kalman filter has given the innovation e of the block (measured minus
+        predicted estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -207,7 +207,8 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the random walks, the onsets and the prior sizes, weighted by their probabilities.
+        Both are averages over the sizes of the random walk, the possible onsets and the prior variances of the step,
+        weighted by their posterior probabilities. The onset has a 95 % interval, and the size a standard deviation.
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
@@ -246,9 +247,11 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of the estimates' prediction errors (innovations) over the variance that the estimates state.
+        """Variance of the estimates' prediction errors (innovations) over the variance that the Kalman filter predicts.
 
-        It applies to the random walk with a variance per block of a tenth of the first estimate's variance.
+        The filter is the one whose random walk has a variance per block of a tenth of the first estimate's variance.
+        The ratio is averaged over the blocks, with fading memory, and over `stated` more ones (`priors.toml`) with the
+        ratio 1.
         """
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
