@@ -152,9 +152,9 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return a recording's summary of wavelet details if its `levels` and `duty` are valid; else raise ValueError.
 
-    `levels` are logarithms of the RMS of the pressures' wavelet details, `duty` describes how the machine is moved and
-    loaded (`RmsBlocks`). The length of `levels` must match the number of chambers, and that of `duty` the number of its
-    quantities. Their numbers are logarithms and must be below 750 in magnitude.
+    `levels` (5 per chamber,) are logarithms of the RMS of the pressures' wavelet details, and `duty` (4,) describes how
+    the machine is moved and loaded (`RmsBlocks`). At least one chamber must be named, and all numbers must be below 750
+    in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):

@@ -214,12 +214,9 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key by which the distribution of a detector's step test is stored, such as "volume balance: step".
+    """Return the key under which `HealthyNull` stores a detector's test for a step of the leak within a recording.
 
-    It is the distribution, in healthy recordings (`HealthyNull`), of the test for a step of the leak within a
-    recording.
-
-    `provider`: name of the detector.
+    It is the name of the detector, `provider`, and the word "step", such as "volume balance: step".
     """
     return f"{provider}: step"
 

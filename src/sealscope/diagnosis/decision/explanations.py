@@ -155,9 +155,8 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
         log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
 
     The largest is over the events of the set. For the rise over healthy recordings, the negative factors of events
-    that contradict it are added.
-    `gains_of`: log Bayes factors of each event, by its name, for each possible onset (`_possible_gains`). Of all
-    combinations of onsets the one with the largest sum counts.
+    that contradict it are added. `gains_of`: log Bayes factors of each event, by its name, for each possible onset
+    (`_possible_gains`). Of all combinations of onsets the one with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()

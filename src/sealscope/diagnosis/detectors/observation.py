@@ -101,8 +101,8 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
     """Run a detector with those baseline recordings that it can use.
 
     `distrust`: reason why the pressures cannot be judged, None if they can. If the detector cannot use the recording,
-    or none of the given baselines, the report is empty and states the reason. So it is without a baseline if a pressure
-    does not move for some time, except for the volume balance, which needs no motion.
+    or none of the given baselines, the report is empty and states the reason. Without a baseline, the report is also
+    empty if a pressure does not move for some time; the volume balance, which needs no motion, is exempt from this.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:

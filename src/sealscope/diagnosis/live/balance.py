@@ -92,7 +92,10 @@ class BlockConductance(NamedTuple):
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of the mean pressure difference [Pa] and the mean flow [m^3/s]; finite even if these are 0."""
+        """Logarithms of the mean |p_A - p_B| [Pa] and of the mean flow that moves the piston [m^3/s].
+
+        They are finite even if these are 0.
+        """
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
@@ -246,7 +249,12 @@ class LiveBalance:
             yield self._take_block(block)
 
     def _take_block(self, block: Blocks) -> BlockResult:
-        """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted."""
+        """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
+
+        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The result is a
+        NotJudged until then, for a block with missing values or at standstill, and if several blocks have moved far
+        more than the usual ones: the coefficients are then learned anew.
+        """
         end = self._sample_times(block)[1]
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")

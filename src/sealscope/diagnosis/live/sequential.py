@@ -97,9 +97,10 @@ class StepDetector:
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
         """Update the evidence of a step by the estimate `g` of the coefficient in the next block.
 
-        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e = g -
-        level be the innovation of the Kalman filter for a random walk, S its variance, and f the effect of a unit
-        step on it. Then for each walk and each possible onset, a += f e / S, b += f^2 / S and T += e^2 / S.
+        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
+        innovation, i.e. g minus its prediction by the Kalman filter for a random walk, S its variance, and f the effect
+        of a unit step on it. Then for each size of the walk and each possible onset, a += f e / S, b += f^2 / S and T
+        += e^2 / S. The first block after `forget` only sets the level of the filter.
         """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
@@ -162,10 +163,12 @@ class StepDetector:
             self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
-        """Compute the logarithm of the evidence that the coefficient has risen (e-value M of the module's docstring).
+        """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        The result is minus infinity if no rise can have begun yet, or if a quick upper bound of log M is at most
-        `min_log_e`.
+        M is the sum over all possible onsets of the likelihood ratio of a step to no step, averaged over the size of
+        the random walk, the prior variance of the step and the part of the first block. In a healthy machine the mean
+        number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can have begun yet,
+        or if a quick upper bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
@@ -188,7 +191,9 @@ class StepDetector:
         """Compute the log likelihood ratios (v, q, j) of a step of the coefficient against none.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset.
+        and j the onset. With the sums a, b and T over the n innovations since the onset, which `take` updates,
+
+            R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
@@ -198,7 +203,9 @@ class StepDetector:
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
-        v, q and j are as in `_step_log_ratios`; the sum is M in the module's docstring.
+        A term is the likelihood ratio of a step to no step, for a prior variance v of the step (`SIZES`), a variance q
+        of the random walk (`WALKS`) and an onset j, times the posterior probability of q without a step, over the
+        numbers of v and of `PARTS`. It is 0, and its logarithm -inf, for a step down.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))

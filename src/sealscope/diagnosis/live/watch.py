@@ -504,9 +504,10 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows in the last block's estimate by means over more blocks, which cover whole machine cycles.
+        """Replace the flows in the last block's estimate by means over more blocks, so as to average over cycles.
 
-        The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
+        The blocks are those since the tests began, which restart after a pause or a change of duty. After an alarm they
+        are those since the onset of the leak. At most the last `RECENT` are used.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):

@@ -206,8 +206,10 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        The prior scale of a step is a multiple of the scatter tau. A growth is a rise per month; its prior scale is
-        tau over a number of usual intervals between recordings. With `steps_only` there are no growths.
+        Each has several prior scales of its size, which are hypotheses of their own. Those of a step are multiples of
+        the scatter tau (`change.steps` in `priors.toml`). A growth is a rise per month; its scales are tau over several
+        times (`change.intervals`, multiples of the median interval of recordings). With `steps_only` there are no
+        growths.
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))
@@ -230,7 +232,7 @@ class _Changes(NamedTuple):
         """Build the single hypothesis of a growth that begins with the first recording.
 
         `profile` (n,) is the effect of a growth of unit size on each recording, and `scale` the prior scale of its
-        size.
+        size, in units of the scatter tau.
         """
         first = np.zeros(1, dtype=np.int64)
         return cls(
@@ -277,7 +279,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     what does not depend on tau (the wide priors on the level of each group and on the growth, and the prior on the
     covariate's coefficient), the levels have the covariance
 
-        shared + tau^2 (r C + (1 - r) I) + error^2 = L L'.
+        shared + tau^2 (r C + (1 - r) I) + diag(error^2) = L L'.
 
     Multiplied by L^-1, the levels become z, the profiles G, and the covariance of the levels with the level of the last
     group u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
@@ -403,10 +405,10 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw from the posterior distribution of hypothetical changes, given the leakage levels; the seed is fixed.
+        """Draw scatter, change, its size and the mean level before it from their joint posterior distribution.
 
-        `changes` are the hypotheses. The size of a change has a half-normal prior or, with `signed`, a flat prior on
-        either sign.
+        The distribution is conditional on the leakage `levels`. `changes` are the hypotheses, one of which is drawn.
+        The size of a change has a half-normal prior or, with `signed`, a normal one of either sign. The seed is fixed.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
