@@ -124,8 +124,10 @@ def _check_statistic(value: Any) -> Any:
 def _check_sums(summary: Any) -> Any:
     """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
 
-    Its terms must include the leak, and its arrays must have shapes that match the number of terms. The sums of
-    squares and products of leak and flow must obey Cauchy's inequality.
+    `terms` must include the leak. `sums` (E, m, m) holds sums of products of the columns of a balance in the recording.
+    The m columns are the terms and, as the last one, the left side, a flow. The leak's column and the left side must
+    have positive sums of squares, and their sum of products must obey Cauchy's inequality. The shapes of the other
+    arrays are checked, too.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -150,9 +152,9 @@ def _check_sums(summary: Any) -> Any:
 def _check_levels(summary: Any) -> Any:
     """Return a recording's summary of wavelet details if its `levels` and `duty` are valid; else raise ValueError.
 
-    `levels` are logarithms of the RMS of the pressures' wavelet details, `duty` describes how the machine is moved and
-    loaded (`RmsBlocks`). The length of `levels` must match the number of chambers, and that of `duty` the number of its
-    quantities. Their numbers are logarithms and must be below 750 in magnitude.
+    `levels` (5 per chamber,) are logarithms of the RMS of the pressures' wavelet details, and `duty` (4,) describes how
+    the machine is moved and loaded (`RmsBlocks`). At least one chamber must be named, and all numbers must be below 750
+    in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -166,8 +168,9 @@ def _check_levels(summary: Any) -> Any:
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
-    They have a row for each field of `Octaves`, of which the last, a variance, is not negative. They are logarithms of
-    RMS values, phases [rad] and the variances of these [rad^2]; all must be below 750 in magnitude.
+    `values` (4, k) has one column for each of k octaves. Its rows are the fields of `Octaves`: the logarithms of the
+    RMS of both channels, their phase [rad], and the variance of the phase's error [rad^2], which must not be negative.
+    All numbers must be below 750 in magnitude.
     """
     if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
@@ -242,7 +245,8 @@ _ABOUT = {
 def _restore_arrays(value: Any, name: str) -> Any:
     """Convert packed arrays in a parsed JSON value, at any depth, to numpy arrays.
 
-    `name` is the name of the value. Raises ValueError with the name of an array that cannot be restored.
+    A packed array is a table with the keys "shape" and "f8", where "f8" holds the bytes. `name` is the name of the
+    value. Raises ValueError with the name of an array that cannot be restored.
     """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:

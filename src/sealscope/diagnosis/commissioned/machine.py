@@ -97,7 +97,7 @@ class Origin(NamedTuple):
 
 
 def _format_date(moment: float) -> str:
-    """Format a time [s since 1970] as date, hour and minute."""
+    """Format a time [s since 1970] as date, hour and minute in UTC, such as "2024-05-31 07:30"."""
     return datetime.fromtimestamp(moment, UTC).isoformat(" ", "minutes").removesuffix("+00:00")
 
 
@@ -207,9 +207,9 @@ class CommissionedMachine:
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
-        A leak is open from its onset until the next repair. A later judgement "invalid" of the same alarm revokes the
-        confirmation. It does not if it concerns a new alarm of the same name, whose onset is after the first
-        judgement.
+        An alarm that was judged "valid" or "repaired" is a confirmed leak. It is open from its onset until the next
+        repair. A later judgement "invalid" of an alarm with the same name revokes the confirmation, unless its onset is
+        after the time of the confirmation: it then concerns a new alarm.
         """
         for number, leak in enumerate(self.alarms, 1):
             is_revoked = any(
@@ -264,8 +264,8 @@ def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: flo
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
     """List the files of recordings at one or several paths, each a file or a folder.
 
-    In a folder, hidden files and files that Sealscope wrote are left out. Links that lead out of the folder are left
-    out with a warning. Raises InputError if no file remains.
+    In a folder, hidden files, notes, pages and pictures (`NO_RECORDINGS`), and results that Sealscope wrote, are left
+    out. Links that lead out of the folder are left out with a warning. Raises InputError if no file remains.
     """
     try:
         named_paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)

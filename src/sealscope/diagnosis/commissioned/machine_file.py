@@ -466,7 +466,9 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
 def _convert_tree(tree: dict[str, Any], place: str) -> dict[str, Any]:
     """Check the tables of a machine's file and convert their values, for example times to seconds.
 
-    Raises InputError if a value is not valid; `place` is the path of the file for the message.
+    `tree` holds all tables as read. Returns the converted tables `machine`, `map`, `healthy` and `alarms`, without the
+    rig's; `map` is absent if the file has none. Raises InputError if a value is not valid; `place` is the path of the
+    file for the message.
     """
     try:
         tables: dict[str, Any] = convert_type(_FILE, tree).model_dump(exclude_unset=True)

@@ -140,9 +140,10 @@ class MachineSummary:
 
 
 def _describe_rig(rig: Rig | None) -> str:
-    """Describe in one line what is stated of the machine: its rig, or else piston areas and pump displacement.
+    """Describe in one line the rig that is stated for a machine.
 
-    `rig`: None stands for a machine of which nothing is stated.
+    The text is the title of the rig. If only sizes are stated, it lists the stated ones of piston areas and pump
+    displacement. If none is stated, or `rig` is None, the text says that the size is not stated.
     """
     rig = rig or unstated_rig()
     if rig.states("cylinder.M_eq"):  # a whole rig is stated, not sizes alone
@@ -192,10 +193,12 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Describe a healthy recording for display, by name of the quantity.
+    """Collect figures of a healthy recording for display, by name.
 
-    The quantities are mean pressure difference, oil temperature, noise of each channel, units in the log, and
-    problems. Unknown ones are left out.
+    They are `pressure_bar`, the mean of abs(p_A - p_B) [bar]; `oil_degC`, the oil temperature [deg C]; `noise`, the
+    standard deviation of the noise of each channel, in the channel's unit; `log_units`, the unit of each channel in the
+    log; and `wrong`, a list of problems as texts. Unknown figures are left out. `inspection` is the check of the same
+    `recording`.
     """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
@@ -217,10 +220,12 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
 def summarise_machine(
     healthy: Sequence[SummarisedRecording], rig: Rig | None, left_out: Sequence[str] = ()
 ) -> MachineSummary:
-    """Summarise a machine's healthy recordings.
+    """Estimate the figures of a machine from the summaries of its healthy recordings.
 
-    `left_out` are recordings that could not be used, with the reasons; they become the first of the problems. Terms
-    and smallest leak are estimated from the recordings with a volume balance of the same terms as the first one.
+    The noise of a channel is the median over the recordings. The coefficients of the volume balance and the smallest
+    detectable leak are estimated from the recordings that allow a volume balance. Of these, a recording whose balance
+    has other terms than that of the first one is not used, and is listed as a problem. `left_out` are texts on
+    recordings that could not be used at all; they become the first problems. `rig` is None if nothing is stated.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -247,9 +252,10 @@ def summarise_machine(
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
     """Estimate the coefficients of a volume balance from all recordings together, and their scatter.
 
-    `sums` holds the Gram matrix (m, m) of each recording, i.e. the products of the columns of its equations, whose rows
-    are scaled to unit noise. `rig` and the recorded `channels` determine the equation. The scatter is the standard
-    deviation between recordings. Returns the estimates by the name of the term.
+    `sums` holds for each recording the Gram matrix (m, m): the products of the balance's columns, summed over rows that
+    are scaled to unit noise. The m columns are the terms and, as the last one, the left side. `rig` and the recorded
+    `channels` determine the terms. The scatter is the standard deviation of the estimates from single recordings.
+    Returns an estimate for each term with an unknown coefficient, by the name of the term.
     """
     equation = equations(rig, channels)[0]
     roles, units = ColumnRoles(equation), {term.name: term.unit for term in equation.terms}
@@ -265,10 +271,10 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 
 
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients of a volume balance by least squares, from the Gram matrix of the columns.
+    """Fit the coefficients x of a volume balance X x = y by least squares, as x = (X'X)^-1 X'y.
 
-    `gram` (m, m): products of the columns with each other, summed over the rows; `roles`: tells which column is the
-    left side; `columns`: indices of the c columns to fit. Returns the coefficients (c,).
+    `gram` (m, m): products of the balance's m columns with each other, summed over the rows; `columns`: indices of the
+    c columns in X; `roles`: tells which column is the left side y. Returns x (c,).
     """
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
@@ -277,10 +283,11 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
     `summaries` of the healthy recordings are by the detector `balance`; `channels` are the names of the recorded
-    channels. The leak is detected with the probability `power` (`priors.toml`). With the threshold of Student's t test
-    and the deviation of a healthy rise, it raises the leakage by
+    channels. The leakage of a recording is compared with the healthy mean by Student's t test. `deviation` is the
+    standard deviation of this difference for a healthy recording of a later day. The smallest leak, which is detected
+    with the probability `power` (`priors.toml`), raises the leakage by
 
-        rise = (threshold + normal quantile of `power`) deviation.
+        rise = (threshold of the test + normal quantile of `power`) deviation.
 
     More healthy days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
     """

@@ -104,8 +104,9 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
     """Estimate the leakage conductance of pump and piston together in the healthy recordings.
 
-    The result is None if fewer than two recordings have an estimate. A machine with a servo valve has several
-    balances and no estimate.
+    Mean and standard deviation are over the recordings. The lower end of the range is at least the largest conductance
+    divided by the effect of the warmest oil (`oil.warmest` in `priors.toml`). The result is None if fewer than two
+    recordings have an estimate. A machine with a servo valve has several balances and no estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:
@@ -119,7 +120,8 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    The result is None if the summary does not contain the sums of exactly one volume balance.
+    It is fitted by least squares to the sums of products in the summary, together with the other coefficients of the
+    volume balance. The result is None if there is no such summary, or if the rig has no or several volume balances.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:

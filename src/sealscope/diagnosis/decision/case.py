@@ -117,7 +117,11 @@ class Case:
         return probability_of(self.explanations, cause="external leak", data_kind=self._data_kind(alarm))
 
     def _data_kind(self, alarm: LeakTest) -> str:
-        """Return the kind of data (`Observable.data`) by which a test raised its alarm."""
+        """Return the kind of data (`Observable.data`) by which a test raised its alarm.
+
+        It is `RISE`, the difference from healthy recordings, if the alarm is from the comparison with them and leakage
+        is measured. Otherwise it is the kind of data that the judging detector tests for changes.
+        """
         is_rise = alarm.name == AGAINST and self.leak is not None
         return RISE if is_rise else self.judge.observables[0].data
 
@@ -210,12 +214,9 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
 
 def step_key(provider: str) -> str:
-    """Return the key by which the distribution of a detector's step test is stored, such as "volume balance: step".
+    """Return the key under which `HealthyNull` stores a detector's test for a step of the leak within a recording.
 
-    It is the distribution, in healthy recordings (`HealthyNull`), of the test for a step of the leak within a
-    recording.
-
-    `provider`: name of the detector.
+    It is the name of the detector, `provider`, and the word "step", such as "volume balance: step".
     """
     return f"{provider}: step"
 
@@ -223,7 +224,9 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    It is the test of the rarest of its observables that a leak changes; empty if a leak changes none of them.
+    The detector has a test for each of its observables. Of the tests of observables that a leak changes, the one with
+    the smallest p-value is taken; the result is empty if a leak changes none of them. The threshold is the score that
+    would have the allowed p-value if the score were proportional to log p.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

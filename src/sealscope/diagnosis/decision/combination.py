@@ -38,9 +38,10 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if a detector could use the recording, and states a verdict or a cause or has raised an alarm.
+    """Return True if a detector could use the recording and has decided.
 
-    An alarm is a score above the threshold.
+    It has decided if its verdict is `leak` or `no leak`, if it states the cause of a change, or if it has raised an
+    alarm, i.e. its score is above the threshold.
     """
     return evidence.usable and not evidence.abstains
 

@@ -123,10 +123,11 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 
 
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
-    """Return the cause of a leak: as the detector states it, unless other data exclude a part of it or add to it.
+    """Return the cause of a detected leak, such as "piston or pump leak".
 
-    An external leak that the data behind the `alarm` do not exclude is named with the piston and the pump. A leak of
-    the pump is left out if it was tested by an observable of its own and its probability is negligible.
+    It is "internal or external leak" if the data that raised the `alarm` do not exclude that oil leaves the circuit.
+    Otherwise it is the cause that the detector states (`leak.cause`), but "piston leak" in place of "piston or pump
+    leak" if the pump was tested separately and its leak has a negligible probability.
     """
     if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
         return "internal or external leak"

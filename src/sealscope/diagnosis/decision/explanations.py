@@ -104,16 +104,17 @@ def explain(
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of terms of the volume balance that describe a change worse than the best term.
 
-    The terms are alternative descriptions of the same residual. With the best term's log Bayes factor B and log
-    likelihood L, a term with the log likelihood l gets
+    The terms are alternative descriptions of the same residual. A term's log likelihood l is taken as the log Bayes
+    factor of the p-value that its detector states, i.e. without calibration by healthy recordings. With the log
+    likelihood L of the best term and its calibrated log Bayes factor B, each term gets
 
-        log factor = max(B - (L - l), 0).
+        log factor = max(B - (L - l) / (1 + 2 m L), 0),
 
-    Healthy recordings show how rare the best description is, but are too few to show which term is the best; for that
-    only the likelihoods in the judged recording count.
+    where m is the relative misfit of models (`explanation.misfit` in `priors.toml`). Healthy recordings show how rare
+    the best description is, but are too few to show which term is the best; for that only the judged recording counts.
 
-    `log_factors`: observables with their log Bayes factors. Those of other data than the balance's are returned
-    unchanged. Factors and differences are corrected for the misfit of the model (`_correct_for_misfit`).
+    `log_factors`: observables with their calibrated log Bayes factors, corrected for the misfit
+    (`_correct_for_misfit`). Those of other data than the balance's are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -151,8 +152,11 @@ class _Posterior(NamedTuple):
 def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> _Posterior:
     """Compute the log posterior of a set of events, up to a constant, and the kinds of data that the set explains.
 
-    `gains_of`: log Bayes factors of each event by its name, for each possible onset (`_possible_gains`). The best
-    onset of each event counts.
+        log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
+
+    The largest is over the events of the set. For the rise over healthy recordings, the negative factors of events
+    that contradict it are added. `gains_of`: log Bayes factors of each event, by its name, for each possible onset
+    (`_possible_gains`). Of all combinations of onsets the one with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -170,11 +174,11 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 def _possible_gains(
     event: Event, factors: Sequence[tuple[Observable, float]], rise: LeakRise | None
 ) -> Sequence[_Gains]:
-    """Compute an event's log Bayes factors by kind of data, for each possible time of its onset.
+    """Compute an event's log Bayes factors by kind of data, in one mapping for each possible time of its onset.
 
-    `factors`: observables with their log Bayes factors. The first mapping is for an onset within the recording. For a
-    leak, if `rise` is given, a second one is for an onset before the recording: such a leak explains only the leakage
-    above that of healthy recordings (the rise) and no other data.
+    `factors`: observables with the log Bayes factors of a change of them, against no change. The first mapping is for
+    an onset within the recording. For a leak, if `rise` is given, a second one is for an onset before the recording:
+    such a leak explains only the leakage above that of healthy recordings (the rise) and no other data.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -187,8 +191,10 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors of an event that begins within the recording, by kind of data.
 
-    `factors`: observables with their log Bayes factors. The event begins at the onset of the observable that it
-    explains best. Other observables count if they may have changed at the same time.
+    `factors`: observables with the log Bayes factors of a change of them, against no change. Of the observables that
+    the event affects, the one with the largest factor gives the time of the event. The others count if they may have
+    changed at the same time. Observables that the event changes only as a side effect count if other data support it.
+    For each kind of data the largest factor is returned, with the log odds of the prior on the size of the change.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     if not affected:
@@ -213,10 +219,11 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of the hypothesis that an observable has changed, against no change.
 
-    `chance`: probability that a healthy recording has at least its score. An increase of the leakage makes an
-    alternative to it, such as an external leak, seem to increase as well. Therefore such an observable has at most
+    `chance`: probability that a healthy recording has at least its score. An increase of the leakage beyond that of
+    healthy recordings (`rise`) makes an alternative to it, such as an external leak, seem to increase as well.
+    Therefore such an observable has at most
 
-        log factor = log factor of the leakage (`rise`) + log likelihood ratio of the alternative to the leak.
+        log factor = log factor of the rise + log likelihood ratio of the alternative to the leak.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -240,7 +247,8 @@ def log_bayes_factor(chance: float) -> float:
 def _coincide(observable: Observable, anchor: Observable) -> bool:
     """Return True if two observables may have changed at the same time, by the 95 % intervals of their onsets.
 
-    An observable without onset may coincide with any other.
+    Their onsets then differ by at most half the sum of the widths of these intervals. An observable without an onset
+    may have changed at the same time as any other.
     """
     if observable.onset is None or anchor.onset is None:
         return True

@@ -51,9 +51,10 @@ class HealthyNull:
         return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Correct the p-value `chance` that a detector states for a test by those that it stated for healthy machines.
+        """Correct the p-value `chance` that a detector states for a test, by those it stated for healthy recordings.
 
-        These are the `surprisals` of healthy recordings under the `key` of the test.
+        The corrected p-value is the sum over k of w_k chance^(1/lambda_k). lambda_k are possible mean surprisals of
+        healthy recordings, and w_k their posterior weights, given the `surprisals` under the `key` of the test.
         """
         weights, inflations = self._inflation(key)
         return min(float(weights @ np.exp(np.log(max(chance, np.finfo(float).tiny)) / inflations)), 1.0)
@@ -101,7 +102,8 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 def null_key(observable: Observable) -> str:
     """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
 
-    It consists of data and name, or of the data alone for a comparison with healthy recordings, which has no onset.
+    It consists of data and name. A comparison with healthy recordings, which has no onset, has a key without the name,
+    such as "rise: against", so that all comparisons by the same data share it.
     """
     return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
 

@@ -179,7 +179,7 @@ def _observable_text(other: OtherEvent) -> str:
 
 
 def _rarity_text(chance: float) -> str:
-    """State the p-value `chance` of a change in words, as one of so many healthy recordings, at most 10 000."""
+    """State the p-value `chance` of a change in words, as 1 in so many healthy recordings, at most 10 000."""
     count = f"{float(f'{1.0 / max(chance, 1e-4):.2g}'):,.0f}".replace(",", " ")
     return text_of("doubt", "rarity", count=count)
 

@@ -101,7 +101,8 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
     """Run a detector with those baseline recordings that it can use.
 
     `distrust`: reason why the pressures cannot be judged, None if they can. If the detector cannot use the recording,
-    or none of the given baselines, the report is empty and states the reason.
+    or none of the given baselines, the report is empty and states the reason. Without a baseline, the report is also
+    empty if a pressure does not move for some time; the volume balance, which needs no motion, is exempt from this.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -173,10 +174,11 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
     """Collect how improbable each test result is in the healthy recordings, as surprisals -log(chance).
 
-    They are the null distributions of the test results (observables) of all detectors. A test for a change within a
-    recording has one value from each healthy recording. The tests of one kind of data (`Observable.data`) that compare
-    recordings share a distribution: the largest surprisal of each healthy recording, compared with all others. With
-    `shut`, the results of the volume balance hold if valves cut the pump off at rest.
+    `chance` is the p-value that a detector states for a test result (observable). The result holds a list of surprisals
+    for each test of all detectors, as its null distribution. A test for a change within a recording has one value from
+    each healthy recording. The tests that compare recordings share one list for each kind of data (`Observable.data`):
+    each healthy recording is compared with all others, and its largest surprisal counts. With `shut`, surprisals of the
+    volume balance are those under the hypothesis that valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

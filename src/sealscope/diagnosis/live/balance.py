@@ -92,7 +92,10 @@ class BlockConductance(NamedTuple):
 
     @property
     def duty(self) -> tuple[float, float]:
-        """Logarithms of the mean pressure difference [Pa] and the mean flow [m^3/s]; finite even if these are 0."""
+        """Logarithms of the mean |p_A - p_B| [Pa] and of the mean flow that moves the piston [m^3/s].
+
+        They are finite even if these are 0.
+        """
         return math.log(max(self.pressure, TINY)), math.log(max(self.pump_flow, TINY))
 
 
@@ -149,9 +152,11 @@ def _estimate_leak(
 ) -> tuple[float, float, float, float]:
     """Estimate the leak's coefficient in one block of a volume balance.
 
-    `gram` (m, m) are the products of the balance's columns in the block. `column_order` (n + 2,) holds the indices of
-    these columns: n nuisances (terms other than the leak), the leak, and the left side. Other arguments and the result
-    are as in `coefficients.estimate_leak`.
+    `gram` (m, m) are the products of the balance's columns, summed over the `rows` equations of the block.
+    `column_order` (n + 2,) holds the indices of these columns: n nuisances (terms other than the leak), the leak, and
+    the left side. With `is_learned`, the block is also added to the sums in `model`, from which the nuisances'
+    coefficients are computed. Returns (w, w g, w s, w^2 V) for the estimate g, its precision w, the shift s of the
+    series of estimates and the variance V of g due to the nuisances (`coefficients.estimate_leak`).
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, rows, is_learned)  # type: ignore[no-any-return]
@@ -244,7 +249,12 @@ class LiveBalance:
             yield self._take_block(block)
 
     def _take_block(self, block: Blocks) -> BlockResult:
-        """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted."""
+        """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
+
+        The first `LEARNED` blocks are stored, and the last of them gives the conductances of all. The result is a
+        NotJudged until then, for a block with missing values or at standstill, and if several blocks have moved far
+        more than the usual ones: the coefficients are then learned anew.
+        """
         end = self._sample_times(block)[1]
         if not block.rows[0]:
             return NotJudged.with_count(end, "missing values")
@@ -292,17 +302,18 @@ class LiveBalance:
     def _relative_motion(self, block: Blocks) -> float:
         """Compute the motion of the machine in a block, relative to earlier blocks.
 
-        The measure is the mean square of the left side of the volume balance, i.e. of the measured volume
-        (`coefficients.relative_motion`).
+        It is the mean square of the left side of the volume balance, i.e. of the measured volume, in the block, divided
+        by the weighted mean over earlier blocks.
         """
         return relative_motion(float(block.gram[0, 0, -1, -1]), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, is_learned: bool = True) -> tuple[float, ...]:
         """Estimate the leak in a block from all volume balances of the machine together.
 
-        With the estimate g, its precision w, the shift s of the series of estimates, and the variance V of g due to the
-        other coefficients (`coefficients.estimate_leak`), returns (w, w g, w s, w^2 V), each summed over the balances.
-        With `is_learned`, the block also updates the other coefficients.
+        Each balance gives the estimate g with its precision w, the shift s that is subtracted from g to keep the series
+        of estimates continuous while the other coefficients improve, and the variance V of g due to the errors of these
+        coefficients. Returns (w, w g, w s, w^2 V), each summed over the balances. With `is_learned`, the block also
+        updates the other coefficients.
         """
         rows, equation_parts = float(block.rows[0]), zip(self._models, block.gram[0], self._column_orders, strict=True)
         results = [
@@ -395,7 +406,10 @@ def _split(blocks: Blocks) -> list[Blocks]:
 
 
 def size_error(rig: Rig) -> float:
-    """Return the relative standard error of flows that is due to the uncertain piston area or pump displacement."""
+    """Return the relative standard error of all flows that is due to the uncertain size of the machine.
+
+    The size is the one that scales the flows: the pump's displacement, or the piston area behind a servo valve.
+    """
     return float(getattr(INFERENCE.size, rig.circuit.flow_size))
 
 

@@ -75,10 +75,11 @@ def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
 
 @law
 def load_block(model: Any, gram: Any, column_order: Any) -> None:
-    """Copy the products of a volume balance's columns in one block to `model.block`, in the order of the model.
+    """Copy the products of a volume balance's columns in one block to `model.block` (n + 2, n + 2).
 
-    `model` is a `Coefficients`, and `gram` (m, m) holds the products. `column_order` (n + 2,) holds the indices of
-    these columns: n nuisances (terms other than the leak), the leak, and the left side.
+    `model` is a `Coefficients`, and `gram` (m, m) holds the products of all m columns. `column_order` (n + 2,) holds
+    the indices of the columns to copy, in this order: n nuisances (terms other than the leak), the leak, and the left
+    side.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
@@ -87,11 +88,16 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
 
 @large_law
 def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None:
-    """Add the products in `model.block` to the sums over earlier blocks, whose weight decreases.
+    """Add the products in `model.block` to the sums over earlier blocks, which lose weight exponentially.
 
-    `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0
-    to 1. Between blocks the leak may take a random step, with the variance of a block's estimate, or of any size if
-    `has_stepped`.
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `weight` the weight of the block, 0 to
+    1. The leak's coefficient is assumed to take a random step before each block, with the variance that a block's
+    estimate of it has or, if `has_stepped`, with an infinite one. The earlier value of the leak is therefore
+    eliminated. With the sums S, their column S_l of the leak and its diagonal element S_ll, and the block's products B,
+
+        S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
+
+    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out.
     """
     sums, block, size, leak = model.sums, model.block, len(model.block), len(model.block) - 2
     leak_column = model.matrix[0]  # a copy in free memory, as the sums change below
@@ -114,8 +120,10 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 def _solve(model: Any) -> None:
     """Solve the normal equations C x = r of a volume balance in place, for three right-hand sides r.
 
-    `model` is a `Coefficients` with n coefficients, whose `matrix[:, n:]` holds the right-hand sides. C (n, n) and
-    the first of them are computed here from the sums, with the leak's column eliminated.
+    The unknowns are the n coefficients other than the leak's. `model` is a `Coefficients`, whose `matrix[:, n:]` (n, 3)
+    holds the right-hand sides, which the solutions replace. C (n, n) and the first right-hand side are computed here
+    from the sums, with the leak's column eliminated: these products of the columns of the unknowns with each other and
+    with the left side of the balance give the least-squares estimate.
     """
     sums, leak = model.sums, len(model.matrix)
     n, left_side = leak, leak + 1  # indices of the leak's column and of the equation's left side
@@ -152,7 +160,8 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 def fit_coefficients(model: Any) -> None:
     """Compute a volume balance's coefficients other than the leak's, and the variance of its equations.
 
-    `model` is a `Coefficients` with the sums from which both are computed, and in which they are stored.
+    They are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, with the residual sum of
+    squares divided by the number of equations. Both are stored in `model`.
     """
     n = len(model.matrix)
     solution = model.matrix[:, n:]
@@ -167,10 +176,11 @@ def fit_coefficients(model: Any) -> None:
 
 @large_law
 def _learn_block(model: Any, rows: float, g: float) -> float:
-    """Add the products in `model.block` to the sums, update the usual noise, and return the block's weight.
+    """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
-    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in it.
-    The weight is below 1 if the residual variance is more than `JUMP`^2 times the usual one. If g differs from the
+    `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` the leak's coefficient in it. The
+    usual noise is the variance of an equation's residual, averaged over earlier blocks with fading memory. The weight
+    is 1, or `JUMP`^2 times the usual noise over the block's residual variance if that is less. If g differs from the
     earlier estimate by more than `JUMP` standard deviations, the leak has stepped and earlier blocks do not constrain
     it any more.
     """
@@ -230,8 +240,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
-    `square` is the sum of squares over the block's `rows` equations, and `numbers` holds the sums over earlier blocks
-    (`Coefficients`). Returns inf if only this block moved, and 1 if none moved.
+    `square` is the sum of squares over the block's `rows` equations. `numbers` (`Coefficients.numbers`) holds the same
+    sum and number of equations over earlier blocks. Returns inf if only this block moved, and 1 if none moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

@@ -203,8 +203,9 @@ def find_level_rise(
 def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     """Return the conductance before a leak began, and the range that it would have at time `t` [s] without the leak.
 
-    The range allows for colder and warmer oil, and widens from the onset on. After `shift` hours (`priors.toml`) it
-    spans from the coldest to the warmest oil.
+    The range, `low` to `high` of the result, allows for colder and warmer oil. It reaches from 1/r to r times the
+    conductance before, where r = warmest^(h / shift), h is the time since the onset [h] but at most `shift`, and
+    `warmest` and `shift` are in the table `oil` of `priors.toml`.
     """
     oil, hours, before = INFERENCE.oil, max(0.0, t - leak.onset_s) / 3600.0, leak.conductance_before
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
@@ -213,9 +214,10 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 
 
 def mean_flow(flows: Array, errors: Array) -> Flow:
-    """Average the flows of several blocks (n,) [L/min].
+    """Average the flows of n blocks (n,) [L/min]; return the mean and its standard error [L/min].
 
-    The standard error of the mean covers both their standard `errors` (n,) and their scatter.
+    The squared standard error is sum(errors^2)/n^2 + s^2/n, with the standard `errors` (n,) of the flows and the
+    standard deviation s of the flows between blocks, 0 for a single block.
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
@@ -244,8 +246,8 @@ class BaselineLearning:
     total : float
         Sum of their conductances [m^3/(s Pa)].
     flow : float
-        Sum over the blocks of the factor from a conductance to a flow, at the block's mean pressure [L/min per
-    m^3/(s Pa)].
+        Sum over the blocks of the factor from a conductance to a flow [L/min per m^3/(s Pa)], at the mean pressure
+        difference of each block.
     duty_low, duty_high : tuple of float, or None
         Smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s].
     group : list of float

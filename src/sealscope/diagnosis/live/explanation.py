@@ -45,10 +45,11 @@ UNKNOWN = RiseExplanation(is_leak=False)
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
     """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
-    `observables` are the quantities that were tested for a change. `data` is the kind of data that the leakage is
-    estimated from; changes in these data outside the interval `onset` [s] are ignored. `is_settled` is True if enough
-    blocks have followed to distinguish a leak to the outside from a sensor fault. The result is `UNKNOWN` if nothing
-    explains the increase yet.
+    `observables` are the results of tests for changes. `data` is the kind of data (`Observable.data`) that the leakage
+    is estimated from; changes in these data that began outside the interval `onset` [s] are ignored. `is_settled` is
+    True if enough blocks have followed to distinguish a leak to the outside from a sensor fault; before, only a leak
+    past piston or pump counts as a leak. The result is `UNKNOWN` if these data show no sufficiently rare change, or
+    none that the most probable events would cause.
     """
     names = ALARMING if is_settled else LEAK_EVENTS
     events = [event for event in load_events() if event.name in names]

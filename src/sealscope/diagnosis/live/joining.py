@@ -50,13 +50,14 @@ def format_ways(ways: Sequence[Sequence[str]]) -> str:
 def are_successive(steps: Any, rate: float) -> Any:
     """Test whether each sample directly follows the sample before it; False for a gap and for a copy.
 
-    `steps` are the times between neighbours [s], a number or an array, and `rate` is the sampling rate [Hz].
+    `steps` are the times between neighbours [s], a number or an array, and `rate` is the sampling rate [Hz]. A sample
+    follows directly if this time is 0.5 to 1.5 sampling intervals (`samples.follows` in `priors.toml`).
     """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
 
 def is_same_rate(rate: float, rate_before: float) -> bool:
-    """Test whether two sampling rates [Hz] are equal to within the usual error of a logger's rate."""
+    """Test whether two sampling rates [Hz] are equal to within 1 %, the usual error of a logger's stated rate."""
     return abs(rate / rate_before - 1.0) < _MAX_RATE_ERROR
 
 

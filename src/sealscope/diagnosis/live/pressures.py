@@ -139,7 +139,11 @@ class PressureEstimator:
         return True
 
     def _estimate_block(self, block: Recording) -> BlockResult:
-        """Estimate the leakage conductance in a block of samples, or return the reason for none."""
+        """Estimate the leakage conductance in a block of samples, or return the reason for none.
+
+        There is none at too low a sampling rate, with missing values, while the fit settles, if the model does not
+        describe the block, or if the standard error is above the prior standard deviation of the conductance.
+        """
         begin, end = float(block.t[0]), float(block.t[-1]) + 1.0 / block.rate
         if self._follower is None or block.rate < _MIN_RATE:
             return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")

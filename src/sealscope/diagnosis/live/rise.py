@@ -44,7 +44,8 @@ class LiveRise(NamedTuple):
     def log_chance(self) -> float:
         """Logarithm of the probability that a healthy machine reaches this score of the test or a higher one.
 
-        For a step it is an upper bound by Ville's inequality, -score/2.
+        For a step it is an upper bound by Ville's inequality, -score/2. For a level, whose score is a normal quantile,
+        it is log Phi(-score).
         """
         from scipy.special import log_ndtr
 
@@ -56,7 +57,10 @@ class LiveRise(NamedTuple):
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score of the test that a healthy machine exceeds with a probability of at most `chance`."""
+        """Return the score of the test that a healthy machine exceeds with a probability of at most `chance`.
+
+        It is -2 log(chance) for a step, and the normal quantile of 1 - chance for a level.
+        """
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))

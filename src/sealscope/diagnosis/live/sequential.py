@@ -97,9 +97,10 @@ class StepDetector:
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
         """Update the evidence of a step by the estimate `g` of the coefficient in the next block.
 
-        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e = g -
-        level be the innovation of the Kalman filter for a random walk, S its variance, and f the effect of a unit
-        step on it. Then for each walk and each possible onset, a += f e / S, b += f^2 / S and T += e^2 / S.
+        `begin` and `end` [s] are the limits of the block, and `deviation` is the standard error of `g`. Let e be the
+        innovation, i.e. g minus its prediction by the Kalman filter for a random walk, S its variance, and f the effect
+        of a unit step on it. Then for each size of the walk and each possible onset, a += f e / S, b += f^2 / S and T
+        += e^2 / S. The first block after `forget` only sets the level of the filter.
         """
         self._unit = self._unit or deviation
         g, variance = g / self._unit, (deviation / self._unit) ** 2
@@ -127,10 +128,10 @@ class StepDetector:
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the noise and the probabilities of the random walks after a block.
+        """Update the scale of the noise and the probability of each size of the random walk after a block.
 
-        Each of the q walks has a Kalman filter with an innovation e of variance S. `variance` (q, 1) is S, and
-        `square` (q, 1) is e^2 / S.
+        For each of the sizes, q in number, a Kalman filter has given the innovation e of the block (measured minus
+        predicted estimate) and its variance S. `variance` (q, 1) is S, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -162,10 +163,12 @@ class StepDetector:
             self._sums, self._onsets = self._sums[:, :, is_selected], self._onsets[is_selected]
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
-        """Compute the logarithm of the evidence that the coefficient has risen (e-value M of the module's docstring).
+        """Compute the logarithm of the evidence M that the coefficient has risen.
 
-        The result is minus infinity if no rise can have begun yet, or if a quick upper bound of log M is at most
-        `min_log_e`.
+        M is the sum over all possible onsets of the likelihood ratio of a step to no step, averaged over the size of
+        the random walk, the prior variance of the step and the part of the first block. In a healthy machine the mean
+        number of blocks until M exceeds A is at least A. The result is minus infinity if no rise can have begun yet,
+        or if a quick upper bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
@@ -188,7 +191,9 @@ class StepDetector:
         """Compute the log likelihood ratios (v, q, j) of a step of the coefficient against none.
 
         v is the prior variance of the step's size (`SIZES`), q the variance of the random walk in a block (`WALKS`),
-        and j the onset.
+        and j the onset. With the sums a, b and T over the n innovations since the onset, which `take` updates,
+
+            R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
         """
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
@@ -198,7 +203,9 @@ class StepDetector:
     def _log_terms(self) -> Array:
         """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
 
-        v, q and j are as in `_step_log_ratios`; the sum is M in the module's docstring.
+        A term is the likelihood ratio of a step to no step, for a prior variance v of the step (`SIZES`), a variance q
+        of the random walk (`WALKS`) and an onset j, times the posterior probability of q without a step, over the
+        numbers of v and of `PARTS`. It is 0, and its logarithm -inf, for a step down.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
@@ -207,7 +214,8 @@ class StepDetector:
     def rise(self) -> LiveRise:
         """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
 
-        Both are averages over the random walks, the onsets and the prior sizes, weighted by their probabilities.
+        Both are averages over the sizes of the random walk, the possible onsets and the prior variances of the step,
+        weighted by their posterior probabilities. The onset has a 95 % interval, and the size a standard deviation.
         """
         terms = self._log_terms()
         log_e = float(np.logaddexp.reduce(terms.ravel()))
@@ -246,9 +254,11 @@ class StepDetector:
 
     @property
     def noise(self) -> float:
-        """Variance of the estimates' prediction errors (innovations) over the variance that the estimates state.
+        """Variance of the estimates' prediction errors (innovations) over the variance that the Kalman filter predicts.
 
-        It applies to the random walk with a variance per block of a tenth of the first estimate's variance.
+        The filter is the one whose random walk has a variance per block of a tenth of the first estimate's variance.
+        The ratio is averaged over the blocks, with fading memory, and over `stated` more ones (`priors.toml`) with the
+        ratio 1.
         """
         walk = 3  # index in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))

@@ -128,8 +128,8 @@ class Watch:
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
         """Compute the false-alarm probability of a single test that is made once in `seconds`.
 
-        `test` is `STEP` or `LEVEL`; each has a fixed fraction of the stated rate of false alarms. Raises InputError
-        if no threshold can be set for this rate.
+        It is the fraction of the stated rate of false alarms that belongs to the `test` (`STEP` or `LEVEL`; fractions
+        in `priors.toml`), times `seconds`. Raises InputError unless it is 1e-12 to 0.05.
         """
         rate: float = self.false_alarms_per_1000_h
         fraction_of_alarms = getattr(_PRIORS, test)
@@ -192,10 +192,10 @@ class Watch:
         return decide_on_stream(measure, probability)
 
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Describe the detected `leak` in the form that the decision judges.
+        """Convert the detected `leak` to a LiveLeak, from which the verdict is decided (`decide_on_stream`).
 
-        If `leak` is None, the result describes the upper bound of an undetected leak. `estimator` states the
-        uncertainty of flows.
+        If `leak` is None, the result has a score below the threshold and the 95 % upper bound of an undetected leak.
+        `estimator` states the uncertainty of flows.
         """
         make_measure = partial(
             LiveLeak,
@@ -395,10 +395,11 @@ class Watch:
         return False
 
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
-        """Find the cause of an increase of the conductance in the blocks around it.
+        """Find the cause of the increase `rise` of the conductance, from changes of other quantities at its onset.
 
-        The cause is a leak if these blocks are no longer stored. If it is the start of the machine, or surely another
-        event, the tests restart and the event is counted.
+        These are tested in the stored blocks up to `block`, the present one. The cause is a leak if the blocks around
+        the onset are no longer stored, and unknown if too few blocks have followed. If it is the start of the machine,
+        or surely another event than a leak, the tests restart and the event is counted.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))
         if n_since < _EXPLANATION.shows:
@@ -420,10 +421,11 @@ class Watch:
         return explanation
 
     def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Test the mean of the last `GROUP` blocks against the healthy machine, and raise the alarm if it is higher.
+        """Test the mean conductance of the last `GROUP` blocks, and raise the alarm if it is too high.
 
-        The healthy mean is taken from the baseline or, until there is one, from the healthy recordings. Without either
-        there is no test.
+        It is too high if it is significantly above the mean of the healthy machine, given the scatter, and above the
+        lowest healthy value, increased for the warmest oil (`find_level_rise`). Healthy values are from the baseline
+        or, until there is one, from the healthy recordings. Without either there is no test.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
@@ -502,9 +504,10 @@ class Watch:
         return self._compared[is_after] if is_after.any() else self._compared[-1:]
 
     def with_cycle_means(self, estimate: BlockEstimate) -> BlockEstimate:
-        """Replace the flows in the last block's estimate by means over more blocks, which cover whole machine cycles.
+        """Replace the flows in the last block's estimate by means over more blocks, so as to average over cycles.
 
-        The blocks are those since an interruption, or since the onset of a leak, at most the last `RECENT`.
+        The blocks are those since the tests began, which restart after a pause or a change of duty. After an alarm they
+        are those since the onset of the leak. At most the last `RECENT` are used.
         """
         estimator = self._estimator
         if estimator is None or not (estimate.judged and len(self._compared)):
@@ -515,7 +518,9 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        The estimate is returned unchanged if no L/min are stated.
+        The leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is not added
+        if there is neither, nor the total flow if the `estimator` states only changes. The estimate is returned
+        unchanged if no L/min are stated.
         """
         if not estimator.litres:
             return estimate

@@ -87,7 +87,7 @@ class PhasePriors(PriorTable):
     - `error` [rad]: standard error of the phase that a filter of known cut-off frequency causes in an octave.
     - `scatter` [rad]: standard deviation of the phase between days.
     - `recordings`: the prior on the scatter weighs as much as this number of recordings.
-    - `uniform`: fraction of the phases that say nothing.
+    - `uniform`: fraction of the phases that may have any value and therefore say nothing.
     """
 
     error: float
@@ -100,7 +100,8 @@ class FilteredPriors(PriorTable):
     """Low-pass filter of one pressure, such as a clogged line of its sensor.
 
     - `lowest`, `highest` [Hz]: limits of the cut-off frequency.
-    - `noises`: possible fractions of the sensor's noise in the octave that has the least power per frequency.
+    - `noises`: possible values of the fraction of power that is noise of the sensor, in the octave with the least power
+      per frequency.
     """
 
     lowest: float
@@ -128,7 +129,12 @@ class ChargePriors(PriorTable):
 
 
 class ChangePriors(PriorTable):
-    """All tables of `inference/changes/priors.toml`, the assumptions on signals that a leak does not change."""
+    """All tables of `inference/changes/priors.toml`, the assumptions on signals that a leak does not change.
+
+    The last three are log-normal priors. `accumulator`: gas volume of the accumulator over the exponent of its
+    expansion [m^3]; `charge_fall`: fall of the charge pressure by an external leak [Pa/s]; `zero_drift`: drift of the
+    zero of a failing pressure sensor [Pa/s].
+    """
 
     features: SignalPriors
     levels: PressureLevelPriors

@@ -173,10 +173,10 @@ class GrowthPriors(PriorTable):
 
 
 class StepSize(PriorTable):
-    """Size of a change other than a leak past the piston, with a log-normal prior.
+    """Log-normal prior on the size of a change other than a leak past the piston, or on the volume of an accumulator.
 
-    - `size`: median size. It is in [m^3/s] for an external leak, [Pa] for free air, [Pa/s] for a drift, and relative
-      for a scale.
+    - `size`: median size. It is in [m^3/s] for an external leak, [Pa] for free air (its volume fraction times the
+      atmospheric pressure), [Pa/s] for a drift, [m^3] for an accumulator, and relative for a scale.
     - `spread`: standard deviation of the logarithm of the size.
     """
 

@@ -8,7 +8,7 @@ class LevelDeviation(PriorTable):
 
     - `volume_balance`: standard deviation over the usual level, for the volume balance.
     - `ringing`: standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing).
-    - `nodes`: number of standard deviations that are tried.
+    - `nodes`: number of values of the standard deviation, on a grid, over which results are averaged.
     - `freedom`: degrees of freedom of the prior.
     - `lasts`: fractions of the variance that are correlated over time, each equally likely.
     - `times` [d]: correlation times.

@@ -119,7 +119,8 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
     Both are described for `RmsBlocks`. `transformed` holds the wavelet details of each chamber, and `bounds` (n + 1,)
-    the numbers of the samples at which blocks begin and end.
+    the numbers of the samples at which blocks begin and end. If only one chamber is recorded, its pressure minus the
+    mean over the recording takes the place of the pressure difference.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -168,8 +169,9 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
     """Choose the sample numbers at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
     `inside` are the samples that do not depend on padding, `rate` is the sampling rate [Hz], and `cycle` the period
-    of the command [s], or None. A block is an integer fraction or an integer multiple of the cycle. If this gives too
-    many blocks, each block spans several whole cycles.
+    of the command [s], or None. The cycle is divided into equal parts of about the shortest allowed length, each of
+    which is a block; if the cycle itself is shorter, a block is several cycles. Without a cycle, a block has the
+    shortest allowed length. If there are too many blocks, they become longer and span whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = min_block_s = max(prior.seconds, prior.samples / rate)

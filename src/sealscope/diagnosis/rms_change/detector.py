@@ -56,7 +56,12 @@ class RmsChange:
         return None if frozen is None else f"{frozen} is constant"
 
     def learn(self, recording: Recording) -> Summary:
-        """Summarise a healthy recording: log RMS of details, duty (motion and load), chambers, rate and start."""
+        """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
+
+        Entries: `chambers`, the pressures that were used, without mostly clipped ones; `recorded`, all recorded chamber
+        pressures; `rate` [Hz]; `start_s` [s since 1970] or None; `levels` (5 per chamber,), the log RMS; and `duty`
+        (4,), features of how the machine is moved and loaded (`RmsBlocks.duty`).
+        """
         levels, duty = measure_levels(recording)
         return {
             "chambers": list(judged_chambers(recording)),
@@ -91,9 +96,10 @@ class RmsChange:
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
-    All quantities are assumed to change at one onset, which is found from the sum of their log likelihoods. `rate` is
-    the sampling rate [Hz], and `unused` are recorded columns that belong to no channel. If a quantity has too little
-    information, the report is empty and states the reason.
+    Each detail is tested for a step up and a step down, and reported with the more significant one. All are assumed to
+    change at one onset. It is found from the sum of the log likelihoods of the judged details (d2 to d4), without those
+    whose step has a p-value of 0.5 or more. `rate` is the sampling rate [Hz], and `unused` are recorded columns that
+    belong to no channel. If a detail has too little information, the report is empty and states the reason.
     """
     changes = dict[str, tuple[StepTest, float]]()  # likelier test of a step up or down, and the size of that step
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -155,8 +161,10 @@ def compare_summaries(
 ) -> tuple[tuple[Observable, ...], float]:
     """Test the RMS of every chamber pressure's wavelet details for a rise or fall against leak-free recordings.
 
-    `judged` and `summaries` are results of `RmsChange.learn`. Returns one observable for each detail, and the
-    smallest 95 % upper bound of an undetected change over all judged quantities (change of log RMS).
+    `judged` is the summary of the judged recording and `summaries` are those of the leak-free ones, by
+    `RmsChange.learn`; `chambers` are the pressures to compare. Returns the tests, one observable for each detail and
+    chamber, and the 95 % upper bound of an undetected change of the log RMS. It is the smallest of the bounds of the
+    judged details d2 to d4.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)

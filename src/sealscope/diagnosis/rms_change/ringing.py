@@ -33,8 +33,9 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 
         y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1).
 
-    Both results have the shape of `log_rms`; for d1 itself y is the log RMS, and w is 1. The product d3d4 changes as d3
-    and d4 together, with w = 1.
+    Both results have the shape of `log_rms`. For d1 itself y is the log RMS, and w is 1. For the product d3d4, whose
+    RMS changes about as the product of those of d3 and d4, y is its log RMS minus the terms log sqrt(S_j + E_1) of d3
+    and d4, and w is 1.
     """
     y, weight = np.array(log_rms), np.ones_like(log_rms)
     min_signal_fraction = RMS_PRIORS.walk.least
@@ -91,9 +92,9 @@ def estimate_rises(
     leak-free recordings and of the judged one [s], None if unknown. Returns the changes, one for each wavelet
     quantity, and the fractions of their energy that are not noise, (5 per chamber,).
 
-    The healthy values are modelled by a common mean, an effect of the duty, and an Ornstein-Uhlenbeck process over
-    time. The rate of this process is unknown. Its variance is the variance between sessions, which are separated by a
-    pause.
+    The values are modelled by a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck
+    process over time, which is independent between sessions, i.e. recordings separated by a pause. The variance of the
+    process is that between sessions (`priors.toml`), and its rate is unknown.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponents = np.array([vars(RMS_PRIORS.duty)[name] for name in DUTY])

@@ -80,7 +80,7 @@ class LeakReading:
     problem : str
         Reason why there is no level, else "".
     pump : float
-        Mean flow of the pump [m^3/s].
+        Mean flow of the pump [m^3/s]; by the volume balance only while the machine moves. nan without either method.
     size_error : float
         Relative standard error of flows due to the machine's sizes (displacement, piston area).
     sums : RecordingSums or None
@@ -197,8 +197,9 @@ def _balance_level(solution: RecordedBalance, machine: AssumedMachine) -> dict[s
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     """Make the prior on the standard deviation of the leakage level (`LeakReading.level`) between recordings.
 
-    `basis` is the method by which the levels were estimated, and `usual` the typical level. For the volume balance,
-    the standard deviation is proportional to it.
+    `basis` is the method by which the levels were estimated, and `usual` the typical level, in the unit of the levels.
+    The typical standard deviation is proportional to `usual` for the volume balance, and a constant for other methods
+    (`priors.toml`).
     """
     between = TREND.between
     if basis == "pressure response":

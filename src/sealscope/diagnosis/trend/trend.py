@@ -172,7 +172,11 @@ class Trend:
 
     @property
     def state(self) -> MachineState:
-        """State of the machine by NAMUR NE 107, as in a diagnosis of one recording."""
+        """State of the machine by NAMUR NE 107, such as "good".
+
+        It is a failure if the verdict is `leak` and the 95 % interval of the present leakage lies above the repair
+        limit.
+        """
         condition: str = self.verdict
         if self.verdict == LEAK and self.wear is not None and self.limit is not None:
             condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
@@ -385,7 +389,10 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count the compared recordings that were known to be healthy; at least 1."""
+    """Count the compared recordings among the first `trend.healthy` different recordings; at least 1.
+
+    These are known to be healthy. Of copies only the first is counted, and recordings left out do not count.
+    """
     digests = dict.fromkeys(point.digest for point in trend.points)  # copies count once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))
@@ -404,9 +411,9 @@ class _ConvertedLevels(NamedTuple):
 def _convert_levels(trend: Trend) -> _ConvertedLevels:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
-    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. The temperature is that
-    of the first recording. Levels are conductances [m^3/(s Pa)] or, for the ringing, logarithms of an RMS; the
-    difference of a logarithm from the healthy mean is converted to %.
+    The unit is L/min at the trend's pressure, or % of the mean level of the healthy recordings. Levels are conductances
+    [m^3/(s Pa)] or, for the ringing, minus the logarithm of an RMS, whose difference from the healthy mean, times 100,
+    is in %. If the oil temperature of every recording is known, conductances are converted to that of the first one.
     """
     compared = [trend.points[k] for k in trend.rows]
     t, group, value, error = (
@@ -433,8 +440,9 @@ def _convert_levels(trend: Trend) -> _ConvertedLevels:
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
     """Convert the repair limit to the increase of the leakage at which a repair is due, in the trend's unit.
 
-    `trend_units_per_level` is the factor from the level of a reading to that unit. None if the limit cannot be
-    converted.
+    `trend_units_per_level` is the factor from the leakage level of a recording, a conductance [m^3/(s Pa)], to that
+    unit. A limit stated as a creep speed corresponds to the conductance (speed times piston area) / (median pressure
+    difference). The result is None if the limit cannot be converted.
     """
     compared = [trend.points[k] for k in trend.rows]
     if trend.repair.kind == "flow" and trend.pressure is not None:

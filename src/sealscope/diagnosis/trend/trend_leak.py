@@ -102,13 +102,13 @@ def decide_trend(
     episode : Episode
         The period since the last repair, with its test.
     trend_units_per_level : float
-        Factor from the level of a reading to the trend's unit.
+        Factor from the leakage level of a recording (`LeakReading.level`) to the unit of the trend, L/min or %.
     pressure : float or None
-        Pressure difference at which L/min are stated [Pa], None if the levels are relative.
+        Pressure difference at which L/min are stated [Pa], None if the unit is %.
     interval : float
         Median time between two recordings [days].
     years : float
-        Mean time between false alarms [machine-years].
+        Mean time between false alarms [machine-years]. The allowed probability of a false alarm is `interval` over it.
 
     Returns
     -------
@@ -135,9 +135,11 @@ def _measure_leak(
 ) -> TrendLeak:
     """Describe the increase of the leakage since the last repair as a TrendLeak.
 
-    `wear` is the estimated state of the machine, and `chance` the probability of such an increase in a healthy machine.
-    The other arguments are as in `decide_trend`. The leak may be laminar or an orifice, so its flow is proportional to
-    the pressure to one of the powers `EXPONENTS`.
+    `points` are the recordings since the repair, `wear` is the estimated state of the machine, and `chance` the
+    probability of such an increase in a healthy machine. `trend_units_per_level` is the factor from a level
+    (`LeakReading.level`) to the unit of the trend, and `pressure` the pressure difference at which L/min are stated
+    [Pa], None if the unit is %. The leak may be laminar or an orifice, so its flow is proportional to the pressure to
+    one of the powers `EXPONENTS`.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -165,7 +167,9 @@ def _measure_leak(
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
     """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
 
-    The result is None if the chance is 0.5 or more, or if the upper bound of the increase is not positive.
+    Its mean is the estimated increase or, if that is 0, its upper bound; its standard deviation is the mean over the
+    normal quantile of 1 - `chance`. The result is None if the chance is 0, or 0.5 or more, or if the upper bound is not
+    positive.
     """
     from scipy.special import ndtri
 

@@ -116,8 +116,9 @@ class Levels:
         From the prior's `scale` and `freedom` f, and the n changes between neighbours in a group, it is
 
             sqrt((f v_prior + n v_changes) / (f + n)),    v_prior = scale^2 + mean of error^2,
+            v_changes = (1.4826 median of abs(change) / sqrt(2))^2.
 
-        where v_changes is the variance of a level that the median change corresponds to.
+        For independent normal levels v_changes is the variance of a level, as a change has twice that variance.
         """
         prior = self.prior
         # the step of two neighbours has twice the variance of one
@@ -130,6 +131,7 @@ class Levels:
     def average_neighbours(self, max_count: int = 240) -> Levels:
         """Average the levels of successive recordings in a group, so that about `max_count` levels remain.
 
+        Times and covariates are averaged, too; the standard error of an average is sqrt(sum of error^2) / number.
         This limits the computing time.
         """
         size = math.ceil(len(self) / max_count)
@@ -148,11 +150,15 @@ class Levels:
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     """Compute the part of each leakage level beyond the limit of outliers, which the fit of the wear subtracts.
 
-    It is 0 within the limit of `outlier` standard deviations (`priors.toml`) from the median of up to three levels
-    before. Beyond it, it is the distance from that median less the limit, with the sign of the distance. It is also 0
-    if the level before lies as far out on the same side. Returns two
-    variants, each (n,). The first treats each level as the latest one. The second is also 0 for the last level, and for
-    a level whose successor lies as far out on the same side.
+    The limit L is `outlier` (`priors.toml`) times the scatter of all earlier levels (`Levels.scatter`). With the
+    distance d of a level from the median of up to three levels before it in its group, the result is
+
+        sign(d) max(abs(d) - L, 0).
+
+    It is 0 for the first level of a group, and if the level before lies beyond the limit on the same side, as two such
+    levels are a change. Returns two variants, each (n,). The first treats each level as the latest one. The second is
+    for the whole series: it is also 0 for the last level of a group, and if the next level lies beyond the limit on the
+    same side.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -200,8 +206,10 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        The prior scale of a step is a multiple of the scatter tau. A growth is a rise per month; its prior scale is
-        tau over a number of usual intervals between recordings. With `steps_only` there are no growths.
+        Each has several prior scales of its size, which are hypotheses of their own. Those of a step are multiples of
+        the scatter tau (`change.steps` in `priors.toml`). A growth is a rise per month; its scales are tau over several
+        times (`change.intervals`, multiples of the median interval of recordings). With `steps_only` there are no
+        growths.
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))
@@ -224,7 +232,7 @@ class _Changes(NamedTuple):
         """Build the single hypothesis of a growth that begins with the first recording.
 
         `profile` (n,) is the effect of a growth of unit size on each recording, and `scale` the prior scale of its
-        size.
+        size, in units of the scatter tau.
         """
         first = np.zeros(1, dtype=np.int64)
         return cls(
@@ -271,7 +279,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     what does not depend on tau (the wide priors on the level of each group and on the growth, and the prior on the
     covariate's coefficient), the levels have the covariance
 
-        shared + tau^2 (r C + (1 - r) I) + error^2 = L L'.
+        shared + tau^2 (r C + (1 - r) I) + diag(error^2) = L L'.
 
     Multiplied by L^-1, the levels become z, the profiles G, and the covariance of the levels with the level of the last
     group u. `_Node` stores a = sum G^2 and b = sum G z up to each recording.
@@ -315,8 +323,9 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
 def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
     """Compute the log of the mean likelihood ratio of a change whose size delta has a half-normal prior.
 
-    `scale` is the scale k of the prior; `a` and `b` are terms of the ratio exp(b delta - a delta^2/2). Its mean over
-    delta is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)``.
+    A change of size delta has the likelihood ratio exp(b delta - a delta^2/2) to no change. With the scale k of the
+    prior, the argument `scale`, the mean over delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with
+    ``v = 1/(a + 1/k^2)``. The arguments are broadcast together.
     """
     from scipy.special import log_ndtr
 
@@ -347,8 +356,9 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
-    R [days] is the sum of the likelihood ratios of all possible changes, each times its waiting time (see the module).
-    The first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
+    R [days] is the sum over all possible changes of the likelihood ratio of the change to no change, times the time
+    between the recordings before and after the beginning of the change [days], at most `wait` (`priors.toml`). The
+    first `n_healthy` recordings are assumed unchanged. With `falls` the test is for a downward step instead. With
     `may_grow`, an even growth since the first recording does not count as a change.
     """
     if falls:
@@ -384,7 +394,8 @@ class _Draws(NamedTuple):
     """Random draws (d,) from the posterior distribution of a change of the leakage level.
 
     `tau` is the standard deviation between recordings, `change` the index of the drawn hypothesis in `_Changes`,
-    `amplitude` the size of the change, and `mean_before` the mean level before it.
+    `amplitude` the size of the change, i.e. of a step, or of a growth per month, and `mean_before` the mean level
+    before the change.
     """
 
     tau: Array
@@ -394,10 +405,10 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw from the posterior distribution of hypothetical changes, given the leakage levels; the seed is fixed.
+        """Draw scatter, change, its size and the mean level before it from their joint posterior distribution.
 
-        `changes` are the hypotheses. The size of a change has a half-normal prior or, with `signed`, a flat prior on
-        either sign.
+        The distribution is conditional on the leakage `levels`. `changes` are the hypotheses, one of which is drawn.
+        The size of a change has a half-normal prior or, with `signed`, a normal one of either sign. The seed is fixed.
         """
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
@@ -417,9 +428,10 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute the rise (d,) of the last recording's leakage level in each draw.
+        """Compute the rise (d,) of the last recording's leakage level above the mean level before the change.
 
-        `changes` are the hypotheses from which the draws were made.
+        There is one value for each of the d draws from the posterior distribution. `changes` are the hypotheses from
+        which they were made.
         """
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
@@ -528,9 +540,10 @@ def _days_to_limit(level: Array, growth: Array, limit: float) -> Array:
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the level and the scatter of recordings without a change.
+    """Estimate the mean leakage level and the scatter of recordings without a change.
 
-    Returns (mean level with the range of 95 % of such recordings, standard deviation between recordings).
+    Returns (mean level, standard deviation between recordings). The limits of the first contain 95 % of the levels of
+    single recordings, with their scatter and standard errors.
     """
     draws = _Draws.sample(levels, _Changes.from_profile(np.zeros(len(levels)), 1.0))
     error = float(np.mean(levels.error[levels.group == levels.group[-1]] ** 2))

@@ -181,7 +181,10 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """Cause that the verdict names, either of the leak or of another event; None if it names none."""
+        """Cause that the verdict names, either of the leak or of another event; None if it names none.
+
+        Causes in `LEAKS`, such as "piston leak", are named only with the verdict `leak`, and any other only without it.
+        """
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -214,8 +217,9 @@ class Diagnosis(Evidence):
     def is_baseline(self) -> bool:
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
-        The leakage is usual if at least 1 in 20 healthy recordings scores as high. The result is False also if an
-        undetected leak could make up the whole total leakage.
+        The leakage is usual if at least 1 in 20 healthy recordings scores as high in the comparison with healthy
+        recordings. The result is False without such a comparison, if a cause of a change is stated, or if an undetected
+        leak could make up the whole total leakage.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
@@ -227,7 +231,10 @@ class Diagnosis(Evidence):
 
     @property
     def rises_within(self) -> bool:
-        """True if the leakage probably rose within the recording, although no onset is stated."""
+        """True if the leakage probably rose within the recording, although no onset is stated.
+
+        In the test for a rise within the recording, fewer than 1 in 20 healthy recordings then score as high.
+        """
         step_test = self._find_test(WITHIN)
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 

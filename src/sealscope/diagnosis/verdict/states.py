@@ -84,7 +84,7 @@ def state_of(
 
 
 def find_separation(cause: str) -> str | None:
-    """Find the words for what separates a cause from a leak in `states.toml`; None if it has none."""
+    """Return the text of `states.toml` that tells how to distinguish a cause from a leak; None if there is no text."""
     words: str | None = _tables()["causes"].get(cause, {}).get("separates")
     return words
 
