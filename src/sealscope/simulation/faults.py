@@ -303,7 +303,10 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
     def build_effect(name: str, c_open: float) -> Effect:
-        """Build the effect on the throttle coefficient `name`, which is `c_open` with a fully open valve."""
+        """Build the effect on the throttle's flow coefficient `name`.
+
+        `c_open` [m^3/(s Pa^0.5)]: value of this coefficient with a fully open valve.
+        """
         c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:

@@ -146,9 +146,10 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum of amplitude 1 at times t [s].
+    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s].
 
-    Each harmonic has a random phase and `sensor.hum_harmonics` times the amplitude of the one before.
+    It is relative to the amplitude of the fundamental, harmonic 1. Each harmonic has a random phase and
+    `sensor.hum_harmonics` times the amplitude of the one before.
     """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)

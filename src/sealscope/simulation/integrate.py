@@ -371,7 +371,9 @@ def integrate(
 class _Integration:
     """The integration of one run with its inputs and settings.
 
-    `euler`: True if eq. (4.2) is taken as printed (`rk4_step`); `reached` [s]: time last reported to `progress`.
+    `euler`: True to advance the integral of the motor's speed error once a step, as eq. (4.2) is printed, instead of
+    with the other states (`rk4_step`); `rate` [Hz]: rate of the outputs; `reached` [s]: time last reported to
+    `progress`.
     """
 
     inputs: RunInputs

@@ -24,7 +24,8 @@ _MIN_SLOPE = 0.1
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| [m^3/s] of a leak at times t [s] under `dp` = p_A - p_B [Pa].
 
-    The flow of an orifice is linear in dp below about `dp_0` [Pa].
+    `t`, `dp` (n,). The flow is a G |dp| for a laminar leak and a C sqrt|dp| for an orifice, where a is the leak's
+    opening at t, 0 to 1. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 

@@ -56,7 +56,7 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C with the command and leak level of this test of chapter 5, which is one of them."""
+        """The tests of Appendix C with the command and leak level of this test of chapter 5; it is one of these."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
@@ -230,7 +230,8 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
 
-    A view is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
+    The views are the input and motion, the leak and the pressures, the wavelet details, and their windowed RMS. A view
+    is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
     """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
@@ -260,8 +261,9 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Compute the RMS of a chamber pressure's wavelet details in successive windows of `WINDOW_SIZE` samples.
+    """Compute the RMS of a chamber pressure's wavelet details in windows of 1000 samples that begin every 500 samples.
 
+    Windows that reach samples near the record's ends, where the wavelet's filters reach beyond it, are left out.
     Returns the centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)

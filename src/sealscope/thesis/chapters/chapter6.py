@@ -88,8 +88,8 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 def supply_flow(run: Trajectory) -> Array:
     """Compute the flow [m^3/s] from the supply into a servo valve without overlap, over time.
 
-    It is Q_A if the spool connects the supply with chamber A (spool position x_s > 0), else -Q_B, where Q_A flows into
-    chamber A and Q_B out of chamber B.
+    It is the flow Q_A into chamber A if the spool connects the supply with A (spool position x_s > 0), else the flow
+    -Q_B into chamber B.
     """
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
@@ -326,8 +326,9 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking, stiffness and energy of the pump-controlled and the valve-controlled rig over the leak.
+    """Compare the pump-controlled with the valve-controlled rig in a table over controllers and leaks.
 
+    The columns are tracking error, bandwidth, stiffness, electrical and hydraulic energy in a cycle, and efficiencies.
     Energy and stiffness are also drawn as a figure.
     """
     rigs = {"pump": RIG, "valve": VALVE_RIG}

@@ -95,7 +95,8 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
     """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
     The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
-    leak but with drifting parameters. Two more rows are for a rule that always fires and one that never does.
+    leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet, and the rate
+    with the leak minus that with drift alone. Two more rows are for a rule that always fires and one that never does.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},

@@ -112,7 +112,8 @@ class SheetClaim:
 def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
     """Format the fraction of the tests of a data sheet in which a rule fires, such as "35/41 = 85.4 % (71 to 94 %)".
 
-    A rule of Table 5.1 fires if the RMS of its wavelet details move as a leak should move them (`Rule`).
+    A rule of Table 5.1 fires in a test if the RMS of all its wavelet details of p_A fall and those of p_B rise from
+    the first to the second half (`Rule`). The limits in brackets are the 95 % interval.
     """
     return format_rate(rule.fires(sheet))
 

@@ -145,7 +145,7 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command with the thesis's solver and with a converged one; return both runs by solver.
+    """Simulate a command with the thesis's solver (RK4, 1e-4 s) and with a converged one; return both runs by solver.
 
     `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
     equations of the throttles.

@@ -158,7 +158,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw some quantities of a case over time, each with the thesis's solver and with a converged one.
 
-    `item.inputs` has the case and the names of the quantities.
+    `item.inputs` has the case of Table 4.2 or 4.3 and the names of the quantities, such as "p_A".
     """
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
