@@ -1,8 +1,8 @@
 """Changes of machine and instruments within a run.
 
-An `Effect` changes one number of the compiled laws or one parameter of an instrument over time; a `Hold` makes a
-sensor repeat a reading. Drifts (in this module) and faults (in `faults`) are lists of effects. The solver takes the
-machine's numbers as constant within short blocks of time.
+An `Effect` changes one parameter of the compiled model or of an instrument over time; a `Hold` makes a sensor repeat
+a reading. Drifts (in this module) and faults (in `faults`) are lists of effects. The solver takes the machine's
+parameters as constant within short blocks of time.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ _INSTRUMENT_SYMBOLS = {"noise", "hum", "offset", "gain_error", "scale_error", "c
 class Effect:
     """Change of one parameter of the machine or of an instrument over time.
 
-    `field`: name of a number in `RigNumbers`, or dotted name of an instrument's parameter; `change(t)`: addend (if
-    `additive`) or factor at times t [s]. Several effects on one parameter give (value + sum of addends) x product of
-    factors. The solver takes parameters as constant within blocks of time: `max_change` is the largest change of
-    `change` within a block, `min_block` [s] the shortest block, `breakpoints` are the times [s] at which `change`
-    jumps or changes its slope.
+    `field`: name of a parameter of the compiled model (`RigNumbers`), or dotted name of an instrument's parameter;
+    `change(t)`: addend (if `additive`) or factor at times t [s]. Several effects on one parameter give (value + sum of
+    addends) x product of factors. The solver takes parameters as constant within blocks of time. `change` must not
+    change by more than `max_change` within a block, unless the block would be shorter than `min_block` [s].
+    `breakpoints`: times [s] at which `change` jumps or changes its slope.
     """
 
     field: str
@@ -72,10 +72,10 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute one parameter at times t [s] by applying the effects to its value in the rig.
+    """Compute one parameter at times t [s] as (value in the rig + sum of addends) x product of factors.
 
-    `rig_value`: value of the parameter without effects; `field`: name of the parameter; `effects`: changes of
-    parameters over time, of which only those of this parameter are applied.
+    `rig_value`: value of the parameter in the rig, without effects; `field`: name of the parameter; `effects`: changes
+    of parameters over time, of which only those of this parameter are applied. Without any, `rig_value` is returned.
     """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
@@ -123,9 +123,9 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the extreme values of the model's parameters in a run, each of which the solver's step must resolve.
+    """Collect the sets of model parameters in a run that limit the length of the solver's step.
 
-    The parameters change during the run. A step that is short enough for each of the returned parameter sets is
+    The parameters change during the run by `effects`. A step that is short enough for each of the returned sets is
     short enough for the whole run. The first set is `base`, the parameters without effects. The others are the
     parameters just before and just after each breakpoint of a fast effect, such as a valve that switches
     (`min_block` below `SHORTEST_BLOCK`). Slow effects change the parameters too little to matter.
@@ -253,7 +253,7 @@ class Wander:
             raise InputError(f"a wander must have finite weights and last > 0 s, got {self}")
 
     def value_at(self, t: Array) -> Array:
-        """Compute the random walk, which is the change of a drifting parameter, at times t [s]."""
+        """Compute the random walk, which is the change of a drifting parameter, at times t [s]; 0 before t = 0."""
         phase = np.pi / self.duration * np.maximum(t, 0.0)
         change = np.asarray(self.slope / np.pi * phase)
         if self.weights:  # next term by sin(a + phase) = 2 cos(phase) sin(a) - sin(a - phase)
@@ -269,7 +269,7 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the walk so that its highest minus its lowest value is `size`; return a constant walk unchanged."""
+        """Scale the walk to a range (maximum minus minimum over its duration) of `size`; leave a constant one as is."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self
@@ -306,10 +306,10 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    `parameter`: bare or dotted name of a parameter of motor, pump, lines, cylinder, friction, oil or make-up; of a
-    sensor's noise, hum, offset, gain or scale error; or `friction` for all friction forces together. `absolute` must
-    be True for offsets, gain and scale errors and the load `F_l`, False for all others. Raises InputError for any
-    other parameter.
+    "value" is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of motor, pump, lines,
+    cylinder, friction, oil or make-up; of a sensor's noise, hum, offset, gain or scale error; or `friction` for all
+    friction forces together. `absolute` must be True for offsets, gain and scale errors and the load `F_l`, False for
+    all others. Raises InputError for any other parameter.
     """
 
     parameter: str
@@ -351,7 +351,10 @@ class ParameterDrift:
         breakpoints = self.shape.breakpoints()
 
         def build_effect(field: str, power: float) -> Effect:
-            """Build the change of the model parameter `field` by the drift, raised to `power` if it is relative."""
+            """Build the change of the model parameter `field`: factor (1 + drift)^power, or the drift as an addend.
+
+            It is an addend if the drift is absolute.
+            """
             if self.absolute:
                 max_change = _ABSOLUTE_MAX_CHANGES.get(field, math.inf)
                 return Effect(field, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)

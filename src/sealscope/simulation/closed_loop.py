@@ -21,8 +21,9 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
     """Find the fewest solver outputs per recorded sample for which every controller sample falls on an output.
 
-    `rate`, `controller_rate` [Hz]: sampling rates of recording and controller; `min_outputs`: lower limit of the
-    result. Raises InputError if no number of outputs suits both rates.
+    An output is a time at which the solver writes its results. `rate`, `controller_rate` [Hz]: sampling rates of
+    recording and controller; `min_outputs`: lower limit of the result. Raises InputError if no number up to 64 suits
+    both rates.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate
@@ -46,7 +47,7 @@ class Feedback:
     ) -> None:
         """Prepare a run of `duration` [s] on `rig` in which `controller` follows `target`.
 
-        `rate` [Hz]: rate of the solver's outputs; `seed`: seed of the noise in the measured pressures.
+        `rate` [Hz]: rate at which the solver writes its outputs; `seed`: seed of the noise in the measured pressures.
         """
         self._controller = controller
         self._spacing = round(rate / controller.rate)

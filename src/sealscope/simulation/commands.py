@@ -155,7 +155,10 @@ class Polyline:
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
-        """Find the time [s] at which the signal begins to rise above 0; infinity if it never does."""
+        """Find the time [s] of the last point before the first positive value, where the signal begins to rise above 0.
+
+        It is 0 if the first value is positive, and infinity if no value is positive.
+        """
         if not np.any(self.y > 0):
             return math.inf
         first_positive = int(np.argmax(self.y > 0))

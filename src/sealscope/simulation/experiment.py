@@ -74,9 +74,10 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 
 
 def check_circuit(rig: Rig) -> None:
-    """Check that a single-rod cylinder in a closed circuit has valves through which its rod can displace oil.
+    """Check that a single-rod cylinder in a closed circuit has pilot-operated check valves or a relief valve.
 
-    Raises InputError otherwise.
+    Its two chambers take up unequal volumes of oil; the difference must leave and enter the circuit through these
+    valves. Raises InputError otherwise.
     """
     cylinder, makeup = rig.cylinder, rig.makeup
     if not rig.circuit.pump_feeds_chambers:
@@ -334,7 +335,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Describe the experiment by plain values that a recording may contain.
+        """Describe the experiment by a dict of plain values, which the recording keeps as its provenance.
 
         Leaks, faults and drifts are left out, because a diagnosis must find them by itself.
         """

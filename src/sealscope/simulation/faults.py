@@ -106,7 +106,8 @@ class FaultRow:
     def _parse_value(self, groups: Groups) -> float:
         """Read the size of a fault from the named groups of its matched text.
 
-        The result is a size in SI units, a factor, or a fraction, whichever the text states.
+        A number with a unit is converted to SI units. "x3" and "+20 %" are factors, 3 and 1.2; "1 %" of a gain or of
+        air is a fraction, 0.01. Without a number the result is 1 for a fault stated by a factor, else 0.
         """
         if groups.get("size") is not None:
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
@@ -169,7 +170,7 @@ class Fault:
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
-        Raises InputError if this rig cannot have the fault.
+        Raises InputError if this rig cannot have the fault, because a part is absent or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
@@ -302,7 +303,10 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     initial_opening = line.open_A if fault.at == "A" else line.open_B
 
     def build_effect(name: str, c_open: float) -> Effect:
-        """Build the effect on the throttle coefficient `name`, which is `c_open` with a fully open valve."""
+        """Build the effect on the throttle's flow coefficient `name`.
+
+        `c_open` [m^3/(s Pa^0.5)]: value of this coefficient with a fully open valve.
+        """
         c_initial = c_open if initial_opening >= 1.0 else series_coefficient(c_open, c_line, initial_opening)
 
         def change(t: Array) -> Array:
@@ -320,10 +324,11 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
 
 
 def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
-    """Build the effects of a changing oil temperature on viscosity, density, bulk modulus and what depends on them.
+    """Build the changes of the model's parameters over time that a fault of the oil's temperature causes.
 
-    The conductances of laminar gaps are proportional to 1/viscosity, filter resistances and viscous friction to the
-    viscosity.
+    Viscous friction and filter resistances are proportional to the oil's viscosity, the conductances of the leaks of
+    pump and rod seals to 1/viscosity. Bulk modulus and density depend on the temperature, and parameters that contain
+    the density change with it.
     """
     from sealscope.physics.fluid import thermal_density_ratio, thermal_stiffness_ratio
 

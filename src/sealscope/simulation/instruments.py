@@ -50,8 +50,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """Filter a signal against aliasing (`anti_alias_taps`), and return `n` samples of it, one in `factor` values.
 
-    `values` must continue for FILTER_REACH samples after the last returned one. Before their beginning the signal
-    is taken as constant. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not
+    `values` must continue for FILTER_REACH x `factor` values after the last returned one. Before their beginning the
+    signal is taken as constant. `delay` >= 0: lag of the samples behind the signal in intervals of `values`, not
     necessarily whole.
     """
     if factor == 1 and delay == 0.0:
@@ -86,9 +86,9 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
     """Compute the samples (n,) of a signal that a clock with jitter takes.
 
-    `sample(values)` takes the samples (n,) with a clock without jitter. `lateness` (n,): delay of each sample in
-    intervals of `values`, -1 .. 1, or None for no jitter. The signal is interpolated by a parabola through three of
-    its values.
+    `sample(values)` takes the samples (n,) of a signal with a clock without jitter; `values` (any length) is the
+    signal. `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, or None for no jitter. The signal
+    is interpolated by a parabola through three of its values.
     """
     center = sample(values)
     if lateness is None:
@@ -127,7 +127,7 @@ def read_pressure(
 
     Applied in this order: gain; offset, drift, hum, noise of the channel and `common_noise` [Pa], added; saturation;
     conversion to digits; stuck samples, which repeat a reading; and lost samples, which are NaN. `parameter(symbol,
-    value)` returns a parameter of the sensor over time from its `value` in the rig.
+    value)` returns a parameter of the sensor over time, which may change within the run, from its `value` in the rig.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -146,9 +146,10 @@ def read_pressure(
 
 
 def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Generator) -> Array:
-    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum of amplitude 1 at times t [s].
+    """Compute the sum of the harmonics 2 to `HUM_HARMONICS` of a mains hum at times t [s].
 
-    Each harmonic has a random phase and `sensor.hum_harmonics` times the amplitude of the one before.
+    It is relative to the amplitude of the fundamental, harmonic 1. Each harmonic has a random phase and
+    `sensor.hum_harmonics` times the amplitude of the one before.
     """
     orders = np.arange(2, HUM_HARMONICS + 1)
     phases = random.random(orders.size)

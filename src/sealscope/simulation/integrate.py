@@ -77,9 +77,10 @@ class Trajectory:
 
 
 class RunInputs:
-    """Inputs of a run over time: the voltage command, and the leakage coefficients G and C summed over all leaks.
+    """Inputs of a run over time: the voltage command, and the leakage coefficients summed over all leaks.
 
-    Under a position target the command is 0, because the controller sets the voltage (`Feedback`).
+    The coefficients are G [m^3/(s Pa)] of laminar leaks, Q = G dp, and C [m^3/(s Pa^0.5)] of orifices, Q = C sign(dp)
+    sqrt|dp|. Under a position target the command is 0, because the controller sets the voltage (`Feedback`).
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
@@ -103,9 +104,10 @@ class RunInputs:
         return self._check_and_clip(self._command.volts(t), t), *self._leakage(t)
 
     def max_leakage(self, t: Array) -> tuple[float, float]:
-        """Compute the largest leakage coefficients, summed over all leaks, at the times t [s].
+        """Compute the largest leakage coefficients that occur at the times t [s].
 
-        Returns the largest G [m^3/(s Pa)] and the largest C [m^3/(s Pa^0.5)].
+        Returns the largest G [m^3/(s Pa)], summed over the laminar leaks, and the largest C [m^3/(s Pa^0.5)], summed
+        over the orifices.
         """
         G, C = self._leakage(t)
         return float(G.max(initial=0.0)), float(C.max(initial=0.0))
@@ -158,7 +160,7 @@ def oversampling_of(rate: float, step: float) -> int:
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Compute the number of solver steps, each at most `step` [s] long, between two outputs at `rate` [Hz]."""
+    """Compute the fewest solver steps between two outputs at `rate` [Hz] for which none is longer than `step` [s]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))
 
 
@@ -201,9 +203,9 @@ def integrate_run(
 
 
 def _without_mean_leaks(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Return the leaks with the coefficient 0 for each one whose mean flow is stated instead.
+    """Replace the leaks of which a mean flow is stated by leaks with the coefficient 0; return all leaks.
 
-    The search for its coefficient starts at 0.
+    The search for their coefficients starts at 0.
     """
     return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
 
@@ -236,9 +238,10 @@ def run_with_sized_leaks(
     is_first_run = True
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
-        """Simulate the leaks with `coefficients` (n,); measure their mean flows [m^3/s] for coefficients of 1 (n,).
+        """Simulate the n leaks with `coefficients` (n,), and compute each leak's mean flow per unit of coefficient.
 
-        Also returns a pair of the leaks with these coefficients and the trajectory.
+        Returns the mean flows [m^3/s] (n,) that leaks with the coefficient 1 would have under the pressures of this
+        run, 0 for leaks without a stated mean flow. Also returns the pair of leaks with `coefficients` and trajectory.
         """
         nonlocal is_first_run
         pairs = zip(initial_leaks, coefficients, strict=True)
@@ -288,11 +291,12 @@ def integrate(
     a controller whose voltage replaces the command; `effects`: changes of the rig's numbers within the run
     (`Schedule`); `progress` is called with the time reached [s].
 
-    A stated `step` [s] is rounded down to a divisor of the output interval. If it is None, the longest step that
-    passes a check is taken, from `LONGEST_STEP` down to 1/`MAX_STEP_REFINEMENT` of it; the shortest is taken even if
-    it fails. The check integrates short windows of the run (`comparison_windows`) at half the step as well: no
-    pressure may change by more than `error` [Pa rms], and the RMS of no wavelet detail by more than 0.1 %
-    (`StepErrorCheck`). `error` None omits the check of a stated step.
+    A stated `step` [s] is rounded down to a divisor of the output interval. If it is None, ever shorter steps are
+    tried, from the longest one that resolves the rig, at most `LONGEST_STEP`, down to `LONGEST_STEP` /
+    `MAX_STEP_REFINEMENT`. The first step that passes a check is taken, or the shortest even if it fails. The check
+    integrates short windows of the run (`comparison_windows`) at half the step as well: no pressure may change by more
+    than `error` [Pa rms], and the RMS of no wavelet detail by more than 0.1 % (`StepErrorCheck`). `error` None omits
+    the check of a stated step.
 
     Raises InputError for a step or an error that is not positive; SimulationFailed if the step cannot resolve the
     rig, the leak or an end stop that was hit, if a stated step fails the check, if a pressure falls below vacuum, or
@@ -367,7 +371,9 @@ def integrate(
 class _Integration:
     """The integration of one run with its inputs and settings.
 
-    `euler`: True if eq. (4.2) is taken as printed (`rk4_step`); `reached` [s]: time last reported to `progress`.
+    `euler`: True to advance the integral of the motor's speed error once a step, as eq. (4.2) is printed, instead of
+    with the other states (`rk4_step`); `rate` [Hz]: rate of the outputs; `reached` [s]: time last reported to
+    `progress`.
     """
 
     inputs: RunInputs
@@ -382,9 +388,10 @@ class _Integration:
     reached: float = 0.0
 
     def refuse_unresolved(self, n_steps: int) -> None:
-        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig.
+        """Raise SimulationFailed if `n_steps` solver steps per output are too few to resolve the rig without its leaks.
 
-        The limit holds for the rig without its leaks. Nothing is checked if the experiment allows unresolved runs.
+        The step must be short enough for the rig's fastest oscillation and decay at all times of the run (function
+        `refuse_unresolved`). Nothing is checked if the experiment allows unresolved runs.
         """
         if not self.allow_unresolved:
             for p in self.schedule.numbers:
@@ -474,7 +481,9 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if solver steps of h [s] are too long to resolve a rig without its leaks.
 
-    `p`: the rig's numbers; `method`: rk4 or imex.
+    The step is too long if h exceeds 1/|lambda| of the rig's fastest oscillation or the stability limit of its fastest
+    decay (`longest_step`), throttles and end stops left out. With throttles and rk4, h must also stay below 2.785 /
+    (decay rate of the pressures across a throttle). `p`: the rig's parameters; `method`: rk4 or imex.
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -492,7 +501,8 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
-    `n_out`: number of outputs of the run; `rate` [Hz]: their rate.
+    They are the first 2 s of the run, and 1 s from 50 % and from 90 % of it on, unless such a window would overlap
+    another one or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz]: their rate.
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -526,11 +536,12 @@ class StepErrorCheck:
     def add_window(self, coarse: Array, fine: Array) -> float:
         """Compare a run with the one at half the step in one more window of time.
 
-        Returns the largest ratio of an error to its tolerance.
+        Returns the largest ratio of an error to its tolerance; the step is short enough if it is at most 1.
 
-        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The pressures are compared
-        within the window. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared over all
-        windows so far, at the recording's rate and with its noise added.
+        `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half of it. The error of a pressure is the
+        rms difference within the window, times `SAFETY`. The RMS of the db8 wavelet details d_1 .. d_4 of p_A and p_B
+        are compared over all windows so far, at the recording's rate and with its noise added. They are not compared
+        if the error of a pressure exceeds its tolerance.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)
@@ -556,9 +567,10 @@ class StepErrorCheck:
         return f"the RMS of a detail by {error:.3g} %, which must be <= {tolerance:.3g} %"
 
     def _add_detail_squares(self, coarse: Array, fine: Array) -> None:
-        """Add the squared wavelet details of both runs in a window to the sums over all windows.
+        """Add the squared wavelet details of p_A and p_B of both runs in a window to the sums over all windows.
 
-        Samples near the ends of the window, where the wavelet's filters reach beyond it, are left out.
+        `coarse`, `fine` (n, 4): the pressures, as in `add_window`. Samples near the ends of the window, where the
+        wavelet's filters reach beyond it, are left out.
         """
         import pywt
 

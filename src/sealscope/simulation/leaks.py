@@ -139,8 +139,9 @@ def parse_opening(groups: Groups) -> Polyline:
 def parse_leak(text: str) -> Leak | None:
     """Parse the text of a leak across the piston, such as "0.0042 L/min from 90 s"; return None for ``none``.
 
-    ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`, the mean flow at each time. Raises
-    InputError, which lists all forms, if the text has none of them.
+    ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`. The leak is then laminar: the largest
+    `q_leak` is its mean flow at full opening, and `q_leak` over this maximum is its opening, linear between the times.
+    Raises InputError, which lists all forms, if the text has none of them.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):

@@ -50,8 +50,9 @@ _STATES = {"omega": "rad/s", "theta": "rad", "x": "m", "v": "m/s"}
 class Truth:
     """The true leaks, faults, drifts and noise-free outputs of a run, which its recording does not contain.
 
-    `onset_s`: time [s] at which the first leak across the piston opens, None if none does; `mean_leak_lpm`: sum of
-    the leaks' mean flows while open [L/min]; `outputs`: outputs by name at the samples' times `t` [s].
+    `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first leak across the
+    piston opens, None if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`:
+    outputs by name at the samples' times `t` [s].
     """
 
     leaks: tuple[Leak, ...]
@@ -86,7 +87,8 @@ class Difference:
 class Proof:
     """Comparison of an experiment's run at a solver step with its run at half that step.
 
-    `step`, `halved` [s]: both steps; `method`: rk4 or imex; `differences`: the change of each quantity.
+    `step`, `halved` [s]: both steps; `method`: integration method, rk4 or imex; `differences`: the change of each
+    compared quantity (`compare_trajectories`).
     """
 
     method: str
@@ -109,7 +111,10 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the quantity whose difference between the two runs is largest relative to its tolerance."""
+        """Find the quantity whose difference between the two runs is largest relative to its tolerance.
+
+        Quantities without a tolerance are left out.
+        """
         limited_rows = [row for row in self.differences if row.tolerance]
         return max(limited_rows, key=lambda row: row.difference / (row.tolerance or math.inf))
 
@@ -123,9 +128,10 @@ class Run:
     proof: Proof | None = None
 
     def lines(self) -> list[str]:
-        """Describe the run in lines of text: solver and step, leaks with their mean flow, and other faults.
+        """Describe the run in lines of text: solver and step, each leak and fault, and the mean flow of the leaks.
 
-        Under a controller that reports it, the last line states the leakage flow that the controller compensates.
+        If a controller reports the leakage flow that it compensates, the last line states the mean of this flow over
+        the last second [L/min].
         """
         solver = self.recording.provenance["solver"]
         lines = [f"{solver['method']}, h = {solver['step_s']:.3g} s"]
@@ -243,8 +249,8 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Compute the differences between two runs of an experiment, one at a solver step and one at a shorter step.
 
-    There is one difference for the rms of each state and pressure, and one for the RMS of each wavelet detail of p_A
-    and p_B, noise included.
+    They are the rms differences of speed, angle, position and velocity (without a tolerance) and of the four pressures;
+    and the changes of the RMS of the wavelet details d1 to d4 of p_A and p_B, noise included.
     """
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms

@@ -24,7 +24,8 @@ _MIN_SLOPE = 0.1
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| [m^3/s] of a leak at times t [s] under `dp` = p_A - p_B [Pa].
 
-    The flow of an orifice is linear in dp below about `dp_0` [Pa].
+    `t`, `dp` (n,). The flow is a G |dp| for a laminar leak and a C sqrt|dp| for an orifice, where a is the leak's
+    opening at t, 0 to 1. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
@@ -36,11 +37,11 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:
-    """Compute the mean flow [m^3/s] that a leak has while it is open, for an opening of 1.
+    """Compute the mean flow [m^3/s] that a leak has while it is open, scaled to an opening of 1.
 
-    It is the sum of `flow` (n,), |Q_L| [m^3/s] at times `t` (n,) [s], over the sum of the leak's opening, 0 to 1: while
-    the leak grows, its flow counts in full, but the time only in proportion to the opening. It is 0 if the leak never
-    opens.
+    It is sum(flow) / sum(opening). `flow` (n,): |Q_L| [m^3/s] at the times `t` (n,) [s]; the leak's opening at these
+    times is between 0 (shut) and 1 (full). A leak that is half open has about half the flow, and its time counts half.
+    The result is 0 if the leak never opens.
     """
     opening = leak.opening.value_at(t)
     opening_sum = float(opening.sum())

@@ -61,7 +61,8 @@ class Force:
     """An additional load on the piston against +x: F = signal(t) + f(x) + g(v) [N].
 
     `words`: text of the load; `over_x`, `over_v`: the piecewise linear functions f of the piston's position x [m] and
-    g of its velocity v [m/s], as breakpoints; () for none.
+    g of its velocity v [m/s]; () for none. The pairs (a, b), (s_1, c_1), (s_2, c_2) .. mean a + b s + sum of c_k
+    max(s - s_k, 0), where s is x or v.
     """
 
     signal: Command
@@ -76,8 +77,9 @@ class Force:
     def tables(self) -> tuple[Array, Array] | None:
         """Build the tables of the load over position and over velocity that the compiled model takes.
 
-        Returns two arrays of breakpoints for `piecewise_linear_force`, first over position, then over velocity; a
-        table without a load is zero. Returns None if the load depends on time alone.
+        Returns two arrays (rows, 2) with the pairs of `over_x` and `over_v`, for `piecewise_linear_force`. If only one
+        of them states a load, the other array has the single row (0, 0). Returns None if the load depends on time
+        alone.
         """
         if not (self.over_x or self.over_v):
             return None
@@ -89,9 +91,10 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the numbers of a rig for the compiled model, including a load in addition to the rig's own.
+    """Build the parameters of a rig for the compiled model, including a load in addition to the rig's own.
 
-    `load`: the additional load, None for none.
+    `load`: the additional load, None for none. Its part over position and velocity is among the parameters; of its
+    part over time they only state that it exists.
     """
     from sealscope.physics.rig import rig_numbers
 
@@ -101,7 +104,7 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the state (14,) at t = 0 with the piston at rest at `x` [m].
+    """Compute the state (14,) of the compiled model at t = 0 with the piston at rest at `x` [m].
 
     `load`: load in addition to the rig's own, None for none.
     """
@@ -116,11 +119,11 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
 
 
 def breakpoints_through(s: Array, F: Array) -> Breakpoints:
-    """Convert points (s, F) of a load to the equivalent breakpoints of `piecewise_linear_force`.
+    """Convert points (s, F) of a load to breakpoints (s_k, c_k) of F_0 + sum of c_k max(s - s_k, 0).
 
-    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. Beyond the outer points the force is
-    constant. The first returned pair is (F_0, 0): the force and the slope before the first point. The others are
-    the pairs (s_k, change of the slope at s_k).
+    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. The force is linear between the points and
+    constant beyond the outer ones. The first returned pair is (F_0, 0): the force and the slope before the first point.
+    The others are the pairs (s_k, change of the slope at s_k), for `piecewise_linear_force`.
     """
     # the coefficient c_k of a breakpoint is the change of slope there
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])

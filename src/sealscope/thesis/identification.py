@@ -47,9 +47,9 @@ def noise_free_mean_squares(
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
     Returns the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4] as (chambers, 5). The pressures are
-    sampled at the rig's rate behind its anti-alias filter, over `ANALYSED` seconds after `SETTLING`. `leak`: leak as
-    text, for which the rig's leakage coefficient is found; `x_0` [m]: start of the piston; `values`: parameters that
-    override the test's. Raises the errors of the simulation.
+    sampled at the rig's rate behind its anti-alias filter, from 7.2 s on (`SETTLING`) for 4 pi s (`ANALYSED`). `leak`:
+    text of the leak, None for no leak; `x_0` [m]: start of the piston; `values`: parameters that override the test's.
+    Raises the errors of the simulation.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # d4 depends on 120 later samples
     values = {**experiment_values(condition), **(values or {})}
@@ -62,11 +62,11 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute the logarithm of the RMS of the wavelet details d1..d4 and d3d4 of pressures with white noise.
+    """Compute the natural logarithm of the RMS of the wavelet details d1..d4 and d3d4 of pressures with white noise.
 
-    `squares` (..., 5): mean squares m_1 to m_4 and m_34 of the details without noise; `sigma` [psi]: standard deviation
-    of the noise. Returns (..., 5): ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 +
-    sigma^4) / 2`` for the product d3d4.
+    `squares` (..., 5): mean squares m_1 to m_4 [psi^2] of the details and m_34 [psi^4] of their product d3d4 without
+    noise; `sigma` [psi]: standard deviation of the noise in the pressure. Returns (..., 5): ``log(m_j + sigma^2) / 2``
+    for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the product d3d4.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -90,7 +90,7 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     """Compare the rig's simulated leak-free RMS with the measured one in every test of Appendix C.
 
     Returns log(simulated/measured) as (tests, chambers, 5) for the wavelet details d1..d4 and d3d4. The rig is
-    simulated at its own sampling rate.
+    simulated at its own sampling rate. `sheet`: the measured data sheet.
     """
     group_squares = {}
     for command, closed_pct in groups():  # the number and the level have no effect
@@ -104,14 +104,14 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A possible difference between the real rig and the identified one.
+    """A possible difference between the real rig and the rig that was fitted to the tests of Appendix C.
 
-    The identified model is symmetric: both chambers ring alike, and a leak damps both. In Appendix C, however, d3 of
-    p_A falls with the leak while d4 of p_B rises. `overrides`: parameters in both halves of a test; `factors`:
-    factors of parameters in both halves; `leaking_factors`: further factors in the half with the leak; `x_0`,
-    `x_0_leaking` [m]: start of the piston in the half without and in the half with the leak; `extra_closing_B`:
-    fraction by which throttle B is closed further than A; `gain_B`: gain of the pressure sensor B; `law`: law of the
-    leak's flow, "laminar" or "orifice".
+    The fitted rig is symmetric: both chamber pressures ring alike, and a leak damps both. In Appendix C, however, the
+    RMS of the wavelet detail d3 of p_A falls with the leak while that of d4 of p_B rises. A test has a half without
+    and a half with the leak. `overrides`: values of parameters in both halves; `factors`: factors on parameters in
+    both halves; `leaking_factors`: further factors in the half with the leak; `x_0`, `x_0_leaking` [m]: start of the
+    piston in the half without and in the half with the leak; `extra_closing_B`: closed fraction of throttle B minus
+    that of A; `gain_B`: gain of the pressure sensor B; `law`: law of the leak's flow, "laminar" or "orifice".
     """
 
     name: str
@@ -134,7 +134,8 @@ def predicted_sheet(
 ) -> DataSheet:
     """Simulate the tests of Appendix C on a rig that is changed according to a hypothesis; return the data sheet.
 
-    Each of the `conditions` is simulated without and with its leak. The RMS are in psi, of d3d4 in psi^2.
+    `conditions`: the inputs of the tests, each of which is simulated without and with its leak. The sheet has the RMS
+    of the wavelet details in psi, of their product d3d4 in psi^2.
     """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
@@ -162,7 +163,10 @@ def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the parameters in which the identified rig differs from the thesis's rig, with their sources."""
+    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's rig, with their sources.
+
+    The columns are name, meaning, value in the thesis's rig, value in the fitted rig, and source.
+    """
     fitted, thesis_rows = load_rig(BENCH_RIG), {row.name: row for row in load_rig("thesis").table()}
     rows = [
         (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
@@ -174,9 +178,10 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail.
+    """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
-    Returns two tables: geometric means over all tests of Appendix C, and over the tests of each operating condition.
+    Returns two tables: geometric mean and geometric standard deviation over all tests of Appendix C, and geometric
+    means over the tests of each operating condition (command and closing of the throttles).
     """
     assert context.sheet is not None
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
@@ -196,10 +201,12 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well the rig under each hypothesis agrees with the measured data sheet.
+    """Tabulate how well the fitted rig, changed as each hypothesis says, agrees with the measured data sheet.
 
-    The columns are the ratio of the leak-free RMS, the mean change with the leak, and the number of tests in which
-    the change has the sign of the measured change. A quick reproduction simulates only the first two hypotheses.
+    For some wavelet details of each chamber the columns are: the geometric mean of simulated over measured leak-free
+    RMS; the geometric mean change of the simulated RMS with the leak [%]; and the number of tests in which this change
+    has the sign of the measured one. The first row is the measured sheet itself. A quick reproduction simulates only
+    the first two hypotheses.
     """
     assert context.sheet is not None
     sheet = context.sheet

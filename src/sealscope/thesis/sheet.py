@@ -39,7 +39,7 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 
 @dataclass(frozen=True)
 class Condition:
-    """The inputs of one test of Appendix C; `number` counts the tests from 1, in the order printed.
+    """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the order printed.
 
     `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak
     [L/min] after the bypass valve was opened; `level`: position of the bypass's needle valve, which does not
@@ -97,8 +97,9 @@ def mean_leaks() -> Array:
 class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
-    `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chambers "p_A" and "p_B" and the
-    wavelet details `QUANTITIES`; the tests are in the order of `APPENDIX_C`.
+    `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chamber pressures "p_A" and "p_B" and
+    the wavelet details "d1" .. "d4" [psi] and their product "d3d4" [psi^2]; the tests are in the order of
+    `APPENDIX_C`.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
@@ -134,7 +135,7 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
 
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
-    """Read the measured data sheet in `folder`; return it with a SHA-256 of its files.
+    """Read the measured data sheet in `folder`; return it with a SHA-256 digest of its two files.
 
     Raises UnreadableFile if a file cannot be read. Raises InputError if a column or a row is missing, or if a value is
     not a positive number (only the closing may be 0). It is also raised if command, closing, leak and level in row k
@@ -182,12 +183,10 @@ def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, 
 
 
 def _check_condition(row: dict[str, str], condition: Condition, path: Path) -> None:
-    """Check that a row of the data sheet states the same test as `condition`: command, closing, leak and leak level.
+    """Check that a row of the data sheet states the same test as `condition`; raise InputError otherwise.
 
-    The throttles are closed by the closing [%]; the leak is its mean flow [L/min], and the level the position of the
-    needle valve, such as "large".
-
-    Raises InputError otherwise.
+    Compared are the command, the closing of the throttles [%], the mean leak [L/min], and the leak's level, such as
+    "large". `path`: the file, for messages.
     """
     leak, amplitude, omega = (_parse_number(row, column, condition.number, path) for column in _POSITIVE_COLUMNS)
     closed = _parse_number(row, _CLOSED_COLUMN, condition.number, path, allow_zero=True)

@@ -13,8 +13,8 @@ from sealscope.recordings.recording import Array
 class SineFit(NamedTuple):
     """Result of `sine_fit`: complex amplitudes of the sines, linear trend, and residual.
 
-    `amplitudes` (k,): one for each sine; `slope` [unit of the signal/s]; `residual` (n,): the signal minus constant,
-    trend and sines.
+    `amplitudes` (k,): a_k of Re(a_k exp(i omega_k t)), one for each sine; `slope` [unit of the signal/s]; `residual`
+    (n,): the signal minus constant, trend and sines.
     """
 
     amplitudes: NDArray[np.complex128]

@@ -225,9 +225,9 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    It is the shortest step that error control finds for the first seconds of a few runs of the set. It is also no
-    longer than any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients;
-    `error` [Pa]: allowed rms error of a pressure.
+    For the first 4 s of up to four runs of the set, error control (`integrate`) finds a step short enough that halving
+    it changes no pressure by more than `error` [Pa rms]. The result is the shortest of these steps, and no longer than
+    any run of the set allows (`longest_allowed_step`). `coefficients` (runs,): leakage coefficients.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -238,10 +238,10 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 
 
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
-    """Compute the longest step [s] that resolves all runs of a set of experiments.
+    """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
 
-    `coefficients` (runs,): leakage coefficients. The result is no shorter than the shortest step that error control
-    tries.
+    `coefficients` (runs,): leakage coefficients, G [m^3/(s Pa)] of a laminar leak or C [m^3/(s Pa^0.5)] of an orifice.
+    The result is no shorter than the shortest step that error control tries.
     """
     from sealscope.physics.solvers.limits import longest_step
 

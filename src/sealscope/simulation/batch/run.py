@@ -55,18 +55,21 @@ class Member:
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """Extreme values of the model's parameters in the run, each of which the solver's step must resolve.
+        """The sets of model parameters in the run that limit the length of the solver's step.
 
-        The parameters change during the run. A step that is short enough for each of these parameter sets is short
-        enough for the whole run. They are the parameters without any change, and those just before and just after
-        each fast change, such as the switching of a valve.
+        The parameters change during the run. A step that is short enough for each of these sets is short enough for
+        the whole run. They are the parameters without any change, and those just before and just after each fast
+        change, such as the switching of a valve.
         """
         return step_limiting_parameters(self.effects, self.numbers)
 
 
 @dataclass(frozen=True)
 class ExperimentSet:
-    """Experiments that are integrated together: their laws, command waveform (`shape`), load and solver are equal."""
+    """Experiments that are integrated together: their laws, command waveform (`shape`), load and solver are equal.
+
+    Equal laws are equal choices of the rig, such as the law of friction; parameters may differ.
+    """
 
     members: tuple[Member, ...]
     shape: Command
@@ -80,7 +83,10 @@ class ExperimentSet:
 def refuse_unbatchable(experiment: Experiment, row: int) -> None:
     """Raise InputError for an experiment that cannot be part of a batch, with the rule that it breaks.
 
-    `row`: its index in the batch, for the message.
+    It must have a voltage command, at most one leak that opens abruptly or linearly, no fault of a sensor, no leak
+    while the oil's temperature changes, the integrator "state" of the motor, and no clock jitter. Its chamber pressure
+    sensors must have no lag, no harmonics of the hum, and no stuck or lost samples. `row`: its index in the batch, for
+    the message.
     """
     rig, leaks = experiment.rig, experiment.leaks
     violated_rules = []
@@ -130,7 +136,8 @@ def _split_command(command: Command) -> _ScaledCommand:
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
     """Group experiments into sets that can be integrated together: equal laws, waveform, load, solver settings.
 
-    Raises InputError if one of them cannot be in a batch, or if they differ in duration or sampling rate.
+    Laws are the choices of a rig, such as the law of friction; the waveform is the command without gain and offset.
+    Raises InputError if an experiment cannot be in a batch, or if they differ in duration or sampling rate.
     """
     from sealscope.physics.rig import CHOICES
 
@@ -232,7 +239,8 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     """Compute the model's parameters over time for a set of runs.
 
     Time is divided into cells in which the parameters are constant, so short that they change little from one cell
-    to the next. `n_out`: number of outputs of a run, at `rate` [Hz].
+    to the next (`block_bounds`). All runs have the same cells. `n_out`: number of outputs of a run, that is of times at
+    which the solver writes its results, at `rate` [Hz].
     """
     from sealscope.physics.rig import NUMBERS
 
@@ -263,8 +271,9 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
 def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
     """Build the table of the parameters of the instruments of p_A and p_B, for a span of samples.
 
-    Returns (runs, 2, INSTRUMENT_ROWS), for compiled code. Parameters that change within the run are taken as linear
-    from sample `first` to sample `last`.
+    Returns (runs, 2, INSTRUMENT_ROWS) for compiled code; the last axis has the quantities whose indices are constants
+    of `signals` (`GAIN` to `MAX_CODE`). Parameters that change within the run are taken as linear from sample `first`
+    to sample `last`.
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -308,7 +317,10 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
 
 
 class _Chunk(NamedTuple):
-    """A part of a run that is integrated at once: first_cell <= cell < end_cell, start <= output < stop."""
+    """A part of a run that is integrated at once: first_cell <= cell < end_cell, start <= output < stop.
+
+    A cell is a span of time with constant parameters, an output a time at which the solver writes its results.
+    """
 
     first_cell: int
     end_cell: int
@@ -461,7 +473,10 @@ class SetRun:
         return chunks
 
     def _readable_samples(self, stop: int) -> int:
-        """Count the samples that the anti-alias filter can compute once the outputs before `stop` are integrated."""
+        """Count the samples of the recording that the anti-alias filter can compute from the outputs before `stop`.
+
+        An output is a time at which the solver writes its results.
+        """
         if stop == self.n_outputs:
             return self.n_samples
         return min(max(0, (stop - self.taps_after - 1) // self.oversampling + 1), self.n_samples)
@@ -532,7 +547,8 @@ class SetRun:
         """Build the parameters of the pressure instruments for some groups of runs and a span of samples.
 
         The span is from sample `first` to sample `last`. Returns (groups, 2, INSTRUMENT_ROWS, width) for the groups
-        groups[0] <= g < groups[1] of `width` runs.
+        groups[0] <= g < groups[1] of `width` runs; the second axis is p_A and p_B, the third has the quantities of
+        `build_instrument_rows`.
         """
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
@@ -543,7 +559,7 @@ class SetRun:
     def _constant_sensors(self) -> Array | None:
         """The parameters of the pressure instruments of all groups of runs, (groups, 2, INSTRUMENT_ROWS, width).
 
-        None if any of them change within a run.
+        None if any of them change within a run. The axes are those of `_sensors`.
         """
         if any(member.experiment.readings().effects for member in self.experiment_set.members):
             return None

@@ -48,8 +48,8 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
     """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
-    `sensor`, `row`: parameters of the channel's instrument, see `convert_lanes`. The sine is computed as 2 sin a
-    cos a, with the phase 2 a.
+    It is a sine, computed as 2 sin a cos a from half its phase a. `sensor`: table of the parameters of the
+    instruments; `row`: index of the first of this channel's `INSTRUMENT_ROWS` rows in it.
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
@@ -71,9 +71,10 @@ def _read_pressure(
 ) -> Any:
     """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
-    `sensor`, `row`: see `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]:
-    drift of the offset so far; `sample`: number of the sample; `samples_since`: number of samples since the one for
-    which `sensor` was built.
+    `sensor`: table of the parameters of the instruments; `row`: index of the first of this channel's
+    `INSTRUMENT_ROWS` rows in it; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the
+    offset so far; `sample`: number of the sample; `samples_since`: number of samples since the one for which `sensor`
+    was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)

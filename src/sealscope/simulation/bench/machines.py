@@ -110,8 +110,8 @@ def _random_stream(seed: int, name: str) -> np.random.Generator:
 def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
     """Draw the course of a drift over `duration` [s]: linear with an end value of +-1, or a walk with a range of 1.
 
-    `shapes`: names of the courses to choose from, "linear" and "wander" (a random walk); `warms`: a linear course
-    rises instead of rising or falling at random.
+    The range is maximum minus minimum. `shapes`: names of the courses to choose from, "linear" and "wander" (a smooth
+    random walk); `warms`: a linear course always rises, otherwise it rises or falls at random.
     """
     shape = shapes[int(random.integers(len(shapes)))]
     rises = random.random() < 0.5 or warms
@@ -124,8 +124,8 @@ def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: f
 def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> Wander:
     """Draw the course of a parameter's drift: a mixture of the oil temperature's course and an independent one.
 
-    `drift`: range of the size, and weight of the oil temperature in the mixture; `oil`: course of the oil
-    temperature.
+    It is w oil + sqrt(1 - w^2) path, scaled to a range (maximum minus minimum) that is drawn uniformly from
+    `drift.size`. Here w is `drift.oil`, `oil` the course of the oil temperature, and path an independent course.
     """
     path = _draw_path(random, drift.shapes, oil.duration)
     # weights whose squares sum to 1, so that the mixture varies as much as either path
@@ -136,8 +136,8 @@ def _draw_drift(random: np.random.Generator, drift: DriftRange, oil: Wander) -> 
 def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str, float], list[ParameterDrift]]:
     """Draw the values of a nuisance, that is of one difference between machines, and its drifts.
 
-    Returns values by parameter, which are factors on the rig's values if the nuisance scales, and the list of drifts.
-    `oil`: course of the oil temperature, which drifts may follow.
+    Returns the values by parameter, and the list of drifts. A value is in SI units, or a factor on the rig's value if
+    `nuisance.scales`. `oil`: course of the oil temperature, which drifts may follow.
     """
     values: dict[str, float] = {}
     drifts: list[ParameterDrift] = []

@@ -85,9 +85,9 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a wavelet detail's RMS with the leak, over the mean leak of each test.
 
-    The points are the measured change, the simulated change, and the change simulated without a leak. One panel shows
-    it in the unit of the RMS, the other in %. `item.inputs` has the chamber, the detail and the direction in which the
-    detail should change.
+    The points are the measured change, the change simulated with the leak, and that simulated without any leak between
+    the two halves of a test. One panel shows the changes in the unit of the RMS, the other in %. `item.inputs` has the
+    chamber, the detail, and the direction in which a leak should change it ("down" or "up").
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

@@ -40,9 +40,10 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
     """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
 
-    Each entry `drifts` of `cases.toml` lists parameters and a range of relative sizes. One size is drawn uniformly from
-    this range, with a random sign, and all parameters of the entry step by it. `number`: number of the test; `half`:
-    time of the step, half the duration [s]; `draw`: index of the draw. Number and index are part of the seed.
+    Each entry under `drifts` in `cases.toml` lists parameters and a range of relative sizes. One size is drawn
+    uniformly from this range, with a random sign, and all parameters of the entry step by it. `number`: number of the
+    test; `half`: time of the step, half the duration [s]; `draw`: 0, 1, .. for different draws of one test. The random
+    numbers depend on `number` and `draw` only.
     """
     rng, drifts = np.random.default_rng([_SEEDS["drift"], draw, number]), load_texts("cases.toml")["drifts"].values()
     sizes = [rng.uniform(*drift["shares"]) for drift in drifts]
@@ -89,7 +90,10 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe what changes in the middle of a test: "leak opened", drifting parameters with factors, or "nothing"."""
+    """Describe what changes in the middle of a test: "leak opened", drifting parameters with factors, or "nothing".
+
+    A parameter that drifts is described as "NAME x FACTOR", with the factor on its value.
+    """
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -138,8 +142,8 @@ def make_row(
     """Build the row of a test in a table with the columns `COLUMNS`.
 
     `condition`: inputs of the test; `change`: description of what changes in the middle of the test; `mean_leak_lpm`:
-    mean leak [L/min]; `ranges_MPa`: range of p_A and of p_B without a leak [MPa]; `rms`: RMS of each wavelet detail in
-    the first and in the second half, by chamber and detail.
+    mean leak [L/min]; `ranges_MPa`: range of p_A and of p_B in the first half, before the leak opens [MPa]; `rms`: RMS
+    of each wavelet detail in the first and in the second half, by chamber and detail.
     """
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
@@ -152,7 +156,10 @@ def column(table: ThesisTable, head: str) -> Array:
 
 
 def parse_sheet(table: ThesisTable) -> DataSheet:
-    """Build the data sheet from a table of simulated tests, which has the columns `COLUMNS`."""
+    """Build the data sheet from a table with the columns `COLUMNS`: the RMS of the wavelet details of simulated tests.
+
+    The table has one row for each test, and both halves of a test in separate columns.
+    """
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 
@@ -187,7 +194,7 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def simulated_sheet(context: Context, runs: Runs) -> tuple[ThesisTable, DataSheet]:
-    """Read the simulated tests of Appendix C, which another part of the reproduction wrote: table and data sheet.
+    """Return the simulated tests of Appendix C as a table and as a data sheet, from a needed item of the reproduction.
 
     `runs`: kind of the tests by what changes in the middle of each: "leak" (a leak begins), "drift" (parameters of the
     rig step), or "no-leak" (nothing changes).

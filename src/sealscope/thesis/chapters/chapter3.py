@@ -41,8 +41,8 @@ class WaveletFunctions(NamedTuple):
 class WaveletCentre(NamedTuple):
     """Centre of a wavelet in time and in frequency.
 
-    `time`: centre of its energy, in the wavelet's unit of time; `frequency`: frequency at which its spectrum is
-    largest [1 per unit of time].
+    `time`: centre of its energy, in samples at scale 1; `frequency`: frequency at which its spectrum is largest
+    [cycles per sample].
     """
 
     time: float
@@ -69,15 +69,15 @@ class Spectrogram(NamedTuple):
 
 
 def mother_wavelet() -> WaveletFunctions:
-    """Compute the scaling function and the mother wavelet of db8 by the cascade algorithm."""
+    """Compute the scaling function and the mother wavelet of db8 over time in samples, by the cascade algorithm."""
     return WaveletFunctions(*discrete_wavelet(WAVELET).wavefun(level=10))
 
 
 def wavelet_spectrum(omega: Array) -> np.ndarray:
-    """Compute the Fourier transform of the mother wavelet db8 at `omega` [rad per unit of the wavelet's time].
+    """Compute the Fourier transform Psi of the mother wavelet db8 at `omega` [rad per sample at scale 1].
 
-    Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2), where H and G are the responses sum_k taps_k exp(-j w k) of
-    the synthesis filters, low-pass and high-pass. The wavelet has unit l2 norm.
+    Psi(w) = G(w/2)/sqrt(2) prod_(j>=2) H(w/2^j)/sqrt(2). H and G are the frequency responses sum_k taps_k exp(-i w k)
+    of the low-pass and of the high-pass synthesis filter. The wavelet has unit l2 norm.
 
     Source: Daubechies, Ten Lectures on Wavelets (1992), eqs. (5.1.17), (6.2.2).
     """
@@ -105,16 +105,20 @@ def wavelet_centre() -> WaveletCentre:
 
 
 def scales_for(frequencies: Array) -> Array:
-    """Compute the scales a [s] at which the wavelet db8 responds most to the given `frequencies` [Hz]."""
+    """Compute the scales a = f_c/f [s] at which the wavelet db8 responds most to the `frequencies` f [Hz].
+
+    f_c is the frequency at which the wavelet's spectrum is largest at scale 1.
+    """
     return np.asarray(wavelet_centre().frequency / np.asarray(frequencies, dtype=np.float64))
 
 
 def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
-    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6), with a sum over samples in place of
-    the integral. Here b is the middle of the wavelet (the centre of its energy). The record is mirrored at its ends.
-    Returns (scales, n) [unit of x times s^0.5].
+    CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, the
+    record is mirrored at its ends, and the integral is computed by Fourier transforms. The time b is that of the
+    wavelet's middle (the centre of its energy). Returns (scales, n), a column for b at each sample [unit of x times
+    s^0.5].
     """
     wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))  # db8 is 15 long at scale 1
     pad = min(x.size - 1, wavelet_reach)
@@ -136,9 +140,9 @@ def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
 
     gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da,
 
-    here over six decades of scales around the frequencies. With weight 2 the gain is the same at all frequencies (the
-    wavelet's admissibility constant), and dividing by it recovers the signal. Eq. (3.5) is printed with weight 0, for
-    which the gain falls as 1/w^2.
+    where Psi is the spectrum of the wavelet db8 and w = 2 pi f; the integral is over six decades of scales around the
+    frequencies. With weight 2 the gain is the same at all frequencies (the wavelet's admissibility constant), and
+    dividing by it recovers the signal. Eq. (3.5) is printed with weight 0, for which the gain falls as 1/w^2.
     """
     omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
     geometric_mean = float(np.exp(np.mean(np.log(omega))))
@@ -229,7 +233,8 @@ def wavelet_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def vanishing_moments(psi: Array, t: Array) -> int:
     """Count the vanishing moments of a wavelet `psi` (n,) over the time `t` (n,).
 
-    These are the integrals of t^k psi(t), k = 0, 1, ..., before the first one that is not 0; at most 20 are counted.
+    These are the integrals of t^k psi(t), k = 0, 1, ..., before the first one that is not 0, to within rounding; at
+    most 20 are counted.
     """
     k = 0
     centred = t - t.mean()  # smaller powers, the same number of vanishing moments
@@ -277,7 +282,8 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def _width(t: Array, values: Array) -> float:
     """Compute the width [s] of the largest peak of a series `values` over `t` [s].
 
-    It is the standard deviation of the energy around its centre, within 0.1 s of the maximum.
+    It is the standard deviation of the times around their mean, both weighted by `values` squared, within 0.1 s of the
+    maximum.
     """
     near_peak = np.abs(t - t[values.argmax()]) < 0.1
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
@@ -320,10 +326,10 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Compute the rms of each row of `rows` in successive blocks of `size` samples.
+    """Compute the rms of each row of `rows` (rows, n) in successive blocks of `size` samples.
 
-    Returns the middles of the blocks [s], and the rms (rows, blocks). Samples after the last whole block are left
-    out.
+    `t` (n,): times of the samples [s]. Returns the mean time of each block [s], and the rms (rows, blocks). Samples
+    after the last whole block are left out.
     """
     n_used = t.size // size * size
     block_rms = np.sqrt(np.mean(rows[:, :n_used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
@@ -331,12 +337,15 @@ def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge claims 3.1 to 3.6 on transforms, the wavelet, and the effect of a leak on the pressures."""
+    """Judge claims 3.1 to 3.6 on transforms, on the wavelet db8, and on the effect of a leak on the pressures."""
     return (*_fourier_claims(), *_wavelet_claims(), _leak_claim(context))
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2: the spectrum shows the amplitudes and the phases of the two tones of eq. (3.3)."""
+    """Judge claims 3.1 and 3.2 on the spectrum of the signal of eq. (3.3).
+
+    3.1: it has the amplitudes of the two tones and nothing else. 3.2: both tones are cosines, of phase 0.
+    """
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]
@@ -349,9 +358,10 @@ def _fourier_claims() -> Iterator[Claim]:
 
 
 def _wavelet_claims() -> Iterator[Claim]:
-    """Judge claims 3.3 to 3.5 on the wavelet.
+    """Judge claims 3.3 to 3.5 on the wavelet db8.
 
-    They concern its mean and energy, its energy at other scales, and the inverse transform.
+    3.3: its mean is 0. 3.4: its energy is 1, and stays 1 if it is scaled by eq. (3.6). 3.5: the inverse transform as
+    printed in eq. (3.5) has the same gain at 30 and at 100 Hz, within 1 %.
     """
     _, psi, t = mother_wavelet()
     step = float(t[1] - t[0])
@@ -372,7 +382,10 @@ def _wavelet_claims() -> Iterator[Claim]:
 
 
 def _leak_claim(context: Context) -> Claim:
-    """Judge claim 3.6: a leak lowers mean, peak and range of both chamber pressures by more than the noise."""
+    """Judge claim 3.6: a leak lowers mean, peak and range of both chamber pressures by more than the noise.
+
+    The limit is the standard deviation of a pressure transducer's noise (`visible_pressure`).
+    """
     experiments = (Experiment.of(command=_COMMAND, duration=40.0, leak=leak) for leak in (None, _LEAK))
     healthy, leaking = (context.run(experiment, prove=False) for experiment in experiments)
     is_settled = healthy.t > 10.0  # [s]

@@ -36,9 +36,10 @@ NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0
 class PrintedTest:
     """One of the ten leakage tests whose figures chapter 5 prints.
 
-    `section` of the thesis; `command`; `level` of the leak, such as "large"; `first_figure`: number of its first
-    figure; `n_input_figures`: number of figures with command, speed and displacement (2: whole test and close-up);
-    `half`: time [s] at which the leak opened, half the duration.
+    `section` of the thesis, such as "5.2a"; `command`: text of the command; `level` of the leak, such as "large";
+    `first_figure`: n in the number 5.n of its first figure; `n_input_figures`: number of its figures that show command,
+    speed and displacement, 0 to 2 (2: whole test and close-up); `half`: time [s] at which the leak opened, half the
+    duration.
     """
 
     section: str
@@ -55,7 +56,7 @@ class PrintedTest:
 
     @property
     def candidates(self) -> tuple[Condition, ...]:
-        """The tests of Appendix C with the command and leak level of this test of chapter 5, which is one of them."""
+        """The tests of Appendix C with the command and leak level of this test of chapter 5; it is one of these."""
         return tuple(row for row in APPENDIX_C if (row.command, row.level) == (self.command, self.level))
 
     @property
@@ -77,7 +78,10 @@ TESTS: dict[str, PrintedTest] = {row[0]: PrintedTest(*row) for row in load_texts
 
 
 def make_test_experiment(test: PrintedTest) -> Experiment:
-    """Build the experiment of a test on the rig fitted to Appendix C, with the leak open in the second half."""
+    """Build the experiment of one of the ten tests of chapter 5, with the leak open in the second half.
+
+    The rig is the one that was fitted to Appendix C.
+    """
     return leak_test(test.condition, test.half, test.condition.number)
 
 
@@ -121,7 +125,7 @@ class FigureView:
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
-        """Build two curves of `y` over `t` [s], one before and one after the leak opens.
+        """Build two curves of `y` over `t` [s] within the figure's interval, one before and one after the leak opens.
 
         If `t` is None, `y` is over the times of the recording.
         """
@@ -130,14 +134,18 @@ class FigureView:
         return [before, self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the part without the leak, after the start-up, and of the part with the leak."""
+        """Return (mask, label) of the part without the leak, after the start-up, and of the part with the leak.
+
+        The masks (n,) are over the samples of the recording.
+        """
         t, half = self.recording.t, self.test.half
         return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
 
     def draw_inputs(self) -> PanelsAndNumbers:
         """Draw command, motor speed and displacement of the test as three panels.
 
-        Also returns the RMS of the speed and the drift of the displacement, without and with the leak.
+        Also returns, without and with the leak, the RMS of the speed [rpm] and the drift [mm/s] of the displacement,
+        that is its linear trend.
         """
         recording = self.recording
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
@@ -197,7 +205,10 @@ class FigureView:
         return panels, self._rms_changes(_WINDOWED)
 
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
-        """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each."""
+        """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each.
+
+        The pressure is that of the figure's chamber, and each RMS is over one part of the test.
+        """
         numbers = []
         for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
             if name in names:
@@ -219,7 +230,8 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
     """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show each test in several views.
 
-    A view is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
+    The views are the input and motion, the leak and the pressures, the wavelet details, and their windowed RMS. A view
+    is drawn over the whole test or as a close-up of 20 s around the opening of the leak.
     """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
@@ -249,8 +261,9 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
-    """Compute the RMS of a chamber pressure's wavelet details in successive windows of `WINDOW_SIZE` samples.
+    """Compute the RMS of a chamber pressure's wavelet details in windows of 1000 samples that begin every 500 samples.
 
+    Windows that reach samples near the record's ends, where the wavelet's filters reach beyond it, are left out.
     Returns the centres of the windows [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)
@@ -264,10 +277,10 @@ def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict
 class LeakTestMeasures:
     """Measures of one simulated test of chapter 5; each pair is (without leak, with leak).
 
-    `rms`: RMS of the wavelet details, as in Appendix C; `speed`: RMS of the motor's speed [rad/s]; `drift`: drift of
-    the piston's mean position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s]; `range_MPa`: 5 to 95 % range
-    of each chamber's noise-free pressure; `step_s`: time [s], by chamber, at which a single step fits the windowed
-    RMS of d3 best.
+    `rms`: RMS of the wavelet details by chamber and detail, as in Appendix C; `speed`: RMS of the motor's speed
+    [rad/s]; `drift`: linear trend of the piston's position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s];
+    `range_MPa`: difference of the 95 % and 5 % quantiles of each chamber's noise-free pressure; `step_s`: by chamber,
+    the time [s] at which a single step fits the windowed RMS of d3 best, an estimate of the leak's onset.
     """
 
     test: PrintedTest
@@ -282,7 +295,8 @@ class LeakTestMeasures:
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
     """Estimate the time [s] at which a series `y` (n,) over `t` (n,) [s] changes its mean, by least squares.
 
-    The estimate is halfway between two points, with at least `min_points` points before and after it.
+    The mean is taken as constant before and after this time. The estimate is halfway between two points, with at least
+    `min_points` points on each side.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)

@@ -88,7 +88,8 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 def supply_flow(run: Trajectory) -> Array:
     """Compute the flow [m^3/s] from the supply into a servo valve without overlap, over time.
 
-    It is the flow through the open edge between supply and chamber A or B.
+    It is the flow Q_A into chamber A if the spool connects the supply with A (spool position x_s > 0), else the flow
+    -Q_B into chamber B.
     """
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
@@ -97,9 +98,9 @@ def supply_flow(run: Trajectory) -> Array:
 class ControlledRig:
     """A rig whose piston a controller positions, with a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
 
-    The rig's parameters differ from those that the controller assumes (`PLANT_MISMATCH`). `controller`: name of the
-    controller, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `rig`: name of the rig;
-    `values`: further parameters, as pairs (name, value).
+    The rig's friction and bulk modulus differ from those that the controller assumes (`PLANT_MISMATCH`). `controller`:
+    name of the controller, "" for none (open loop), "ideal" for a fault-tolerant one that knows the leak; `rig`: name
+    of the rig; `values`: parameters that override the rig's, as pairs (name, value in SI units).
     """
 
     controller: str
@@ -110,7 +111,8 @@ class ControlledRig:
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
         """Simulate the controlled rig for `duration` [s] under the load `LOAD` (2 kN) plus `load`.
 
-        `command`: text of a position target or, in an open loop, of a voltage command; `load`: text of a force.
+        `command`: text of a position target or, in an open loop, of a voltage command; `load`: text of a force against
+        positive x.
         """
         rig = _rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
@@ -130,9 +132,9 @@ class ControlledRig:
         return integrate_run(experiment, experiment.leaks)
 
     def run_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Simulate five cycles of the duty, a sine of the position; return the run and a mask of its last two.
+        """Simulate five cycles of the position sine `DUTY`; return the run, and a mask of its last two cycles.
 
-        `load`: load in addition to `LOAD`; the mask is over the samples of the run.
+        `load`: text of a load in addition to `LOAD`. The mask is over the outputs of the run.
         """
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
@@ -140,7 +142,8 @@ class ControlledRig:
     def stiffness(self) -> float:
         """Compute the dynamic stiffness |F/x| [N/mm] of the controlled piston at `STIFFNESS_FREQUENCY`.
 
-        The target is constant while the load varies as a sine of amplitude `STIFFNESS_FORCE`.
+        The target is constant while the load varies as a sine of 0.5 Hz and amplitude `STIFFNESS_FORCE`. The result is
+        this amplitude over that of the piston's motion at the same frequency.
         """
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
         run = self.run("position 0 mm sin(t)", 16.0, force)
@@ -150,8 +153,9 @@ class ControlledRig:
     def bandwidth(self) -> float:
         """Compute the frequency [Hz] at which the tracking error of small sines first exceeds -3 dB of the target.
 
-        It is interpolated between the tested frequencies `BANDWIDTH_FREQUENCIES`. Returns the lowest of these if the
-        error exceeds the limit there already, and inf if it exceeds it at none of them.
+        The error is |x/target - 1| of complex amplitudes, its limit 0.71. The target is a sum of sines of the tested
+        frequencies. The result is interpolated between the tested frequencies `BANDWIDTH_FREQUENCIES`. Returns the
+        lowest of these if the error exceeds the limit there already, and inf if it exceeds it at none of them.
         """
         frequencies = BANDWIDTH_FREQUENCIES
         terms = [f"{1e3 * BANDWIDTH_SPEED / (2 * math.pi * f):.6f} mm sin({2 * math.pi * f!r}t)" for f in frequencies]
@@ -187,8 +191,8 @@ class ControlledRig:
 class Tracking(NamedTuple):
     """Result of a run in which the piston follows a sine of the position (`DUTY`).
 
-    `error_mm`: rms error of the position; `energy_J`: electrical energy of the motor in a cycle; `compensated_lpm`:
-    mean leakage flow [L/min] that the controller compensates.
+    `error_mm`: rms error of the position [mm]; `energy_J`: electrical energy of the motor in a cycle [J];
+    `compensated_lpm`: mean leakage flow [L/min] that the controller compensates, 0 if it reports none.
     """
 
     error_mm: float
@@ -209,7 +213,7 @@ def tracking(run: Trajectory, mask: Array) -> Tracking:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking error, bandwidth, energy and stiffness of each controller over the size of the leak.
+    """Tabulate tracking error, bandwidth, energy, stiffness and compensated leakage over the leak, by controller.
 
     Error and stiffness are also drawn as a figure.
     """
@@ -251,7 +255,10 @@ def _figure_over_leak(
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers."""
+    """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers.
+
+    In the open loop a sine of the voltage moves the piston; the controllers are "pi" and "fault-tolerant".
+    """
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
 
@@ -299,7 +306,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column is the change [kPa] of the lower of both chamber pressures from the third to the fifth cycle.
+    The last column is the change [kPa] from the third to the fifth cycle of the cycle's mean of min(p_A, p_B), which
+    shows that the circuit loses oil. The leak's size is its flow at the mean pressure of its side without the leak.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -318,8 +326,9 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
 
 
 def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking, stiffness and energy of the pump-controlled and the valve-controlled rig over the leak.
+    """Compare the pump-controlled with the valve-controlled rig in a table over controllers and leaks.
 
+    The columns are tracking error, bandwidth, stiffness, electrical and hydraulic energy in a cycle, and efficiencies.
     Energy and stiffness are also drawn as a figure.
     """
     rigs = {"pump": RIG, "valve": VALVE_RIG}
@@ -337,9 +346,10 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Read a column of a table, given by its head, as values by the leak [L/min].
+    """Return the values in the column `head` of a table by the leak [L/min].
 
-    Only rows that begin with the cells `names` are read; the leak is in the next column. Empty cells are read as 0.
+    Only rows whose first cells are `names`, such as a controller's name, are read; the leak is in the next column.
+    Empty cells are read as 0.
     """
     n, k = len(names), table.columns.index(head)
     return {float(row[n] or 0.0): float(row[k] or 0.0) for row in table.rows if row[:n] == names}
@@ -351,7 +361,10 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _disturbance_claim(context: Context) -> Claim:
-    """Judge claim 6.2.1: if the position is fed back, a leak causes no drift."""
+    """Judge claim 6.2.1: if the position is fed back, a leak causes no drift.
+
+    The drift with the PI controller must be below 0.1 mm/min (`NEGLIGIBLE_DRIFT`) for each leak.
+    """
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
     rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]
@@ -363,7 +376,9 @@ def _disturbance_claim(context: Context) -> Claim:
 def _tolerance_claim(context: Context) -> Claim:
     """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness with a leak.
 
-    Without a leak it must have the tracking error of the PI controller, and compensate nothing.
+    With each leak, the tracking error may be at most 10 % larger, and the stiffness at most 10 % smaller, than those of
+    the PI controller without a leak. Without a leak it must have the tracking error of the PI controller, and
+    compensate nothing.
     """
     table = first_table(context, "sec-6.2-controllers")
     error, tolerant_error = (_column_by_leak(table, (name,), _ERROR) for name in ("pi", "fault-tolerant"))
@@ -381,7 +396,10 @@ def _tolerance_claim(context: Context) -> Claim:
 
 
 def _load_claim(context: Context) -> Claim:
-    """Judge claim 6.2.3: the largest tracking error over the loads differs between controllers."""
+    """Judge claim 6.2.3: the largest tracking error over the loads, without a leak, differs between controllers.
+
+    The largest of three controllers must exceed the smallest by more than a factor of 1.5 (`DISTINCT_RATIO`).
+    """
     table, error_ranges = first_table(context, "sec-6.2-load"), {}
     for name in LOAD_CONTROLLERS:
         errors = column(table, load_head(name, 0.0, _ERROR))
@@ -394,7 +412,10 @@ def _load_claim(context: Context) -> Claim:
 
 
 def _valve_claim(context: Context) -> Claim:
-    """Judge claim 6.2.4: pump and valve control differ in efficiency and in tracking error."""
+    """Judge claim 6.2.4: pump and valve control differ in efficiency and in tracking error.
+
+    With the PI controller and no leak, both must differ by more than a factor of 1.5 (`DISTINCT_RATIO`).
+    """
     table = first_table(context, "sec-6.2-valve")
     tests = []
     for head in ("efficiency against a damper [%]", _ERROR):

@@ -29,9 +29,9 @@ _Row = tuple[Cell, ...]
 class Rule:
     """A rule of Table 5.1, by which the RMS of some wavelet details indicates a leak.
 
-    It fires in a test if, with the leak, the RMS of all its details of p_A fall and those of p_B rise (`DIRECTION`).
-    `details`: (chamber, detail) pairs; `printed`: success rates [%] in the thesis, "" for a rule that it does not
-    claim.
+    It fires in a test, i.e. indicates a leak, if from the first half to the second, in which the leak is open, the RMS
+    of all its details of p_A fall and those of p_B rise (`DIRECTION`). `details`: (chamber, detail) pairs; `printed`:
+    success rates [%] that the thesis prints, "" for a rule that it does not claim.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Rule:
 
 
 def _load_rules(name: str) -> tuple[Rule, ...]:
-    """Load the rules in the entry `name` of `cases.toml`."""
+    """Load the rules by which details indicate a leak from the entry `name` of `cases.toml`."""
     return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
 
 
@@ -95,7 +95,8 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
     """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
     The sheets are the measured one (None if not given), and the simulated ones with leak, without leak, and without
-    leak but with drifting parameters. Two more rows are for a rule that always fires and one that never does.
+    leak but with drifting parameters. A row has the count, the rate and its 95 % interval on each sheet, and the rate
+    with the leak minus that with drift alone. Two more rows are for a rule that always fires and one that never does.
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -114,9 +115,10 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 def column_tests(sheet: DataSheet) -> list[_Row]:
     """Test each column of a data sheet, a chamber's wavelet detail, for a change with the leak by a sign test.
 
-    Returns rows of chamber, detail, number of tests with a fall and with a rise, geometric mean of the change [%],
-    p-value, corrected p-value, and "yes" if the latter is below 0.05, else "no". Holm's correction covers all ten
-    columns, since Table 5.1 chose among them.
+    Hypothesis of the two-sided test: in each test of the sheet the RMS falls or rises with probability 1/2. Returns
+    rows of chamber, detail, number of tests with a fall and with a rise, geometric mean of the change [%], p-value,
+    corrected p-value, and "yes" if the latter is below 0.05, else "no". Holm's correction covers all ten columns, since
+    Table 5.1 chose among them.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -131,9 +133,9 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
 def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> float:
     """Compute the change of log RMS that noise alone exceeds in 5 % of the tests (`FALSE_ALARMS`).
 
-    `either_side`: True to count changes of either sign, False for one sign. The threshold is ``1.645 rms(log change of
-    d1)``, or 1.960 times this rms for either sign. d1 is the finest wavelet detail of the pressure `chamber`, "p_A" or
-    "p_B". It is noise and does not depend on the leak, so its changes between the halves of a test are as in a rig
+    It is ``1.645 rms(log change of d1)`` over the tests of the sheet if changes of one sign count, and 1.960 times this
+    rms if changes of either sign do (`either_side`). d1 is the finest wavelet detail of the pressure `chamber`, "p_A"
+    or "p_B". It is noise and does not depend on the leak, so its changes between the halves of a test are as in a rig
     without a leak. The other details scatter at least as much.
     """
     change = sheet.log_change(chamber, "d1")
@@ -143,17 +145,18 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
     """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
 
-    `drift`: the sheet of tests simulated with drifting parameters and no leak. A change counts as positive in the
-    direction in which a leak should move the RMS, down for p_A and up for p_B (`DIRECTION`).
+    It is the 95 % quantile over the tests of `drift`, the sheet simulated with drifting parameters and no leak. Changes
+    count as positive in the direction in which a leak should move the RMS: down for p_A, up for p_B (`DIRECTION`).
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule on a single wavelet detail finds if a change must exceed a threshold.
+    """Count the leaks that each rule on a single wavelet detail finds if the change must exceed a threshold.
 
-    Returns rows with the columns `THRESHOLDS`. The threshold is `d1_threshold` on the measured sheet (None if not
-    given), and `drift_threshold` on the simulated sheet `leak`.
+    The threshold is set for 5 % false alarms: on the measured sheet (None if not given) by the scatter of d1
+    (`d1_threshold`), on the simulated sheet `leak` by the sheet `drift`, simulated without a leak but with drifting
+    parameters (`drift_threshold`). Returns rows with the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -171,10 +174,10 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
 
 
 def success_rate_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Build three tables on the success rates of Table 5.1.
+    """Build three tables on the success rates of Table 5.1, the fractions of tests in which a rule indicates the leak.
 
-    They are the table counted again, sign tests of all columns of Appendix C, and the rules of the table with
-    thresholds.
+    They are the rates counted again (`count_rules`), sign tests of all columns of Appendix C (`column_tests`), and the
+    rates of the same rules if a change must exceed a threshold (`count_with_thresholds`).
     """
     leak_runs, leak = simulated_sheet(context, "leak")
     no_leak, drift = (simulated_sheet(context, runs)[1] for runs in ("no-leak", "drift"))

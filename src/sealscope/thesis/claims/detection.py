@@ -15,7 +15,10 @@ from sealscope.thesis.engine.products import Claim, ThesisTable, Verdict
 
 
 def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
-    """Judge the claims on detection in the abstract and in chapters 1, 5 and 6; return them in the thesis's order."""
+    """Judge the claims on leak detection in the thesis's abstract and chapters 1, 5 and 6, in the order of the thesis.
+
+    They are judged by data sheets, measured tests and simulations (`gather_evidence`).
+    """
     evidence = gather_evidence(context)
     claims = (*sheet.leak_level_claims(), *sheet.claims(evidence), *sheet.curve_claims(evidence), *rig.claims(evidence))
     return tuple(sorted(claims, key=_claim_order))

@@ -37,8 +37,9 @@ class ClaimEvidence:
 
     `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
     `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting
-    parameters; `leak_table`: the runs of `leak_sheet`; `test_measures`: measures of the ten tests whose figures chapter
-    5 prints, by section; `no_leak_measures`: measures of test 5.2a without its leak.
+    parameters; `leak_table`: table of the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten
+    tests whose figures chapter 5 prints, by section, such as "5.2a"; `no_leak_measures`: measures of test 5.2a
+    simulated without its leak.
     """
 
     measured_sheet: DataSheet | None
@@ -78,9 +79,9 @@ SheetTest = Callable[[DataSheet], Iterable[Finding]]
 class SheetClaim:
     """A claim that is tested on a data sheet, measured or simulated.
 
-    `test`: yields the findings on a sheet, each a text and a True or False for each part of the claim; `head`,
-    `separator`: text before and between the texts of the findings; `values`: computes the values of placeholders in
-    the claim's other texts.
+    `test`: yields the findings on a sheet, each a text and a True or False for each part of the claim on which it
+    decides; `head`, `separator`: text before and between the texts of the findings; `values`: computes the values of
+    placeholders in the claim's other texts.
     """
 
     test: SheetTest
@@ -91,8 +92,9 @@ class SheetClaim:
     def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
         """Judge the claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
 
-        `id`: the claim's id; `kind`: key of the texts in `claims.toml` if the claim shares them with others, by
-        default `id`. Without a measured sheet the verdict is `cannot be tested`.
+        The simulated sheet has no influence on the verdict. `id`: the claim's id; `kind`: key of the texts in
+        `claims.toml` if the claim shares them with others, by default `id`. Without a measured sheet the verdict is
+        `cannot be tested`.
         """
 
         def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
@@ -110,46 +112,52 @@ class SheetClaim:
 def format_rule_rate(sheet: DataSheet, rule: Rule) -> str:
     """Format the fraction of the tests of a data sheet in which a rule fires, such as "35/41 = 85.4 % (71 to 94 %)".
 
-    A rule of Table 5.1 fires if the RMS of its wavelet details move as a leak should move them (`Rule`).
+    A rule of Table 5.1 fires in a test if the RMS of all its wavelet details of p_A fall and those of p_B rise from
+    the first to the second half (`Rule`). The limits in brackets are the 95 % interval.
     """
     return format_rate(rule.fires(sheet))
 
 
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format the number of tests that passed, as `k/n = rate % (low to high %)` with the exact 95 % interval."""
+    """Format the number of tests that passed, as `k/n = rate % (low to high %)` with the exact 95 % interval.
+
+    The interval is Clopper and Pearson's. `tests` (n,): True for each test that passed.
+    """
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def log_change_to_percent(change: Array | float) -> float:
-    """Convert a change of a logarithm to a relative change [%]; several changes are averaged first."""
+    """Convert a change c of a natural logarithm to the relative change 100 (exp(c) - 1) [%]; average several first."""
     return float(100.0 * np.expm1(np.mean(change)))
 
 
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the p-value of the sign test on each column of a data sheet, corrected by Holm for all ten columns.
+    """Compute the p-value of a two-sided sign test on each column of a data sheet, corrected by Holm's method.
 
-    Returns the p-values by (chamber, wavelet detail).
+    A column has the RMS of one wavelet detail of one chamber pressure. Hypothesis: the RMS rises or falls with the leak
+    with probability 1/2 in each test. The correction is for all ten columns. Returns the p-values by (chamber, detail).
     """
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
-    """Return True if the RMS of a wavelet detail moves significantly in the direction that the thesis states.
+    """Return True if the RMS of a wavelet detail changes with the leak significantly and as the thesis states.
 
-    The direction is down for p_A and up for p_B (`DIRECTION`). The detail must move so in most tests of the sheet,
-    with a corrected p-value below 5 % (`holm_p_values`).
+    It must fall in more tests of the sheet than it rises for p_A, and rise in more tests than it falls for p_B
+    (`DIRECTION`). The p-value of the two-sided sign test, corrected by Holm for all columns of the sheet, must be below
+    5 % (`holm_p_values`). `chamber`: "p_A" or "p_B"; `name`: the detail, such as "d3".
     """
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
 
 
 def is_correlated(r: float, n: int, controls: int = 0) -> bool:
-    """Return True if a correlation coefficient `r` of n points differs from 0 at the 5 % level.
+    """Return True if a correlation coefficient `r` of n points differs from 0 at the 5 % level (two-sided).
 
-    `controls`: number of columns on which both variables were regressed before, 0 for a plain correlation. Fisher's
-    z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
+    `controls`: number of columns on which both variables were regressed before, 0 for a plain correlation. Criterion
+    (Fisher's z): ``|artanh r| sqrt(n - 3 - controls) > 1.96``. Source: Fisher, Metron 3 (1924) 329-332.
     """
     z = np.arctanh(np.clip(r, -0.999999, 0.999999))  # clipped, as artanh(1) is infinite
     return bool(abs(z) * np.sqrt(n - 3 - controls) > WITHIN_95)
@@ -158,7 +166,8 @@ def is_correlated(r: float, n: int, controls: int = 0) -> bool:
 def condition_design() -> Array:
     """Build the design matrix (tests, commands + 1) of the operating conditions of Appendix C for a regression.
 
-    Its columns are an indicator of each command, and the closed fraction of the throttles.
+    Its columns are an indicator of each command (1 in tests with this command, else 0), and the closed fraction of the
+    throttles.
     """
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
@@ -166,9 +175,9 @@ def condition_design() -> Array:
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the correlation of `x` and `y` (n,) at equal `controls` (n, k).
+    """Compute the partial correlation of `x` and `y` (n,), given the k variables `controls` (n, k).
 
-    It is the correlation of their residuals after least squares on `controls`.
+    It is the correlation of the residuals of `x` and of `y` after least squares on `controls`.
     """
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
@@ -186,9 +195,10 @@ def leave_one_out_r2(columns: Array, y: Array) -> float:
 
 
 def change_design(sheet: DataSheet) -> Array:
-    """Build the design matrix (tests, 7) of a data sheet's changes for a regression.
+    """Build the design matrix (tests, 7) for a regression on the changes of the RMS with the leak.
 
-    Its columns are a constant and the log changes of the six wavelet details of Table 5.1.
+    Its columns are a constant, and log(RMS with leak / RMS without) of d3, d4 and d3d4 of p_A and of p_B, the wavelet
+    details of Table 5.1.
     """
     changes = [sheet.log_change(chamber, name) for chamber in CHAMBERS for name in SENSITIVE]
     return np.column_stack([np.ones_like(changes[0]), *changes])
@@ -197,9 +207,11 @@ def change_design(sheet: DataSheet) -> Array:
 def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "condition"]) -> tuple[float, float]:
     """Classify the halves of the tests as leaking or not by their RMS alone, without a baseline.
 
-    Returns the accuracy and the area under the ROC. The inputs are the log RMS of d1..d4 of both chambers. A logistic
-    regression with an L2 penalty of 1 on standardised columns is cross-validated: each time one test, or all tests of
-    one operating condition, are left out (`leave_out`). Raises MissingExtra if scikit-learn is not installed.
+    A test has a half without and a half with the leak. The inputs are the log RMS of d1..d4 of both chambers in one
+    half. A logistic regression with an L2 penalty (C = 1 of scikit-learn) on standardised columns is cross-validated:
+    each time both halves of one test, or of all tests of one operating condition, are left out and then classified
+    (`leave_out`). Returns the fraction of halves classified correctly, and the area under the ROC. Raises MissingExtra
+    if scikit-learn is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression

@@ -55,9 +55,10 @@ _CELLS = CLAIMED[:6]  # without the last, which has two details
 
 
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
-    """Find the tests in which the RMS of a wavelet detail changes by more than the noise (`d1_threshold`).
+    """Find the tests in which the RMS of a wavelet detail changes with the leak by more than noise would change it.
 
-    Only changes in the chamber's direction count, down for p_A and up for p_B. Returns a mask (tests,).
+    Only falls count for p_A, only rises for p_B. The limit is the change of log RMS that noise alone exceeds in 5 % of
+    the tests (`d1_threshold`). `name`: the detail, such as "d3". Returns a mask (tests,).
     """
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
@@ -65,8 +66,8 @@ def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
     """Format how often a rule of Table 5.1 fires in simulations without a leak, i.e. its false alarms.
 
-    The two simulations have constant and drifting parameters. A rule fires if the RMS of its wavelet details move as a
-    leak should move them (`Rule`).
+    The two simulations have constant and drifting parameters. A rule fires in a test if the RMS of all its wavelet
+    details of p_A fall and those of p_B rise from the first to the second half (`Rule`).
     """
     return (
         f"In simulation the rule fires in {format_rule_rate(evidence.no_leak_sheet, rule)} with no leak and in "
@@ -83,11 +84,11 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     chance, printed = 0.5 ** len(rule.details), [int(rate) for rate in re.findall(r"\d+", rule.printed)]
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that a rule's success rate is within one point of a printed one, and higher than by chance.
+        """Test that a rule's success rate is within one percentage point of a printed one, and higher than by chance.
 
-        Yields one finding with two results. The printed rates are the thesis's [%]; the success rate is the fraction of
-        the tests in which the rule detects the leak. Chance: the rate is tested against `chance`, at a p-value below
-        0.005.
+        The success rate is the fraction of the tests in which the rule detects the leak. By chance, each of the rule's
+        k details moves as a leak would move it with probability 1/2, which gives a rate of 1/2^k. The one-sided
+        binomial p-value must be below 0.05/10, for ten columns. Yields one finding with two results.
         """
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
@@ -120,9 +121,10 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
 
 
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.7: in most tests each wavelet detail moves opposite to the direction that section 5.6 states.
+    """Test claim 5.5.7: with the leak, the RMS of the wavelet details of p_A rise and those of p_B fall.
 
-    These directions are down for p_A and up for p_B (`DIRECTION`).
+    Each of d3, d4 and d3d4 of each chamber must do so in more than half of the tests. The rest of section 5.6 states
+    the opposite (`DIRECTION`).
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -132,13 +134,17 @@ def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.1: each rule of Table 5.1 detects the leak in more than 80 % of the tests."""
+    """Test claim 5.6.1: each rule of Table 5.1 detects the leak, that is fires, in more than 80 % of the tests."""
     for rule in CLAIMED:
         yield f"{rule.name} {format_rule_rate(sheet, rule)}", [bool(rule.fires(sheet).mean() > 0.8)]
 
 
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.2: at each level of the leak, d3 of p_A falls beyond the noise in at least 80 % of the tests."""
+    """Test claim 5.6.2: at each level of the leak, d3 of p_A falls beyond the noise in at least 80 % of the tests.
+
+    The levels are "large" to "extra-small". The RMS of the wavelet detail d3 falls beyond the noise if it falls by more
+    than noise alone makes it fall in 95 % of the tests (`d1_threshold`).
+    """
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
         level_exceeds = exceeds[[row.level == level for row in APPENDIX_C]]
@@ -189,8 +195,8 @@ def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
 def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
-    It reveals the leak if its RMS changes by more than the noise, down in p_A and up in p_B. The best detail is the
-    one that does so most often.
+    A detail reveals the leak if its RMS falls in p_A, or rises in p_B, by more than noise alone changes it in 95 % of
+    the tests (`d1_threshold`). The best of d3, d4 and d3d4 is the one that does so most often.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -201,8 +207,9 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
 def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
     """Format the success of detecting leaks without a baseline, for the texts of claim a.1.
 
-    The texts state accuracy and AUC of `classify_without_baseline`, with single tests and with whole operating
-    conditions left out. They say so if scikit-learn is not installed.
+    The texts are "tests" and "conditions": accuracy and area under the ROC of a cross-validated classifier, with single
+    tests and with whole operating conditions left out (`classify_without_baseline`). They say so if scikit-learn is not
+    installed. `evidence` is not used.
     """
     texts = {}
     groups: tuple[Literal["test", "condition"], ...] = ("test", "condition")
@@ -215,23 +222,27 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 
 
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format two results on the rule that d3 of p_A falls, for the texts of claim 5.6.1.
+    """Format two results on the rule that the RMS of d3 of p_A falls, for the texts of claim 5.6.1.
 
-    They are the rule's false alarms in simulation, and the rate of tests on the sheet in which d3 falls by more than
-    the noise.
+    They are "controls", how often the rule fires in simulations without a leak (false alarms), and "finds", the rate of
+    tests on the sheet in which the RMS falls by more than the noise (`d1_threshold`).
     """
     rate_beyond_noise = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
     return {"controls": _format_controls(evidence, _A_D3), "finds": rate_beyond_noise}
 
 
 def _trend_test(chamber: str) -> SheetTest:
-    """Build the function that tests whether the changes of a chamber's wavelet details grow with the mean leak."""
+    """Build the function that tests whether the changes of a chamber's wavelet details grow with the mean leak.
+
+    It tests claim 5.5.3 for p_A or 5.5.4 for p_B on a data sheet. `chamber`: "p_A" or "p_B".
+    """
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
 
     def test_correlations(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that each detail's change is significantly correlated with the mean leak, with the claimed sign.
+        """Test that each detail's log change is significantly correlated with the mean leak, with the claimed sign.
 
-        This is tested without and with correction for the operating condition (`partial_correlation`).
+        The sign is negative for p_A and positive for p_B. Tested are the plain correlation and the partial correlation
+        given the operating condition (`partial_correlation`), both at the 5 % level.
         """
         for name in SENSITIVE:
             change = sheet.log_change(chamber, name)
@@ -245,17 +256,21 @@ def _trend_test(chamber: str) -> SheetTest:
 
 
 def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Compute how well the mean leak can be predicted, for the texts of claims 5.5.3 and 5.5.4.
+    """Compute how well a linear regression predicts the mean leak of a test, for the texts of claims 5.5.3 and 5.5.4.
 
-    The values are the cross-validated R^2 of predictions from the operating condition and from the changes of the
-    RMS.
+    The values are the leave-one-out R^2 of the regression on the operating condition ("condition"), and on the log
+    changes of the RMS with the leak ("changes"). `evidence` is not used.
     """
     columns = {"condition": condition_design(), "changes": change_design(sheet)}
     return {name: leave_one_out_r2(design, mean_leaks()) for name, design in columns.items()}
 
 
 def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.1: the wavelet details of Table 5.1 change significantly, and those it leaves out do not."""
+    """Test claim 5.5.1: the wavelet details of Table 5.1 change significantly, and those it leaves out do not.
+
+    The table has d3, d4 and d3d4 of both chambers, which must move as stated (`moves_beyond_chance`). It leaves out d1
+    and d2, for which the sign test, corrected by Holm for ten columns, must give a p-value of at least 0.05.
+    """
     p = holm_p_values(sheet)
     for rule in (*_CELLS, *UNCLAIMED):
         ((chamber, name),) = rule.details
@@ -266,7 +281,11 @@ def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.2: the mean change of d3d4, relative to its scatter, is larger than those of d3 and of d4."""
+    """Test claim 5.5.2: the product d3d4 has a larger effect size than d3 and than d4, for each chamber.
+
+    The effect size is the mean over the standard deviation, over the tests, of the log change of the RMS with the leak,
+    counted positive as a fall for p_A and as a rise for p_B.
+    """
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
         effect_sizes = {name: float(change.mean() / change.std(ddof=1)) for name, change in changes.items()}
@@ -275,7 +294,10 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.6: the changes of log RMS of the details of p_A and of p_B are negatively correlated."""
+    """Test claim 5.5.6: the log changes of the RMS of a detail in p_A and in p_B are negatively correlated.
+
+    For each of d3, d4 and d3d4, the correlation over the tests must be negative and differ from 0 at the 5 % level.
+    """
     for name in SENSITIVE:
         change_A, change_B = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
         r = float(np.corrcoef(change_A, change_B)[0, 1])
@@ -285,7 +307,10 @@ def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.5: the RMS of the wavelet details of p_B rises significantly."""
+    """Test claim 5.5.5: with the leak, the RMS of the wavelet details d3, d4 and d3d4 of p_B rises significantly.
+
+    The criterion is that of `moves_beyond_chance`: more rises than falls, and a corrected p-value below 0.05.
+    """
     p = holm_p_values(sheet)
     for name in SENSITIVE:
         n_up = int(np.sum(sheet.log_change("p_B", name) > 0))
@@ -293,7 +318,11 @@ def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.3.1: in all tests that chapter 5 shows, the details of p_A fall and those of p_B rise."""
+    """Test claim 5.3.1: in the ten tests that chapter 5 shows, the details of p_A fall and those of p_B rise.
+
+    For each of d3, d4 and d3d4, the RMS with the leak must be smaller (p_A) or larger (p_B) than without it in all of
+    these tests.
+    """
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
             moves = sheet.log_change(chamber, name)[_PRINTED_ROWS] * DIRECTION[chamber] > 0
@@ -340,8 +369,9 @@ Statement = Literal["fall", "change"]
 def leak_level_claims() -> Iterator[Claim]:
     """Judge claims 5.1.1 to 5.1.3 on the levels of the leak ("large" to "extra-small").
 
-    They concern the nominal leak of each level, the ratios of these, and the leak that section 5.2 states for one
-    test.
+    5.1.1: each level's nominal leak is within the range of its tests' mean leaks, and the ranges do not overlap. 5.1.2:
+    the nominal leaks have the ratios that the thesis states, within 25 %. 5.1.3: a "large" test with the command 3
+    sin(4t) has the mean leak that section 5.2 states.
     """
     leaks = {level: [row.mean_leak_lpm for row in APPENDIX_C if row.level == level] for level in NOMINAL_LPM}
     texts = [f"{level} {min(lpm):.4f} to {max(lpm):.4f}, mean {np.mean(lpm):.4f}" for level, lpm in leaks.items()]
@@ -367,10 +397,12 @@ def leak_level_claims() -> Iterator[Claim]:
 def _test_rows(
     sheet: DataSheet, test: PrintedTest, chamber: str, names: Sequence[str], statement: Statement
 ) -> tuple[str, list[bool]]:
-    """Test that wavelet details change by more than the noise in the row of the data sheet of a test of chapter 5.
+    """Test that the RMS of wavelet details change by more than the noise in one row of the data sheet.
 
-    `names`: the details; `statement`: "fall" or "change", as the thesis says. Returns a text, and True or False for
-    each detail. If several rows can be the printed test, the text also counts those with a change beyond the noise.
+    The row is the one for which `test`, a test of chapter 5, is taken. `names`: the details; `statement`: "fall" if
+    only falls count, "change" for changes of either sign. The limit is the change that noise alone exceeds in 5 % of
+    the tests (`d1_threshold`). Returns a text, and True or False for each detail. If several rows can be the printed
+    test, the text also counts those with a change beyond the noise.
     """
     row, limit = test.condition.number - 1, d1_threshold(sheet, chamber, either_side=statement == "change")
     changes = {name: sheet.log_change(chamber, name) for name in names}
@@ -390,11 +422,12 @@ def _test_rows(
 
 
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims of chapter 5 that a leak lowers, or changes, wavelet details of a chamber's pressure.
+    """Judge the claims of chapter 5 that a leak lowers, or changes, the RMS of wavelet details of a chamber's pressure.
 
-    Each claim names a test and some details. The RMS of each detail must fall, or change, by more than the noise in
-    the measured data sheet; without this sheet the claim cannot be tested. For comparison, the texts state the
-    simulated changes, and the changes that drifting parameters alone can cause.
+    Each claim names a test, some details, and whether they fall or only change. The RMS of each detail must do so by
+    more than the noise in the measured data sheet (`_test_rows`); without this sheet the claim cannot be tested. For
+    comparison, the texts state the simulated changes, and the changes that drifting parameters alone exceed in 5 % of
+    the simulated tests.
     """
     for number, (section, chamber, names, statement) in enumerate(load_texts("cases.toml")["curves"], start=1):
         test = TESTS[section]

@@ -180,7 +180,8 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
     """Build the stored result of an item from JSON values; return None if it was made from other inputs.
 
-    `keys`: present digest of each item's inputs; `tree`: the values. Raises ValueError if they are no stored result.
+    `keys`: present digest of each item's inputs, by id, with which the stored digest is compared; `tree`: the values.
+    Raises ValueError if they are no stored result.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")
@@ -190,7 +191,8 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    `row`: its stored result, None if there is none. An item is left out if it needs the data sheet and there is none.
+    An item is left out if it needs the data sheet and `sheet` is None. It is kept if its stored result `row` is no
+    error and all its files still exist in `folder`; `row` is None if no result is stored.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
@@ -200,9 +202,9 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
 
 
 def _iter_rows(results: Generator[tuple[_Job, ItemRow | None], None, None]) -> Generator[ItemRow, None, None]:
-    """Yield the result of each item from pairs of a job and its result.
+    """Yield the stored result (row) of each item from pairs of a job and its result.
 
-    An item whose process died has the result None; it gets a row with that error.
+    A job whose process died has the result None, for which a row that states this error is yielded.
     """
     with closing(results):
         for (item, key, _), row in results:

@@ -27,8 +27,8 @@ class SimulatedRun:
 
     `recording`: None if the run failed; `t` [s], `outputs`: noise-free outputs at the samples (`TRUE_OUTPUTS` in
     `simulation.simulate`); `mean_leak_lpm`: mean leak while open [L/min]; `resolved`: True if the run changed little
-    when the solver's step was halved, None if this was not tested; `step_changes`: the changes by name of the
-    quantity; `diverged`: one-line reason of a failed run, "" for none.
+    when the solver's step was halved, False if not, None if this was not tested; `step_changes`: rms changes by this
+    halving in SI units, by name of the quantity; `diverged`: one-line reason of a failed run, "" for none.
     """
 
     recording: Recording | None
@@ -50,7 +50,8 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    `prove`: True to repeat the run with half the solver's step and compare both.
+    A run that its step does not resolve does not count as failed. `prove`: True to repeat the run with half the
+    solver's step and compare both.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -105,8 +106,8 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table among the products of a needed item, given by its id.
+    """Return the first table among the products of the item with the id `item`, which the item to be made needs.
 
-    Raises InputError if the item failed.
+    Raises InputError if that item failed.
     """
     return next(product for product in context.product(item) if isinstance(product, ThesisTable))

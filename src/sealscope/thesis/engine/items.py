@@ -21,10 +21,10 @@ from sealscope.thesis.engine.texts import load_texts
 class Item:
     """One case, figure, table or group of claims of the thesis that can be reproduced.
 
-    `id`: kind and the thesis's number, such as "fig-4.22"; `make`: function that makes its products; `inputs`: inputs
-    of that function by name; `uses_sheet`: True if it shows the measured data sheet when that is given;
-    `needs_sheet`: True if it cannot be made without the sheet; `needs`: ids of items whose products `make` uses;
-    `claims`: ids of claims that it supports or refutes; `columns`: heads of its table.
+    `id`: kind and the thesis's number, such as "fig-4.22"; `make`: function that makes its products (figures, tables,
+    claims); `inputs`: inputs of that function by name; `uses_sheet`: True if it shows the measured data sheet when that
+    is given; `needs_sheet`: True if it cannot be made without the sheet; `needs`: ids of items whose products `make`
+    uses; `claims`: ids of claims that it supports or refutes; `columns`: heads of its table.
     """
 
     id: str
@@ -49,8 +49,8 @@ class Item:
     ) -> Figure:
         """Build the figure of this item, with its id, title and claims.
 
-        `numbers`: numbers reported with the figure; `resolved`: True if all its runs passed the test with half the
-        solver's step, False if one did not, None if nothing was tested.
+        `numbers`: numbers reported with the figure; `notes`: text below it; `resolved`: True if all its runs passed the
+        test with half the solver's step, False if one did not, None if nothing was tested.
         """
         return Figure(self.id, self.title, tuple(panels), tuple(numbers), self.claims, resolved, notes)
 
@@ -66,8 +66,9 @@ class Item:
     ) -> ThesisTable:
         """Build a table of this item, with its claims.
 
-        `tail` is appended to the item's id; `title` and `columns` replace the item's if stated; `resolved`: True if
-        all its runs passed the test with half the solver's step, False if one did not, None if nothing was tested.
+        `tail` is appended to the item's id, for a second table of one item; `title` and `columns` (heads) replace the
+        item's if stated; `resolved`: True if all its runs passed the test with half the solver's step, False if one did
+        not, None if nothing was tested.
         """
         heads = tuple(columns) or self.columns
         id, title = self.id + tail, title or self.title
@@ -92,7 +93,8 @@ def load_items() -> tuple[Item, ...]:
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     """Yield the items (figures, tables, claims) that a row of `items.toml` describes.
 
-    It is one item, or several if the row's entry `each` names a function that lists them. `name`: the row's key.
+    It is one item, whose id is `name`, the key of the row. If the row has an entry `each`, this names a function that
+    lists (id, title, inputs) of several items.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}

@@ -69,7 +69,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Number:
-    """One number that a figure reports in addition to its curves."""
+    """One number, or a short text, that a figure reports in addition to its curves; `unit`: "" for none."""
 
     name: str
     value: float | str
@@ -119,8 +119,8 @@ Verdict = Literal["holds", "holds in part", "does not hold", "cannot be tested"]
 class Claim:
     """One testable sentence of the thesis, in our words, and the verdict on it.
 
-    `where`: place in the thesis; `sheet`, `simulation`: findings on the data sheet of Appendix C and in simulation;
-    `why`: reason for the verdict.
+    `where`: place in the thesis; `claim`: the sentence; `sheet`, `simulation`: texts of the findings on the data sheet
+    of Appendix C and in simulation; `why`: reason for the verdict.
     """
 
     id: str

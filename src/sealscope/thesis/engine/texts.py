@@ -28,9 +28,10 @@ def format_note(name: str, **values: Any) -> str:
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    `tests`: results, None for a test that cannot be made. The texts are in `claims.toml` under `id`, or under `kind`
-    for claims that share texts. Values named `sheet` (finding by the thesis's data sheet), `simulation` (finding by
-    simulation) and `why` (reason of the verdict) replace the text of that name.
+    `tests`: results, None for a test that cannot be made; the claim holds if all others pass. The texts are in
+    `claims.toml` under `id`, or under `kind` for claims that share texts; `values` replace their placeholders. Values
+    named `sheet` (finding by the thesis's data sheet), `simulation` (finding by simulation) and `why` (reason of the
+    verdict) replace the whole text of that name.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

@@ -62,7 +62,8 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
     """Yield the heads of the columns, then the rows, of a table of all points that a figure shows.
 
-    The columns are x and y of each curve, and x, y and value of each image.
+    The columns are x and y of each curve, and x, y and value of each image. Columns of different length are filled with
+    empty texts.
     """
     heads: list[str] = []
     columns: list[list[str]] = []

@@ -11,7 +11,10 @@ from sealscope.thesis.engine.products import Role
 
 
 class Style(NamedTuple):
-    """Line style of the curves with one role: colour, dashes, width [pt], and marker, which may be filled."""
+    """Line style of the curves with one role, i.e. one meaning: colour, dashes, width [pt], and marker.
+
+    `dashes`: lengths of dashes and gaps in turn, () for a solid line; `filled`: True for a filled marker.
+    """
 
     colour: str
     dashes: tuple[float, ...] = ()

@@ -220,8 +220,8 @@ def _use_plain_numbers(axis: Axis) -> None:
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
     """Select the points (x, y) of a curve that are drawn.
 
-    A long curve is cut to `x_range` plus one point on each side, or not cut if `x_range` is None. A line is then
-    thinned to about `_MAX_POINTS` points.
+    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, unless `x_range` is None
+    or x is not rising. A curve of kind "line" is then thinned to about `_MAX_POINTS` points that preserve its peaks.
     """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
@@ -294,7 +294,8 @@ def _thicken_lines(legend: Legend) -> None:
 def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
     """Remove the x labels of all panels but the lowest of each column, if all panels have the same x axis.
 
-    Nothing changes if a panel has an image.
+    `axes` (rows, columns): matplotlib's axes, of which the last ones may be switched off. Nothing changes if a panel
+    has an image.
     """
     visible_axes = [ax for ax in axes.flat if ax.axison]
     x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}

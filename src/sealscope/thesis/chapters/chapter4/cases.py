@@ -120,8 +120,9 @@ def make_experiment(
 ) -> Experiment:
     """Build the experiment of a command with throttles closed by `closed_pct` [%], None for no throttles.
 
-    `reading`: interpretation of the throttles' equations; `solver`: "as_published" for the thesis's method and step;
-    `duration` [s]; `overrides`: parameters that replace the reading's.
+    `reading`: interpretation of the throttles' equations; `solver`: "as_published" for the thesis's method and step
+    (RK4, 1e-4 s), "converged" for a step chosen by its error; `duration` [s]; `overrides`: parameters that replace
+    those of the interpretation.
     """
     values = {**dict(reading.values(closed_pct)), **overrides}
     experiment = Experiment.of(command=command, duration=duration, set=values)
@@ -134,8 +135,8 @@ def make_drift_experiment(
     """Build the long experiment in which the drift of the piston is measured, with the command of section 4.3.
 
     `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
-    equations of the throttles; `solver`: "as_published" for the thesis's method and step; `overrides`: parameters that
-    replace the reading's.
+    equations of the throttles; `solver`: "as_published" for the thesis's method and step (RK4, 1e-4 s), "converged"
+    for a step chosen by its error; `overrides`: parameters that replace those of the interpretation.
     """
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
     return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, overrides)
@@ -144,7 +145,7 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command with the thesis's solver and with a converged one; return both runs by solver.
+    """Simulate a command with the thesis's solver (RK4, 1e-4 s) and with a converged one; return both runs by solver.
 
     `closed_pct`: closing of the throttles [%], None for no throttles; `reading`: interpretation of the thesis's
     equations of the throttles.
@@ -153,7 +154,7 @@ def run_both_solvers(
 
 
 def all_resolved(runs: Runs) -> bool:
-    """Return True if all runs changed little when the solver's step was halved."""
+    """Return True if all runs of a case changed by no more than the tolerance when the solver's step was halved."""
     return all(run.resolved for run in runs.values())
 
 
@@ -176,20 +177,24 @@ def steady_output(run: SimulatedRun, name: str) -> Array:
 
 
 def steady_range(run: SimulatedRun, name: str) -> float:
-    """Compute the maximum minus the minimum of an output from pi to 2 pi seconds of a run (`STEADY`)."""
+    """Compute the maximum minus the minimum of an output from pi to 2 pi seconds of a run; nan if it diverged."""
     return float(np.ptp(steady_output(run, name)))
 
 
 def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
-    """Compute the mean of the output `first` minus the output `second` in the steady part of a run (`STEADY`)."""
+    """Compute the mean of the output `first` minus the output `second` from pi to 2 pi seconds of a run.
+
+    It is nan if the run diverged.
+    """
     return float(np.mean(steady_output(run, first) - steady_output(run, second)))
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Summarise the pressures and flows in the steady part of a run (`STEADY`) by a few numbers, by name.
+    """Summarise the pressures and flows from pi to 2 pi seconds of a run (`STEADY`) by a few numbers, by name.
 
-    They are in Pa: range and peak of each pressure, the lowest pressure, and mean and largest drop at the orifices. The
-    number `flows differ` is rms(Q_A - Q_B) / rms(Q_A). All numbers are nan if the run diverged.
+    In Pa: "range of p_A" (maximum minus minimum) and "peak of p_A" (maximum) of each pressure; "least pressure", the
+    lowest of all; "mean of p_1 - p_A" and "mean of p_2 - p_B", the mean drops at the orifices; "largest drop" of both
+    by magnitude. "flows differ" is rms(Q_A - Q_B) / rms(Q_A). All numbers are nan if the run diverged.
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}

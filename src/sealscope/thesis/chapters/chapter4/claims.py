@@ -69,7 +69,12 @@ def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> floa
 
 
 def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, which are 4.2 a) to c)."""
+    """Judge claims 4.2 and 4.4 to 4.6 on the cases without orifices, which are those of Table 4.2.
+
+    4.2: the motor's speed is a sine, with a residual of at most 5 % of its rms. 4.4: on measured displacements, which
+    cannot be tested. 4.5: without noise the pressure p_A does not ring visibly after a reversal. 4.6: without Coulomb
+    friction the drift of the piston changes by more than 1 %.
+    """
     runs = {command: context.run(make_experiment(command, None)) for command in COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
@@ -90,7 +95,10 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.5", [ring < noise for ring in rings.values()], rings=text, noise=noise * 1e-3)
 
     def drift_mm(**overrides: float) -> float:
-        """Compute the drift [mm] of the piston in a long run, with some of the rig's parameters replaced."""
+        """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced.
+
+        The drift is the mean position in the last whole period of the command minus that in the first.
+        """
         run = context.run(cases.make_drift_experiment(DEFAULT_READING, None, "converged", **overrides))
         return 1e3 * cases.piston_drift(run)
 
@@ -101,11 +109,15 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 
 
 def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.1 and 4.3 on the solver's step and on the gains of the speed loop."""
+    """Judge claims 4.1 and 4.3 on the solver's step and on the gains of the speed loop.
+
+    They hold if halving the thesis's step of 1e-4 s changes a run by no more than the tolerance: in each case of Tables
+    4.2 and 4.3 (4.1), and in two runs with the gains of the thesis's drive (4.3).
+    """
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
     def largest_change(*, with_throttles: bool) -> str:
-        """Format the largest change of a pressure when the step is halved, in the cases with or without throttles."""
+        """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles."""
         matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
         changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
         return f"{max(changes):.3g} Pa rms" if changes else "diverged"
@@ -130,7 +142,12 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
 
 
 def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.7, 4.13, 4.17, 4.20, 4.22 and 4.23, which follow from the thesis's equations and tables."""
+    """Judge claims 4.13, 4.20 and 4.23 by the thesis's equations and tables; 4.7, 4.17 and 4.22 cannot be tested.
+
+    4.13: a throttle of 3.75 mm in the line's 5 mm is closed by 25 % of the area. 4.20: the friction does not jump at
+    the threshold velocity, whichever way eq. (4.22) is read. 4.23: the throttles as printed let oil flow to the
+    cylinder with less resistance than back, on both sides.
+    """
     rig = thesis_rig()
     charge, run = rig.fluid.p_charge * 1e-6, context.run(make_experiment(COMMANDS[0], 25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
@@ -159,7 +176,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
     """Format how many tests passed, such as "7 of 16 tests pass".
 
-    If only some passed, the text also names the interpretations of the equations under which all tests pass.
+    `tests`: results by interpretation of the throttles' equations (`Reading`). If only some tests passed, the text also
+    names the interpretations under which all of them do.
     """
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
@@ -175,11 +193,11 @@ def _judge_runs(
     test: Callable[[_T], Iterable[bool]],
     format_numbers: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`number` of the thesis by converged runs under both interpretations of the equations.
+    """Judge claim 4.`number` of the thesis by converged runs under both interpretations of the throttles' equations.
 
-    The claim's text states the results of both solvers. `numbers`: results of the runs by solver and interpretation
-    (`Reading`); `test`: yields the outcomes of the tests on the results under one interpretation; `format_numbers`:
-    formats the results under all of them.
+    The claim's text states the results of both solvers, the converged one and the thesis's. `numbers`: results of the
+    runs by solver and interpretation (`Reading`); `test`: yields True or False for each test on the results under one
+    interpretation; `format_numbers`: formats the results under all interpretations.
     """
     tests = {
         solver: {reading: tuple(test(values)) for reading, values in numbers[solver].items()} for solver in SOLVERS
@@ -193,25 +211,25 @@ def _judge_runs(
 
 
 def _format_range(values: Iterable[float], unit: str = "kPa", factor: float = 1e-3) -> str:
-    """Format the smallest and the largest of some values, multiplied by `factor` to be in `unit`."""
+    """Format the smallest and the largest of some values, such as "-1.25 to +3.00 kPa"; `factor` converts to `unit`."""
     scaled = [value * factor for value in values]
     return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
 
 
 def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats the range [kPa] of some numbers over all interpretations of the equations.
+    """Build a function that formats the smallest and largest of some numbers [kPa] over all runs that it is given.
 
-    `head`: text before the range; `values`: computes these numbers [Pa] from the summaries of the runs under one
-    interpretation (`summarise_run`).
+    The function takes, for each interpretation of the throttles' equations, the list of its runs' summaries
+    (`summarise_run`). `values`: computes the numbers [Pa] from one such list; `head`: text before the numbers.
     """
     return lambda rows_of_readings: f"{head} {_format_range(v for rows in rows_of_readings for v in values(rows))}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute by how much a statistic of each pressure changes [Pa] from the first row to each later row.
+    """Compute by how much a statistic of each pressure changes [Pa] from the first run to each later one.
 
-    `rows`: summaries of runs (`summarise_run`); `statistic`: "peak" or "range"; `names`: the pressures. The changes
-    are in one list, row by row.
+    `rows`: summaries of the runs (`summarise_run`); `statistic`: "peak" (maximum) or "range" (maximum minus minimum);
+    `names`: the pressures. The changes are in one list, run by run.
     """
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
@@ -235,7 +253,12 @@ def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> d
 
 
 def _judge_opening(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.8 to 4.12 on the change from open orifices to orifices that are 25 % closed."""
+    """Judge claims 4.8 to 4.12 on the change from open orifices to orifices that are 25 % closed.
+
+    4.8: no pressure's peak or range changes visibly. 4.9: the flows Q_A and Q_B differ by less than 5 %. 4.10: the peak
+    of each pressure changes visibly. 4.11: the mean of p_1 is visibly below that of p_A. 4.12: the mean of p_2 is
+    visibly above that of p_B. Visible is more than a transducer's noise (`visible_pressure`).
+    """
     min_visible = cases.visible_pressure()
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
     p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"
@@ -245,7 +268,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         return _changes(rows, "peak") + _changes(rows, "range")
 
     def format_flow_difference(rows_of_readings: list[Rows]) -> str:
-        """Format the largest relative difference of the flows Q_A and Q_B with orifices that are 25 % closed."""
+        """Format the largest rms(Q_A - Q_B) / rms(Q_A) over the interpretations, with orifices that are 25 % closed."""
         largest = max(rows[1][flows] for rows in rows_of_readings)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
@@ -260,7 +283,12 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
 
 
 def _judge_larger_closings(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices."""
+    """Judge claims 4.14 to 4.16 and 4.21 on larger commands and closings of the orifices.
+
+    4.14: the pressures' ranges grow with the amplitude of the command. 4.15: tighter orifices raise the chamber
+    pressures' peaks. 4.16: they raise the ranges of all four pressures. 4.21: the drop at the orifices is large. Each
+    change or drop must exceed a transducer's noise (`visible_pressure`).
+    """
     min_visible = cases.visible_pressure()
     by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
     fast_by_closing = _run_cases(context, *((COMMANDS[2], closed) for closed in CLOSINGS))
@@ -274,7 +302,10 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
         return _changes([rows[0], rows[-1]], "range")
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Yield for each pressure True if its range grows with the closing, and visibly so from 25 to 75 % closed."""
+        """Yield for each pressure True if its range grows with the closing, and visibly so from 25 to 75 % closed.
+
+        `rows`: summaries of the runs with 25, 50 and 75 % closed. Visible is more than a transducer's noise.
+        """
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
@@ -301,7 +332,10 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
 
 
 def _judge_drift(context: Context) -> Iterator[Claim]:
-    """Judge claims 4.18 and 4.19 on the drift of the piston with orifices."""
+    """Judge claims 4.18 and 4.19: orifices make the piston drift, and tighter orifices make it drift more.
+
+    A change of the drift counts if it exceeds 1 % of the drift without orifices.
+    """
 
     def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
         """Compute the piston's drift [m] in a long run; `closed`: closing of the orifices [%], None for none."""
@@ -315,13 +349,17 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     }
 
     def drift_formatter(head: str) -> Callable[[list[list[float]]], str]:
-        """Build a function that formats the piston's additional drift with orifices, at each closing.
+        """Build a function that formats the piston's drift with orifices minus that without them, at each closing.
 
-        It states the range over both interpretations of the equations; `head`: text before it.
+        It states the smallest and the largest value over the interpretations of the throttles' equations; `head`: text
+        before them.
         """
 
         def format_drift(rows: list[list[float]]) -> str:
-            """Format the added drift [mm] at each closing, as the range over `rows`, one for each interpretation."""
+            """Format the added drift [mm] at each closing, as its smallest and largest value over `rows`.
+
+            Each row has the drifts [m] under one interpretation of the equations, one for each closing.
+            """
             parts = (_format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
             texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
             return f"{head} {', '.join(texts)}"
@@ -329,16 +367,16 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return format_drift
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing True if the piston's drift differs from the drift without orifices.
+        """Yield for each closing True if the piston's drift differs from the drift without orifices by more than 1 %.
 
         `row`: the drift [m] at each closing.
         """
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing but the first True if the piston drifts more than at the closing before.
+        """Yield for each closing but the first True if the piston drifts more than at the next smaller closing.
 
-        `row`: the drift [m] at each closing.
+        The magnitude must grow by more than 1 % of the drift without orifices. `row`: the drift [m] at each closing.
         """
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 

@@ -65,10 +65,10 @@ def item_reading(item: Item) -> Reading:
 
 
 def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
-    """Simulate a case of Table 4.2 or 4.3 with the thesis's solver and with a converged one.
+    """Simulate a case of Table 4.2 or 4.3 with the thesis's solver (RK4, 1e-4 s) and with a converged one.
 
-    `item.inputs` has the case, and may have an interpretation of the throttles' equations. Returns the runs by solver,
-    and the notes for the figure or table.
+    `item.inputs` has the key of the case (`CASES`), and may have an interpretation of the throttles' equations. Returns
+    the runs by solver, and the notes for the figure or table.
     """
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
@@ -78,7 +78,8 @@ def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
 def _run_notes(runs: Runs, reading: Reading | None) -> str:
     """Format the notes on a figure of a case: variant of the equations, and runs that failed or need a smaller step.
 
-    `reading`: one way to understand the thesis's inconsistent equations (`Reading`); None for a case without orifices.
+    They also name runs in which a pressure falls below vacuum. `reading`: one way to understand the thesis's
+    inconsistent equations (`Reading`); None for a case without orifices.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:
@@ -104,7 +105,7 @@ def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureC
 
 
 def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureCurve:
-    """Build the curve of an output as a few marks, below which another curve with the same values stays visible."""
+    """Build the curve of an output as about 80 marks, so that another curve with the same values stays visible."""
     thinned = slice(None, None, max(1, run.t.size // _N_MARKS))
     values = run.outputs[name][thinned] * FIGURE_UNITS[name].scale
     return FigureCurve(run.t[thinned], values, f"{label} (the same)", role, "points")
@@ -113,7 +114,8 @@ def _marked_curve(run: SimulatedRun, name: str, label: str, role: Role) -> Figur
 def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
     """Build the curves of an output over time, one for each solver whose run did not diverge.
 
-    If they coincide, the curve of the thesis's solver is drawn as a few marks.
+    If both curves coincide, that is if their rms difference is below 0.5 % of the output's range, the curve of the
+    thesis's solver is drawn as a few marks.
     """
     converged = runs["converged"]
     max_difference = _COINCIDENCE_FRACTION * steady_range(converged, name) * FIGURE_UNITS[name].scale
@@ -126,7 +128,8 @@ def _solver_curves(runs: Runs, name: str) -> tuple[FigureCurve, ...]:
 def _rms_difference(runs: Runs, name: str) -> float:
     """Compute the rms difference of an output between the runs with the thesis's solver and with a converged one.
 
-    It is in the figures' unit, and computed over the steady part of the runs; nan if one of them diverged.
+    It is in the figures' unit (`FIGURE_UNITS`), and computed from pi to 2 pi seconds of the runs; nan if one of them
+    diverged.
     """
     difference = steady_output(runs["as_published"], name) - steady_output(runs["converged"], name)
     return float(np.sqrt(np.mean(difference**2)) * FIGURE_UNITS[name].scale)
@@ -135,7 +138,8 @@ def _rms_difference(runs: Runs, name: str) -> float:
 def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate minimum, maximum and standard deviation of each quantity in a case of Table 4.2 or 4.3.
 
-    The case is simulated with the thesis's solver and with a converged one.
+    The case is simulated with the thesis's solver (RK4, 1e-4 s) and with a converged one. The last column is the rms
+    difference of both. All numbers are from pi to 2 pi seconds of the runs.
     """
     runs, notes = _run_case(context, item)
     rows: list[tuple[Cell, ...]] = []
@@ -154,7 +158,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw some quantities of a case over time, each with the thesis's solver and with a converged one.
 
-    `item.inputs` has the case and the names of the quantities.
+    `item.inputs` has the case of Table 4.2 or 4.3 and the names of the quantities, such as "p_A".
     """
     runs, notes = _run_case(context, item)
     command, _ = CASES[item.inputs["case"]]
@@ -176,7 +180,8 @@ def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the pressures on both sides of an orifice and their difference over time (Figs. 4.13, 4.14).
 
-    The case is simulated with the thesis's solver and with a converged one.
+    The case is simulated with the thesis's solver (RK4, 1e-4 s) and with a converged one. `item.inputs` has the case
+    and the names of the pressures on the pump's and on the cylinder's side.
     """
     runs, notes = _run_case(context, item)
     pump, chamber = item.inputs["quantities"]
@@ -196,7 +201,8 @@ def orifice_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def _orifice_curves(run: SimulatedRun, pump: str, chamber: str) -> tuple[FigureCurve, ...]:
     """Build the curves of the pressures on both sides of an orifice over time.
 
-    `pump`, `chamber`: names of the two pressures. If they coincide, the pump's is drawn as a few marks.
+    `pump`, `chamber`: names of the pressures on the pump's and on the cylinder's side, such as "p_1" and "p_A". If both
+    curves coincide, the pump's is drawn as a few marks.
     """
     chamber_curve = _line_curve(run, chamber, chamber, "A" if chamber == "p_A" else "B")
     rms_difference = float(np.sqrt(np.mean((steady_output(run, pump) - steady_output(run, chamber)) ** 2)))
@@ -210,8 +216,9 @@ def _sweep_curves(
 ) -> tuple[tuple[FigureCurve, ...], list[Number]]:
     """Build a curve of a measure over a varied parameter for each solver, and list the curves' points as numbers.
 
-    Both are in MPa. `sweep`: runs by value of the parameter; `measure`: computes the measure [Pa] of a run;
-    `template`: name of a number, with a placeholder for the parameter's value.
+    Curves and numbers are in MPa. `sweep`: runs by value of the varied parameter and by solver; `measure`: computes the
+    measure [Pa] of a run, such as the range of a pressure; `template`: name of a number, with a placeholder for the
+    parameter's value; `solvers`: solvers to draw.
     """
     curves, numbers = [], []
     for solver in solvers:
@@ -223,9 +230,10 @@ def _sweep_curves(
 
 
 def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw one pressure with orifices that are 25, 50 and 75 % closed, and its range over the closing.
+    """Draw one pressure over time with orifices that are 25, 50 and 75 % closed, and its range over the closing.
 
-    Both are drawn with the thesis's solver and with a converged one; `item.inputs` has the pressure's name.
+    The runs are made with the thesis's solver (RK4, 1e-4 s) and with a converged one. `item.inputs` has the pressure's
+    name.
     """
     name, reading = item.inputs["quantity"], item_reading(item)
     sweep = {closed: run_both_solvers(context, COMMAND, closed, reading) for closed in CLOSINGS}
@@ -246,7 +254,7 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give.
 
-    The panels show the ranges of p_1 and of p_A and the mean of p_1 - p_A.
+    The panels show the range of p_1, the range of p_A, and the mean of p_1 - p_A, for one command and closing.
     """
     command, closed = "3 sin(4t)", 25.0
     volumes = _QUICK_VOLUMES if context.quick else _VOLUMES

@@ -40,7 +40,8 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
     """Compute the friction [N] at the threshold velocity v_th and just above it, for both forms of eq. (4.22).
 
-    Returns the two forces by the name of the form: "continuous", or "literal" with the bracket as printed.
+    Returns the two forces by the name of the form: "continuous", or "literal" with the bracket as printed. `F_C`:
+    Coulomb force [N].
     """
     v_th = thesis_rig().friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
@@ -55,7 +56,8 @@ def falling_friction_limit(F_C: float) -> float:
     """Compute the velocity [m/s] up to which the friction falls with speed, for the Coulomb force `F_C` [N].
 
     It solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), where viscous friction rises as fast as Stribeck friction falls,
-    and is 0 if the friction never falls.
+    and is 0 if the friction never falls. The parameters are those of the thesis's rig: F_v [N s/m] viscous coefficient,
+    K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
     f = thesis_rig().friction
     return max(0.0, math.log(F_C * (f.K_brk - 1.0) * f.C_c / f.F_v) / f.C_c)
@@ -85,7 +87,10 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22) near standstill."""
+    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22) near standstill.
+
+    The interpretations close the unbalanced bracket of the equation in different places (`stribeck_force`).
+    """
     rig = thesis_rig()
     f = rig.friction
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
