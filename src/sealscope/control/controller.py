@@ -59,8 +59,8 @@ class Started:
     def __call__(self, measured: Measured) -> float:
         """Compute the controller's voltage [V] from the measurements of its next sample.
 
-        Each call advances the controller's state, so it must be called exactly once a sample. An exception of a
-        controller in Python is raised again.
+        Each call advances the controller's state, so it must be called exactly once a sample. If the controller is
+        written in Python and raises an exception, this call raises the exception.
         """
         self._measured[:] = measured
         volts = float(self._call(*self._addresses))

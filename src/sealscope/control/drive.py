@@ -35,10 +35,14 @@ DRIVE = record_dtype(
 def drive_voltage(m: Any, flow: float, dp: float) -> float:
     """Compute the voltage u [V] at which a drive delivers a flow [m^3/s] against `dp` = p_A - p_B [Pa].
 
-    `m`: a record `DRIVE`, the parameters and the filter state of the drive. For a servo valve (Q_N > 0) the equation of
-    `ValveDrive` is solved for u, which is then increased to pass the overlap of the edges. For a pump the equation of
-    `Drive` gives the commanded speed u omega_per_volt. The factor s/(s + corner) of this equation is a high-pass
-    filter, which each call advances by one sample.
+    `m`: a record `DRIVE`, the parameters and the filter state of the drive.
+
+    A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))), with at least 10 % of p_s
+    for the pressure drop. To pass the overlap of the edges, abs(u) is then increased to five times, by at most
+    `dead_volts`.
+
+    A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement. H is the
+    high-pass filter s/(s + corner), which each call advances by one sample; `m.decay` is exp(-corner/rate).
     """
     if m.Q_N > 0.0:  # a servo valve
         valve_drop = max(m.p_s - math.copysign(dp, dp * flow), _MIN_VALVE_FRACTION * m.p_s)  # p_s - sign(Q) dp
@@ -53,9 +57,10 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
 @kernel
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
-    """Filter `values` (n,) by a first-order lag, and write the result to `out` (n,), which begins with `state`.
+    """Filter `values` (n,) by a first-order lag, one sample late, and write the result to `out` (n,).
 
-    `decay`: exp(-T/tau), with the sample interval T and the lag's time constant tau.
+    out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-T/tau), with the sample
+    interval T and the lag's time constant tau.
     """
     for sample in range(values.size):
         out[sample] = state
@@ -129,7 +134,7 @@ class Drive(_Invertible):
 
     @property
     def lag(self) -> float:
-        """Time constant [s] of the motor's speed loop; infinite if the loop has no integral term."""
+        """Time constant [s] of the motor's speed loop, (1 + shortfall)/corner; infinite if it has no integral term."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
     @staticmethod
@@ -141,9 +146,9 @@ class Drive(_Invertible):
         """Compute the pump's flow (n,) [m^3/s] for voltages (n,) [V] at `rate` [Hz] against p_A - p_B (n,) [Pa].
 
         The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall), with the commanded speed
-        omega_d. y is omega_d + droop dp after a first-order lag with the time constant `lag`. With `settling` = 0
-        the run begins at standstill under the first dp. Otherwise the command is periodic with a period of
-        `settling` samples, and the run begins as if it had been repeated for ever.
+        omega_d. y is omega_d + droop dp after a first-order lag with the time constant `lag`; y of a sample depends on
+        the samples before it. With `settling` = 0 the run begins at standstill under the first dp. Otherwise u and dp
+        are taken as periodic with a period of `settling` samples, and y begins with its steady periodic value.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
         lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
@@ -223,5 +228,5 @@ class ValveDrive(_Invertible):
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:
-    """Build a controller's model of what moves a rig's piston: its pump and motor, or its servo valve."""
+    """Build a controller's model of a rig's drive: pump and motor, or the servo valve of a valve-controlled rig."""
     return Drive.from_rig(rig) if rig.circuit.pump_feeds_chambers else ValveDrive.from_rig(rig)

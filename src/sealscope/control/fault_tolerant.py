@@ -44,10 +44,11 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _tolerant_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample: the inner controller's, plus a voltage for the estimated leakage flow.
+    """Compute the voltage [V] of a sample: the inner controller's, plus the one at which the pump feeds the leak.
 
-    It is called as machine code. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the
-    numbers of a `Measured`.
+    The leak's flow is G times the averaged p_A - p_B, where G is the conductance that the observer estimates above
+    the assumed one. While G is not 0, the sum is limited to +-u_max. It is called as machine code. `memory`, `sample`:
+    addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
@@ -84,11 +85,14 @@ class FaultTolerant:
     """A controller that compensates the leakage across the piston, in addition to another controller.
 
     The voltage is that of the controller `inner`, plus the voltage at which the `drive` delivers the leakage flow G
-    dp. A Kalman filter (`update_observer`, with the model `balance`) estimates the conductance between the chambers
-    from the measurements; G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed leakage of the pump. G stays
-    0 until it is significant and measurable, so without a leak the voltages are exactly those of `inner`. The voltage
-    is limited to +-`u_max` [V] while a leak is compensated. `known` >= 0 [m^3/(s Pa)], if given, replaces the
-    estimate: an ideal controller that knows the leak. The compensated flow [m^3/s] is reported as `compensated`.
+    dp, where dp is p_A - p_B averaged over some milliseconds. A Kalman filter (`update_observer`, with the model
+    `balance`) estimates the conductance between the chambers from the measurements; G [m^3/(s Pa)] is this estimate
+    minus `G_assumed`, the assumed leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and
+    would move the piston by half an encoder count a second, so without a leak the voltages are exactly those of
+    `inner`. The voltage is limited to +-`u_max` [V] while a leak is compensated.
+
+    `known` >= 0 [m^3/(s Pa)], if not None, takes the place of the estimated G: an ideal controller that knows the
+    leak. The compensated flow [m^3/s] is reported as `compensated`.
     """
 
     inner: Controller

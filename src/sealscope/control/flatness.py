@@ -32,10 +32,11 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _flatness_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample, the sum of feedback and feed-forward by the equations of `Flatness`.
+    """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
-    It is called as machine code. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the
-    numbers of a `Measured`.
+    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against dp, the pressure
+    difference that the load and the target's speed and acceleration require. It is called as machine code. `memory`,
+    `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0

@@ -80,13 +80,16 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 
 @law
 def _update_with_block(m: Any, dp_sum: float) -> None:
-    """Update the Kalman filter of a leak observer with the block of samples that ends now.
+    """Update the Kalman filter of a leak observer with the volume balance of the block of samples that ends now.
 
-    `m`: record `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples.
+    The filter's state is the leakage conductance and the relative errors of 1/K and of the piston area. `m`: record
+    `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, the two at its
+    ends by half.
 
-    The block is left out if the pressure difference is small, changes its sign, or is too low to shut a check
-    valve. It is also left out if it is an outlier, unless the block before was an outlier of the same sign: then a
-    leak may have opened.
+    The block is left out if the mean of p_A - p_B is smaller in size than `MIN_DP`, or if p_A - p_B changes its sign
+    or is too small to shut a check valve. It is also left out if its innovation exceeds `_OUTLIER_SDS` standard
+    deviations, unless that of the block before did with the same sign: then a leak may have opened, and the variance of
+    the conductance is increased.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:

@@ -80,8 +80,10 @@ def open_loop(
 ) -> tuple[NDArray[np.complex128], bool]:
     """Compute the open-loop response L (n,) of a rig and its controller at frequencies `f` (n,) [Hz].
 
-    The second result is True if the rig is stable without the controller. `speed` [m/s] of the piston and `load`
-    [N] are as in `margins`, which also gives the formula of L.
+    L = -z^-delay sum_j C_j(z) P_j(z) with z = exp(2 pi i f/rate). C_j is the controller's transfer function from
+    measurement j (x, p_A, p_B or theta) to the voltage, P_j that of the rig from the voltage to measurement j. The
+    rig is linearised while its piston moves at `speed` [m/s] (0: standstill), under a force `load` [N] in addition to
+    the rig's own. The second result is True if the linearised rig is stable without the controller.
     """
     A, B, state = _linearise(rig, controller.rate, speed, load)
     z = np.exp(2j * math.pi * f / controller.rate)
@@ -158,9 +160,9 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, Array]]:
     """Compute the response of a controller's voltage to a unit impulse of each measurement, with the piston at rest.
 
-    The impulse lasts one sample. `state` (14,): state of the rig, whose pressures the controller measures
-    otherwise. Returns pairs of the measurement's index in the state and the response (n,) [V per SI unit of the
-    measurement]. Responses that are zero are left out.
+    An impulse changes one measurement during one sample. At all other samples target, position and angle are 0, and the
+    chamber pressures are those in the rig's `state` (14,). Returns pairs of the measurement's index in the state and
+    the response (n,) [V per SI unit of the measurement]. Responses that are zero are left out.
     """
     from sealscope.physics.state import P_A, P_B, POSITION, THETA
 
@@ -168,9 +170,9 @@ def _impulse_responses(controller: Controller, state: Array) -> list[tuple[int, 
     n = round(_RESPONSE_DURATION * controller.rate)
 
     def respond(impulse: Measured) -> Array:
-        """Compute the controller's voltages (n,) [V] after one sample with other measurements, from this sample on.
+        """Compute the controller's voltages (n,) [V] from a sample with the measurements `impulse` on.
 
-        `impulse`: the measurements of this sample. All other samples have the measurements at standstill.
+        All samples before and after that one have the measurements at standstill.
         """
         voltage = controller.start()
         for _ in range(round(controller.rate)):  # settle for a second

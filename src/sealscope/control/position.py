@@ -28,10 +28,12 @@ _memory_at = record_view(FOLLOWING)
 
 @law
 def following_voltage(m: Any, measured: Any) -> float:
-    """Compute the voltage [V] of a sample by the PI law of `PositionPI`, limited to the range of the converter.
+    """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    `m`: a record `FOLLOWING` of the law's parameters and state; its integral and its average pressure difference
-    are updated. `measured`: a `Measured`.
+    It is the voltage at which the drive delivers the flow A v_c, with the piston area A of the chamber with the
+    higher pressure and the commanded velocity v_c = v_target + k_v e + k_i integral of e dt, e = target - x.
+    `m`: a record `FOLLOWING` of the law's parameters and state; the integral and the averaged p_A - p_B in it are
+    updated. `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x

@@ -111,8 +111,8 @@ def fmi_headers() -> Path:
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
     """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    A run of 4 s from mid-stroke is integrated under each of `STEP_COMMANDS`. Returns the shortest step [s] of these
-    runs, and the largest error [Pa] that they estimate.
+    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`; each run chooses its step by this limit.
+    Returns the shortest of the steps [s], and the largest of the errors [Pa] that the runs estimate.
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run
@@ -127,8 +127,8 @@ class MockUp(NamedTuple):
 
     `summary`: one line that describes it; `modules`: LLVM code by function; `variable_list`: its variables; `values`:
     initial values of the parameters, in the order of the code; `n_inputs`, `n_results`, `n_states`: number of inputs,
-    outputs and states; `step` [s]: longest step of the solver; `failures`: messages by the code that a function
-    returns.
+    outputs and states, of a soft sensor the doubles of its memory; `step` [s]: longest step of the solver, or sampling
+    interval of a soft sensor; `failures`: messages by the code that a function returns.
     """
 
     summary: str
@@ -293,9 +293,10 @@ def write_sensor_fmu(
 ) -> tuple[Variable, ...]:
     """Write a functional mock-up unit (FMU) that estimates the leakage from measurements, a soft sensor.
 
-    Its inputs are measured pressures, angle and position. Its outputs are the leakage [m^3/s] and its rise above the
-    leakage during the first blocks of the run, each with a 95 % interval. The FMU contains the compiled volume
-    balance that also judges live recordings, and needs no Python.
+    Its inputs are measured pressures, angle and position. It estimates the leakage of pump and piston together in
+    blocks of 3 s. Its outputs are the mean leakage of the last blocks (at most 20) [m^3/s], its rise above the mean of
+    the first 20 blocks [m^3/s], each with a 95 % interval, and further numbers such as the conductance. The FMU
+    contains the compiled volume balance that also judges live recordings, and needs no Python.
 
     Parameters
     ----------

@@ -94,9 +94,10 @@ class RigChoice(NamedTuple):
     """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
 
     `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional one is present;
-    `exponent`, `literal_metering`: how the equations of the throttles are read (`throttle_flow_coefficients`);
-    `implicit`: True for the implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral
-    is computed by eq. (4.2) of the thesis.
+    `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its diameter;
+    `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed; `implicit`: True for the
+    implicit-explicit method, False for Runge-Kutta; `euler`: True if the speed loop's integral is computed by eq. (4.2)
+    of the thesis.
     """
 
     laws: tuple[bool | tuple[bool, ...], ...]
@@ -122,8 +123,9 @@ def _build_parameters_law(
     """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
 
     Its arguments are the values (n,), in the order of `variables.VALUES`, and two conductances [m^3/(s Pa)] of
-    external leakage out of the chambers A and B, which are added to those of the rig. `laws`, `exponent`,
-    `literal_metering`: as in `RigChoice`.
+    external leakage out of the chambers A and B, which are added to those of the rig. `laws`: the equations that the
+    rig has (`RigChoice`); `exponent`: 1 if the closed fraction of a throttle is that of its area, 2 if that of its
+    diameter; `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed.
     """
 
     @law
@@ -141,10 +143,10 @@ def _build_parameters_law(
 def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
 
-    ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at x_0 [m] under the load of the inputs.
-    ``advance(values, inputs, slopes, y, span, steps)`` integrates it over `span` [s], while the inputs change
-    linearly by their `slopes` (per second). ``report(values, inputs, y, results)`` writes the outputs to `results`.
-    All arguments but x_0, span and steps are pointers (see the module).
+    ``start(values, inputs, x_0, y)`` sets the state `y` to standstill at the piston position x_0 [m] under the load
+    among the inputs. ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps`
+    equal steps, while the inputs change linearly by their `slopes` (per second). ``report(values, inputs, y, results)``
+    writes the outputs to `results`. All arguments but x_0, span and steps are pointers to arrays of doubles.
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])
@@ -159,7 +161,7 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Set the state `y` to standstill at x_0 [m] under the load of the inputs.
+        """Set the state `y` to standstill at the piston position x_0 [m], under the load [N] among the inputs.
 
         Returns 0, or a code of `FAILURES`.
         """
@@ -186,9 +188,9 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Return the state of the rig after a step of h [s] from the state z at the time t [s].
+            """Compute the state of the rig at t + h [s] from its state z at the time t [s].
 
-            The inputs are a + b t, and `p` are the model's parameters.
+            The inputs at a time s are a + b s, with the arrays a and b; `p` are the model's parameters.
             """
             u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
             C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
@@ -198,18 +200,19 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
         @law
         def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Return the state of the rig after a step of h [s] from the state z at the time t [s].
+            """Compute the state of the rig at t + h [s] from its state z at the time t [s].
 
-            The inputs are a + b t, and `p` are the model's parameters.
+            The inputs at a time s are a + b s, with the arrays a and b; `p` are the model's parameters.
             """
             u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
             C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
             return rk4_step(z, h, u, G, C, F, p, euler)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Integrate the state `y` over `span` [s] by equal steps, while the inputs change by `slopes` (per second).
+        """Integrate the state `y` over `span` [s] in equal steps, while the inputs change linearly.
 
-        Returns 0, or a code of `FAILURES` if the state is not finite or a pressure is below vacuum.
+        `inputs`: their values at the start; `slopes`: their change per second; `steps`: number of steps. Returns 0, or
+        a code of `FAILURES` if the state is not finite or a pressure is below vacuum at the end.
         """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
         a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)

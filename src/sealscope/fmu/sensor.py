@@ -177,12 +177,12 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     Samples: `ring` has the last samples, a column each; `increments` the increment of each term of the volume balance
     over the last sampling interval.
 
-    Rows of the volume balance, each of which is a weighted integral over `SPAN` strides (distances between the weight
-    functions of neighbouring rows): `unfinished` has the
-    `SPAN` rows to which the present interval adds; `rows` the finished rows of the open blocks, that is the blocks
-    not yet weighted; `ends` the index past the last row of each open block; `gram` their Gram matrices.
-    `pressure_sums` has the sums of the last blocks (`_SUM`, `_NUMBER`); `slow_sums` the sums over earlier blocks
-    for the coefficients that are not fitted to each block (`weigh_rows`).
+    Rows of the volume balance: a row is the weighted integral of all terms over `SPAN` strides, where a stride is the
+    time from one row to the next. `unfinished` has the `SPAN` rows to which the present interval adds; `rows` the
+    finished rows of the open blocks, whose rows are not weighted yet; `ends` the index past the last row of each open
+    block; `gram` the Gram matrices of the blocks weighted last. `pressure_sums` has, for each of the last blocks, the
+    sum of abs(p_A - p_B) and the number of samples in it; `slow_sums` the sums over earlier blocks for the coefficients
+    that are not fitted to each block (`weigh_rows`).
 
     Blocks before the first fit: `waiting_grams` has their Gram matrices, `waiting_sizes` their sizes
     (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`), `precisions` the precisions of their estimates.
@@ -215,8 +215,9 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
 def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
-    Their arguments are those of the functions in `fmu.machine.build_functions`; the state `y` is a memory of the
-    layout `memory_layout`.
+    ``start`` clears the sensor's memory `y` (`memory_layout`), ``advance`` adds the samples of a communication step to
+    it, and ``report`` writes the outputs to `results`. They have the arguments of the functions of a rig's FMU
+    (`fmu.machine.build_functions`), pointers to arrays of doubles.
     """
     from scipy.special import stdtrit
 
@@ -231,8 +232,8 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the sensor's memory `y` to 0 at the start of a run.
 
-        Returns 0, or a code of `FAILURES` if the pump's displacement is not > 0. The arguments are those of an FMU's
-        rig; `x_0` is ignored.
+        `values`: parameters of the FMU, among them the pump's displacement; `inputs`, `x_0`: ignored. Returns 0, or a
+        code of `FAILURES` if the displacement is not > 0.
         """
         carray(y, n_memory)[:] = 0.0
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
@@ -240,8 +241,9 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
         """Add the samples of the next `span` [s] to the sensor's memory `y`.
 
-        The leakage of each block that they complete is estimated. The inputs change linearly by their `slopes` (per
-        second); `steps` is ignored. Returns 0.
+        The leakage of each block that they complete is estimated. `values`: parameters of the FMU, among them the
+        pump's displacement; `inputs`: measurements at the start of the span; `slopes`: their change per second, taken
+        as constant; `steps`: ignored. Returns 0.
         """
         m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
         first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
@@ -335,9 +337,10 @@ def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
 def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:
     """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1.
 
-    They are written to `out` (n,) in the order of `COLUMNS`. `ring`: the last samples, where sample k has the column
-    k modulo its width; `half`: samples in half a central difference; `rate` [Hz]; `displacement` of the pump
-    [m^3/rad].
+    They are written to `out` (n,) in the order of `COLUMNS`. Those of the response and of the leak, for example, are
+    the volume that the pump displaces [m^3] and the time integral of p_A - p_B [Pa s]. `ring`: the last samples, where
+    sample k has the column k modulo its width; `half`: samples on either side of a central difference, by which the
+    direction of motion is found; `rate` [Hz]: sampling rate; `displacement` [m^3/rad]: that of the pump.
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width
@@ -366,10 +369,10 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 @law
 def _find_angle_sign(m: Any, n_rows: int) -> None:
-    """Find the sign of the pump's angle, and store it in `m.angle_sign`.
+    """Find the sign with which the pump's angle is recorded, and store it, 1 or -1, in `m.angle_sign`.
 
-    With this sign the pump's flow rises with p_A - p_B. It is found from the first `n_rows` rows of the volume
-    balance in the sensor's memory m.
+    With the right sign the pump's flow rises with p_A - p_B: the sign is -1 if their covariance is negative. It is
+    computed from the first `n_rows` rows of the volume balance in the sensor's memory m.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -383,9 +386,10 @@ def _find_angle_sign(m: Any, n_rows: int) -> None:
 def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
     """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-    An estimate at standstill is left out if it is imprecise. `m`: the sensor's memory; `size_error`: relative standard
-    error due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block, and
-    its mean abs(p_A - p_B); `is_learned`: True if the other coefficients are updated with the block.
+    An estimate at standstill is left out if its precision, the inverse of its variance, is at most
+    `MIN_REST_PRECISION` times the usual one. `m`: the sensor's memory; `size_error`: relative standard error of the
+    leakage due to the machine's sizes; `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block,
+    and its mean abs(p_A - p_B); `is_learned`: True if the balance's other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -445,9 +449,12 @@ def _forget_standstill(m: Any) -> None:
 def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
-    `m`: the sensor's memory. The first `LEARNED` blocks with motion are stored until the coefficients can be fitted to
-    all of them together. After `N_WAKING` successive blocks with far larger motion than before, all estimates are
-    discarded, and this first fit is repeated. The other arguments are those of `_append_conductance`.
+    From the first block with motion on, the first `LEARNED` blocks are stored until the coefficients can be fitted to
+    all of them together. After `N_WAKING` successive blocks whose mean square motion is more than 1/`STANDSTILL` times
+    that of earlier blocks, all estimates are discarded, and this first fit is repeated.
+
+    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
+    `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B).
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:
@@ -521,7 +528,8 @@ def _build_block_law(choice: SensorChoice) -> Callable[..., Any]:
 def _mean(history: Any, newest: int, n: int, column: int) -> float:
     """Compute the mean of one result of a soft sensor over n blocks, the last of which is block `newest`.
 
-    `history` (blocks, 5): results of the last blocks; `column`: index of the result.
+    `history` (blocks, 5): results of the last blocks, block k in row k modulo their number; `column`: column of the
+    result.
     """
     total = 0.0
     for k in range(n):
@@ -546,9 +554,11 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
-    `m`: the sensor's memory; `size_error`: relative standard error due to the machine's sizes; `quantiles`: Student's t
-    for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks and the
-    misfit are always written; the other outputs are 0 while there are too few blocks.
+    The leakage is the mean conductance of the last blocks (at most `WINDOW`), times their mean abs(p_A - p_B). The rise
+    is the difference of their mean from that of the first `WINDOW` blocks, times the same pressure. `m`: the
+    sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `quantiles`:
+    Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`. The number of blocks
+    and the misfit are always written; the other outputs are 0 while there are too few blocks.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1

@@ -67,12 +67,13 @@ class AlarmEvent(NamedTuple):
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    `watch`: its detector; `judge`: its alarm; `pending`: number of blocks since the last checkpoint, at which the state
-    was stored; `bytes`: total size of these blocks [bytes]; `n_stored`: number of all blocks so far; `last`: the last
-    estimate, with flows averaged over the machine's cycles; `shown`: the summary that was stored last; `oil_celsius`
-    [deg C]: oil temperature, None if unknown; `judged_s` [s]: end of the last block that was judged; `verdict`: verdict
-    on the last recording, None if whole recordings are not judged; `alarm_samples`: the last samples during an alarm,
-    which may become a healthy recording in the machine's file.
+    `watch`: its leak detector; `judge`: decides on its alarm; `pending`: number of blocks of samples since the last
+    checkpoint, at which the state was stored in the database; `bytes`: total size of these blocks [bytes]; `n_stored`:
+    number of all blocks of samples so far; `last`: the detector's last estimate, with flows averaged over the machine's
+    cycles; `shown`: the summary that was stored last; `oil_celsius` [deg C]: oil temperature, None if unknown;
+    `judged_s` [s]: end of the last stretch of samples that the detector judged; `verdict`: verdict on the last
+    recording, None if whole recordings are not judged; `alarm_samples`: the last samples during an alarm, which may
+    become a healthy recording in the machine's file.
     """
 
     settings: ActuatorSettings
@@ -91,12 +92,13 @@ class _Actuator:
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
     ) -> tuple[list[BlockEstimate], list[AlarmEvent]]:
-        """Judge new samples of the actuator; return an estimate for each block of them, and the changes of the alarm.
+        """Judge new samples of the actuator; return the detector's estimates from them, and the changes of the alarm.
 
-        `follows`: False if there is a gap between these samples and those before; `settings`: thresholds of the
-        alarm; `verdict`: verdict on the samples as a whole recording, None for none. If this verdict decides
-        (`RecordingVerdict.decides`), it updates the alarm; otherwise each block does. The result depends only on the
-        arguments and the state of the actuator.
+        The detector divides the samples into blocks of some seconds, and estimates the leakage of each. `follows`:
+        False if there is a gap between these samples and those before; `settings`: thresholds of the alarm; `verdict`:
+        verdict on the samples as a whole recording, None for none. If this verdict is `leak` or `no leak`, it
+        updates the alarm, and the estimates state the leak that it finds; otherwise each estimate updates the alarm.
+        The result depends only on the arguments and the state of the actuator.
         """
         estimates, events = [], []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
@@ -126,7 +128,7 @@ class _Actuator:
         return estimates, events
 
     def _baseline_version(self) -> int:
-        """Return the version of the healthy baseline, 0 while the first one is being learned."""
+        """Return the version number of the actuator's learned healthy baseline, 0 while one is being learned."""
         return 0 if self.watch.baseline is None else self.watch.baseline.version
 
     def _update_oil_temperature(self, samples: Recording) -> None:
@@ -174,10 +176,11 @@ class _Actuator:
             self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
 
     def _machine_state(self) -> MachineState:
-        """Determine the state of the machine by NAMUR NE 107.
+        """Determine the state of the machine by NAMUR NE 107, such as "good" or "maintenance required".
 
-        It follows from the alarm if that is active, else from the verdict on the last recording, else from the last
-        block and the healthy baseline.
+        It follows from the alarm if that is active, else from the verdict on the last recording if there is one. Else
+        it is that of the condition "no data", "not comparable" (nothing was judged for some time), "learning" (of the
+        healthy baseline) or "watched".
         """
         alarm, baseline, ended_s = self.judge.alarm, self.watch.baseline, self.judge.over_s
         if alarm is not None and alarm.active:
@@ -193,7 +196,13 @@ class _Actuator:
         return state_of("watched", since_s=max(baseline.known_s, ended_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Build the summary of the actuator for the page, the metrics and messages, as plain values by name."""
+        """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
+
+        It has the number of blocks that the leak detector has seen, the end of the last one or of the last recording
+        [s], the state by NAMUR NE 107, the total leakage and the leak [L/min] with their 95 % intervals, the bound of a
+        leak that is not found [L/min], the oil temperature [deg C], facts of the healthy baseline and of the last
+        recording's verdict, id and status word of the open alarm, and the detector's counters. Unknown values are None.
+        """
         baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
         result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
@@ -221,7 +230,7 @@ class _Actuator:
 
 
 def _parse_settings(stored: str) -> WatchSettings | None:
-    """Parse the settings stored with a checkpoint; return None if another version wrote them in another form."""
+    """Parse the settings (JSON) stored with a checkpoint; return None if another version wrote them in another form."""
     try:
         return WatchSettings.model_validate_json(stored)
     except ValidationError:
@@ -229,10 +238,10 @@ def _parse_settings(stored: str) -> WatchSettings | None:
 
 
 def _has_same_learning_settings(stored: Watch, fresh: Watch) -> bool:
-    """Return True if two watches learn their baseline with the same settings and rig.
+    """Return True if two leak detectors learn their healthy baseline with the same settings and rig.
 
-    `stored`: watch from the database; `fresh`: watch by the present settings. The rigs may differ if that of `fresh`
-    is the same machine measured again (`is_remeasured`).
+    `stored`: detector from the database; `fresh`: detector by the present settings. The rigs may differ in the pump's
+    displacement by up to 5 %, as if that were measured again.
     """
     (rig, *conditions), (stored_rig, *stored_conditions) = fresh.learned_with, stored.learned_with
     return conditions == stored_conditions and (rig == stored_rig or is_remeasured(rig, stored_rig))
@@ -259,9 +268,10 @@ class WatchedActuators:
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from the database, or create it if it is new.
+        """Restore an actuator from its last checkpoint in the database and the samples since, or create a new one.
 
-        Its detector (`watch`) starts anew if the rig or the learning time changed since the last checkpoint.
+        Its leak detector (`watch`) starts anew if the rig or the learning time changed since the checkpoint, or if
+        another version stored it.
         """
         name = settings.name
         machine = load_watched(settings.rig)
@@ -424,11 +434,11 @@ class WatchedActuators:
     def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
         """Apply the mark that a person gives an actuator's alarm, store it in one transaction, and return the alarm.
 
-        `name`: the actuator; `mark`: one of `MARKS`; `by_whom`: name of the person; `text`: comment or reason. The
-        mark ``invalid`` withdraws the leak for the reason `text`; ``repaired`` withdraws it and starts to learn a new
-        baseline; ``shelved`` silences the alarm for `hours` of operation. The mark is also written to the file of a
-        commissioned machine (`record_mark`), and an event states the result. Raises InputError if there is no open
-        alarm or an argument is invalid.
+        `name`: the actuator; `mark`: ``acknowledged``, ``comment``, ``valid``, ``invalid``, which withdraws the leak
+        for the reason `text`, ``repaired``, which withdraws it and starts to learn a new healthy baseline, or
+        ``shelved``, which silences the alarm for `hours` of operation; `by_whom`: name of the person; `text`: comment
+        or reason. A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine,
+        and an event states the result. Raises InputError if there is no open alarm or an argument is invalid.
         """
         if len(text) > _MAX_COMMENT_LENGTH or len(by_whom) > 80:
             raise InputError(f"a comment must have at most {_MAX_COMMENT_LENGTH} characters, a name 80")
@@ -488,5 +498,5 @@ class WatchedActuators:
         return summaries
 
     def _notify_change(self) -> None:
-        """Increase `change_number`, by which open pages notice that something has changed."""
+        """Increase `change_number`, by which open web pages notice that results, alarms or outages have changed."""
         self.change_number = next(self._changes)

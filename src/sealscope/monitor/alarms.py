@@ -128,12 +128,14 @@ class AlarmJudge:
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
-        the leak that the watch of the actuator has found, None if there is none; `baseline`: version of the healthy
-        baseline; `settings`: thresholds and debounce.
+        the leak that the actuator's detector has found, None if there is none; `baseline`: version of the healthy
+        baseline; `settings`: thresholds [L/min] and the number of successive blocks beyond one that changes the alarm.
 
-        A leak without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm
-        raises the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then
-        stays, because the leak may last.
+        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
+        or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak
+        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
+        the same alarm again. After a restart of the detector `leak` is None during an alarm; the alarm then stays,
+        because the leak may last.
         """
         if not estimate.judged:
             return None
@@ -200,10 +202,11 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak raises an alarm if its false-alarm probability is within the rate of the settings, or if the verdict on
-        the recording before is a leak as well. The verdict `no leak`, or a leak below the warning threshold, ends the
-        alarm. `earlier`: verdict on the recording before, None if there is none; `baseline`: version of the healthy
-        baseline; `settings`: thresholds and the allowed rate of false alarms.
+        A leak at or above the warning threshold raises an alarm if leak-free recordings give such a verdict seldom
+        enough for the settings' rate of false alarms, or if the verdict on the recording before is a leak as well. The
+        verdict `no leak`, or a leak below the warning threshold, ends the alarm. `earlier`: verdict on the recording
+        before, None if there is none; `baseline`: version of the healthy baseline; `settings`: thresholds and the
+        allowed rate of false alarms.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or ""
         for none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
@@ -242,9 +245,10 @@ class AlarmJudge:
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
-        """Store a changed alarm as the open one, or store that there is none if it is over; return the alarm.
+        """Keep a changed alarm as the open one, or that there is none if it is closed or invalid; return the alarm.
 
-        If its cause has ended or it is over, the time of its last change is stored as its end.
+        If it is no longer active, because its cause has ended or it is closed or invalid, the time of its last change
+        is stored as the time at which the last alarm ended.
         """
         if not alarm.active:
             self.over_s = alarm.updated_s
@@ -254,9 +258,10 @@ class AlarmJudge:
     def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
         """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
-        `mark`: one of `MARKS`; `until` [s]: time until which a shelved alarm is not announced; `reason`: why the
-        alarm is invalid. Raises InputError for an unknown mark, if there is no open alarm, if it has this mark
-        already, or if the mark ``invalid`` has no reason.
+        `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
+        [s]: time until which a shelved alarm is not announced; `reason`: why the alarm is invalid. Raises InputError
+        for an unknown mark, if there is no open alarm, if its state is that of the mark already, or if the mark
+        ``invalid`` has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")

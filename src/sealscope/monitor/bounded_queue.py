@@ -10,10 +10,10 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Load of the queue of blocks that wait to be stored.
+    """Load of the queue of blocks of samples that wait to be stored.
 
-    `n_blocks`, `n_bytes`: number of waiting blocks and of their bytes; `n_waits`: how often a source of blocks had to
-    wait because the queue was full.
+    `n_blocks`: number of these blocks; `n_bytes`: their total size; `n_waits`: how often a source of blocks had to wait
+    since the start because the queue was full.
     """
 
     n_blocks: int = 0

@@ -97,7 +97,8 @@ class Service:
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
         """Queue a block or a refused message for storage; wait while the queue is full.
 
-        Refused messages are also counted and logged. The page draws the samples at once.
+        A refused message, which has no valid block, is also counted and logged. The samples of a block are also passed
+        to the web page, which draws them before they are stored.
         """
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
@@ -126,7 +127,7 @@ class Service:
         return QueueLoad(n_blocks + len(unstored), n_bytes, self._n_waits)
 
     def run(self) -> None:
-        """Store blocks until all sources have ended and there is no page, or until `stop` is called.
+        """Store blocks of samples until `stop` is called or, if there is no web page, until all sources have ended.
 
         Linear algebra runs in one thread: the matrices are small, and on a busy machine several threads spend most of
         the time waiting for each other.
@@ -200,10 +201,10 @@ class Service:
         self._resources.close()
 
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
-        """Store blocks in one transaction by the function `write`, and acknowledge them to their sources.
+        """Store blocks, or refused messages, in one transaction by the function `write`, and acknowledge them.
 
         In an outage of the database its error is raised. After any other error the blocks are stored one by one, and
-        a block that fails is dropped: it would fail again, and the others must not wait for it.
+        a block that fails is dropped and acknowledged: it would fail again, and the others must not wait for it.
         """
         if not blocks:
             return
@@ -230,10 +231,10 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events of alarms to standard output.
+        """Write new events of alarms to the service's output stream, by default standard output.
 
-        If the events can be read, an outage of the database is ended, unless the database still refuses to store
-        blocks.
+        The events are read from the database. If that succeeds, an outage of the database is marked as ended, unless
+        the database still refuses to store blocks.
         """
         self._lines.deliver()
         if not self._is_database_blocked:  # else reading works, but writing does not

@@ -45,11 +45,12 @@ class WatchSettings(_Part):
     """Settings by which an actuator is watched.
 
     `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: upper limit of the false alarms in
-    1000 h; `learn_hours`: time in which the healthy baseline is learned; `warning_lpm`, `error_lpm` [L/min]: leaks at
-    which an alarm is a warning or an error; `debounce_blocks`: number of successive blocks beyond a threshold after
-    which the alarm changes; `return_share`: fraction of a threshold below which the leak counts as ended; `no_data_s`
-    [s]: time without a block after which the state of the actuator is "no data"; `not_comparable_s` [s]: time without
-    a judged block after which it is "not comparable".
+    1000 h of operation; `learn_hours`: time in which the leakage of the healthy machine, the baseline, is learned;
+    `warning_lpm`, `error_lpm` [L/min]: leaks at which an alarm is a warning or an error, None for no error;
+    `debounce_blocks`: number of successive blocks of the detector (some seconds each) beyond a threshold after which
+    the alarm changes; `return_share`: fraction of a threshold below which the leak counts as ended; `no_data_s` [s]:
+    time without samples after which the state of the actuator is "no data"; `not_comparable_s` [s]: time without a
+    judged block after which it is "not comparable".
     """
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
@@ -108,11 +109,11 @@ class ActuatorSettings(WatchSettings):
     @model_validator(mode="before")
     @classmethod
     def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
-        """Complete the table of an actuator with the rate, columns, units and limit in its machine's file.
+        """Complete the table of an actuator with the rate, columns, units and repair limit in its machine's file.
 
         Entries that the table states stay. The key `machine` is another name of `rig`; it must name a file written by
-        `sealscope commission`. The units are those in the column headings of the machine's logs; they are needed for
-        Sparkplug and OPC UA, whose values need not state any.
+        `sealscope commission`. The limit becomes `error_lpm` [L/min]. The units are those in the column headings of the
+        machine's logs; they are filled in for Sparkplug and OPC UA alone, whose values need not state any.
         """
         if not isinstance(values, dict):
             return values

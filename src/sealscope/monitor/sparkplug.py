@@ -55,10 +55,11 @@ class SparkplugMetric:
     unit: str | None = None
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
-        """Convert the value, as it was transmitted, to a Sparkplug data type, and return the metric with both.
+        """Convert the value from its transmitted form to a Sparkplug data type; return the metric with value and type.
 
-        The bytes of an array become numbers (n,), or None if the type is not supported; integers are converted from
-        two's complement. Raises ValueError if an array has a fraction of a number.
+        The bytes of an array become numbers (n,), or None if the type is not supported. Integers of a signed type are
+        converted from two's complement. Other values are unchanged. Raises ValueError if the bytes of an array are no
+        whole number of values.
         """
         value = self.value
         if isinstance(value, bytes):

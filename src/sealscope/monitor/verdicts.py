@@ -30,13 +30,14 @@ _FALSE_ALARM = VERDICT.false_alarm
 class RecordingVerdict:
     """The verdict on one recording, as plain values for the database; times are in seconds since 1970.
 
-    `file`: name of the file; `summary`, `size`, `odds`: texts for the verdict, for the size or bound of the leak, and
-    for the fraction of healthy recordings that look like this one; `reason`, `cause`: as in a Diagnosis; `state`: of
-    the machine by NAMUR NE 107; `start_s`, `end_s`: times of the first and last sample; `onset_s`,
-    `onset_interval_s`: start of the leak, None if it leaks from the first sample on or not at all; `leak_lpm`,
-    `total_lpm` [L/min]: flow of the leak, and of all leakage, with their 95 % intervals; `bound_lpm` [L/min]: upper
-    bound of a leak that is not found; these are None if not stated; `chance`: probability that a leak-free recording
-    scores as high, None if not known; `mark`: mark of a person that ended the alarm, else "".
+    `file`: name of the file; `verdict`: "leak", "no leak" or "cannot tell"; `summary`, `size`, `odds`: texts for the
+    verdict, for the size or bound of the leak, and for the fraction of healthy recordings that look like this one;
+    `reason`: of the verdict, in words; `cause`: of the leak or of another event, "" if not named; `state`: of the
+    machine by NAMUR NE 107; `start_s`, `end_s`: times of the first and last sample; `onset_s`, `onset_interval_s`:
+    start of the leak, None if it leaks from the first sample on or not at all; `leak_lpm`, `total_lpm` [L/min]: flow of
+    the leak, and of all leakage, with their 95 % intervals; `bound_lpm` [L/min]: upper bound of a leak that is not
+    found; these are None if not stated; `chance`: probability that a leak-free recording scores as high, None if not
+    known; `mark`: mark of a person that ended the alarm, else "".
     """
 
     file: str
@@ -111,11 +112,11 @@ class RecordingVerdict:
         return self.leaks or self.clears or self.mark != ""
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if the allowed rate of false alarms is kept although this verdict raises an alarm.
+        """Return True if leak-free recordings lead to such a verdict seldom enough for it to raise an alarm by itself.
 
-        The probability `chance` that a leak-free recording scores as high must not exceed the allowed rate times the
-        length of the recording; the limit is at least `rarest` of `priors.toml`, the smallest chance that can be known.
-        Returns True if `chance` is None.
+        The probability `chance` that a leak-free recording scores as high must not exceed `false_alarms_per_1000_h`
+        times the length of the recording in units of 1000 h; this limit is at least `rarest` of `priors.toml`, the
+        smallest probability that can be known. Returns True if `chance` is None.
         """
         allowed_chance = false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)

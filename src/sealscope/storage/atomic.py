@@ -33,11 +33,11 @@ def check_folder(file: Path) -> None:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a file atomically: yield the path of a temporary file, which replaces `path` if the block succeeds.
+    """Write a file atomically: the `with` block fills a temporary file, which then replaces the file `path`.
 
-    The temporary file is in the folder of `path`, and is removed if the block fails. File and folder are synced to
-    the disk, so that a power loss leaves either the old or the new file. A replaced file keeps its permissions.
-    Raises InputError if the folder does not exist or cannot be written.
+    The path of the temporary file is yielded. This file is in the folder of `path`, and is removed if the block raises
+    an error. File and folder are synced to the disk: a power loss leaves either the old or the new file. A replaced
+    file keeps its permissions. Raises InputError if the folder does not exist or cannot be written.
     """
     target = Path(path)
     try:
@@ -65,7 +65,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _file_mode(target: Path) -> int:
-    """Return the permission bits of the file `target`, or those of a new file if it does not exist."""
+    """Return the permission bits of the file `target`; if it does not exist, those that umask gives a new file."""
     with suppress(FileNotFoundError):
         return target.stat().st_mode & 0o777
     mask = os.umask(0)
@@ -74,9 +74,9 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Force the content of a file, or the names of the files in a folder, from memory to the disk.
+    """Write what the system holds in memory of a file's content, or of a folder's list of files, to the disk.
 
-    `flags` are those of `os.open` with which it is opened.
+    `path`: the file or folder; `flags`: flags for `os.open`, with which it is opened.
     """
     descriptor = os.open(path, flags)
     try:
@@ -89,8 +89,8 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
     If `target` is given, only the temporary files of the file with this name are removed. Otherwise those of all
-    files are removed, in subfolders, too. A file is removed if its process ran on this computer and has ended, and
-    otherwise after a day. Links to folders are not followed.
+    files are removed, in subfolders, too. A file is removed if its process ran on this computer and has ended, or if
+    it was last changed more than a day ago. Links to folders are not followed.
     """
     for path in folder.glob(".*.part") if target is not None else folder.rglob(".*.part"):
         match = _TEMPORARY.fullmatch(path.name)

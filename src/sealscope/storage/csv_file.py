@@ -17,8 +17,9 @@ _FORMULA_BEGINNINGS, _NUMBER = ("=", "+", "-", "@", "\t", "\r"), re.compile(r"[+
 def guard_cell(value: Any) -> Any:
     """Escape a text that a spreadsheet would execute like a formula, or a terminal like a command.
 
-    Other values are returned unchanged. Names and comments may come from other people's files. A text that begins
-    like a formula gets an apostrophe in front. Unprintable characters are escaped.
+    Names and comments may come from other people's files. A text that begins like a formula and is no number gets an
+    apostrophe in front. Unprintable characters are escaped, but not line feeds. Values that are no texts are returned
+    unchanged.
     """
     if not isinstance(value, str):
         return value

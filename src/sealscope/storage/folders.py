@@ -56,7 +56,7 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Split a name into its texts and numbers, which sorts "day_2" before "day_10"."""
+    """Split a name into a list of its texts and whole numbers, a sorting key that puts "day_2" before "day_10"."""
     return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", name)]
 
 

@@ -20,9 +20,10 @@ _MAX_SIZE = 50_000_000
 
 
 def plain_array(values: NDArray[Any]) -> dict[str, Any]:
-    """Convert an array of numbers to a mapping for JSON, with its shape and its bytes (little endian, base64).
+    """Convert an array of numbers to a mapping for JSON with the entries `shape` and `f8`, its values.
 
-    The columns of a structured array become the last axis, without names.
+    The values are 64-bit floats, little endian, as base64 text. The columns of a structured array become the last
+    axis, without names.
     """
     values = np.ascontiguousarray(_as_plain_array(values), dtype="<f8")
     return {"shape": list(values.shape), "f8": b64encode(values.tobytes()).decode("ascii")}
@@ -111,8 +112,8 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, arrays, dataclasses, or objects with a method `state`. Numbers that are not
-    finite become None. Keys of the result are the names without leading underscores.
+    Attributes are numbers, texts, lists, dicts, arrays, dataclasses, or objects with a method `state`. A float
+    attribute that is not finite becomes None. Keys of the result are the names without leading underscores.
     """
     return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
 
@@ -135,10 +136,11 @@ def restore_attributes(
 ) -> None:
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
-    A saved None leaves an attribute unchanged if its present value is a number or None. `kinds`: types of
-    attributes that may be None or may have another type than the present value. An object with a method
-    `load_state` restores itself. Raises InputError if an attribute is missing in `state`, or differs from the
-    present value in type or in the shape of an array; axes that are empty at present may have any length.
+    A saved None leaves an attribute unchanged if its present value is a float or None. `kinds`: types of attributes
+    that may be None or may have another type than the present value. An attribute with a method `load_state`
+    restores itself. If `owner` is a named tuple, its arrays are filled in place. Raises InputError if an attribute is
+    missing in `state`, or differs from the present value in type or in the shape of an array; axes that are empty at
+    present may have any length.
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)

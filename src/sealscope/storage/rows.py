@@ -67,11 +67,12 @@ def read_rows(
 
 
 def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_nan: bool = False) -> Iterator[Row]:
-    """Append each row to the file in a folder as soon as its job ends, then yield the row.
+    """Append each row that the generator `rows` yields to the file `rows.jsonl` in a folder, then yield the row.
 
-    A last line that was cut off before is removed first. `rows` is closed at the end, and `what` names the folder
-    in errors. Raises ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if
-    the file cannot be written.
+    Each row, the result of a job, is on the disk before the generator runs the next job. A last line that an
+    interrupted run left incomplete is removed first. `rows` is closed at the end; `what` names the folder in errors.
+    Raises ValueError for a row with a number that is not finite, unless `allow_nan`, and InputError if the file
+    cannot be written.
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)

@@ -80,7 +80,7 @@ def read_model(
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 class PriorTable:
-    """A table of priors that cannot be changed.
+    """A read-only table of priors, the assumed or published numbers that a `priors.toml` states with their sources.
 
     A subclass annotates its keys, and gives a default for each optional one. Type checkers treat it as a frozen
     dataclass. A real dataclass would take ten times longer to create at import.
@@ -94,11 +94,11 @@ class PriorTable:
 
 
 def read_priors(package: str, kind: type[_T]) -> _T:
-    """Read the `priors.toml` of a package, as an object of the class `kind`.
+    """Read the `priors.toml` of a package, its assumed numbers, as an object of the class `kind`.
 
-    The fields of `kind` are the tables of the file. Each is a `PriorTable` or a mapping, with numbers and tuples as
-    values. Each row of the file must have value, unit and source. Raises InputError that names file, table, key and
-    rule.
+    The fields of `kind` are the tables of the file. Each is a `PriorTable` or a mapping, with numbers and tuples of
+    numbers as values. In the file each key of a table must have value, unit and source. A value is returned as the
+    file states it, in the stated unit. Raises InputError that names file, table, key and rule.
     """
     place = f"{package.replace('.', '/')}/priors.toml"
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
@@ -127,7 +127,8 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
     """Return the value of a prior as `kind`: an int, a tuple of numbers, or else a float.
 
-    `row`: its entry {value, unit, source} in the file; `place` names it in errors.
+    `row`: its entry {value, unit, source} in the file; `place` names it in errors. The value stays in the unit that
+    the row states. Raises InputError if the row lacks one of the three, or if the value does not fit `kind`.
     """
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
@@ -141,7 +142,10 @@ def _parse_value(row: Any, kind: Any, place: str) -> Any:
 
 
 def _parse_number(value: Any, kind: type, place: str) -> Any:
-    """Convert a number of the file to `kind`, int or float; raise InputError for any other value."""
+    """Convert a number of a file of priors to `kind`, int or float; raise InputError for any other value.
+
+    `place`: file, table and key, for the error message.
+    """
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         raise InputError(f"{place} must be {'a whole number' if kind is int else 'a number'}, got {value!r}")
     return kind(value)

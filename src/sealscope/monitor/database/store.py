@@ -42,9 +42,9 @@ _ATTEMPTS = 10
 class StoredRows:
     """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
 
-    `estimates`, `pending`, `events`: new rows; `alarms` (by id), `actuators` and `summaries` (by actuator): rows that
-    are new or replace others, where `actuators` has the checkpoints; `old_blocks`, `old_estimates`: by actuator, the
-    running number up to which old rows are deleted.
+    `estimates`, `pending` (samples since the last checkpoint), `events`: new rows; `alarms` (by id), `actuators`
+    (checkpoints, by actuator) and `summaries` (by actuator): rows that are new or replace others; `old_blocks`,
+    `old_estimates`: by actuator, the running number up to which old rows are deleted.
     """
 
     estimates: list[dict[str, Any]] = field(default_factory=list)
@@ -89,7 +89,7 @@ class StoredRows:
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any]) -> None:
         """Add a checkpoint, that is the settings (JSON) and the state of an actuator.
 
-        Samples of the actuator that were stored before it are deleted.
+        Samples of the actuator that were added before are dropped, because the state includes their effect.
         """
         self.pending = [row for row in self.pending if row["actuator"] != actuator]
         plain = json.dumps(state, allow_nan=False)
@@ -221,7 +221,7 @@ class MonitorStore:
         return bool(self.select_stored([(actuator, identity)]))
 
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
-        """Store the identities of blocks, each given as (actuator, identity, running number of the actuator).
+        """Store the identities of blocks, each given as (actuator, identity, running number in the actuator's blocks).
 
         Raises IntegrityError, which ends the transaction, if one of them is stored already.
         """
@@ -229,10 +229,10 @@ class MonitorStore:
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
-        """Write rows to all tables within a transaction, and delete those that the rows replace.
+        """Write rows to their tables within the transaction of `connection`, and delete rows that are no longer needed.
 
-        These are the samples before a new checkpoint, and the blocks and estimates up to the numbers that `rows`
-        states.
+        Deleted are the samples before a new checkpoint, and the blocks and estimates up to the running numbers in
+        `rows.old_blocks` and `rows.old_estimates`.
         """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
@@ -253,7 +253,7 @@ class MonitorStore:
                 connection.execute(table.delete().where(is_old), last_old_rows)
 
     def commit_rows(self, rows: StoredRows) -> None:
-        """Write rows to all tables in a separate transaction (`write_rows`)."""
+        """Write rows to their tables in a transaction of their own, and delete rows that are no longer needed."""
         with self.writing() as connection:
             self.write_rows(connection, rows)
 
@@ -359,8 +359,9 @@ class MonitorStore:
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        Each row is the mean of equally many successive estimates. `seconds` [s]: length of the history before the
-        newest estimate, None for all of it.
+        Each row has the means over equally many successive estimates of the time `t` [s], the flows and interval ends
+        [L/min], and the oil temperature [deg C], with None for unknown ones. `seconds` [s]: length of the history
+        before the newest estimate, None for all of it.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -389,9 +390,10 @@ class MonitorStore:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Deliver the new events of an output by the function `send`, in order, until it returns False.
+        """Send the events of alarms that an output has not sent yet, by the function `send`, until it returns False.
 
-        After each event its number is stored, so the next call continues there. `output`: name of the output.
+        They are sent in order. After each event its number is stored, so the next call continues there. `output`: name
+        of the output.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -443,13 +445,17 @@ def _unpack(data: bytes) -> StoredSamples:
 
 
 def _event_from_row(row: Any) -> dict[str, Any]:
-    """Convert a row of the table `events` to plain values, in the form in which outputs send events."""
+    """Convert a row of the table `events` to the plain values that outputs send.
+
+    They are `number`, `event` (its kind), `t` [s], `by` (a person), `text` (their comment), and `alarm`, the alarm
+    after the event.
+    """
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
     return {**values, "alarm": json.loads(row.alarm)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
-    """Set the options of a new connection to SQLite."""
+    """Set the options of a new connection to SQLite: sizes, waiting time for locks, WAL mode, full synchronisation."""
     # a page has room for a second of samples, the cache for all pages of a transaction
     settings = "page_size=16384", "cache_size=-32000", "busy_timeout=5000", "foreign_keys=ON"
     for setting in (*settings, "journal_mode=WAL", "synchronous=FULL"):

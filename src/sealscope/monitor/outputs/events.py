@@ -27,7 +27,7 @@ _DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
 
 def _is_announced(event: dict[str, Any]) -> bool:
-    """Return True if an event is to be sent; of a shelved alarm, only the marks of persons are."""
+    """Return True if an event is to be sent; for a shelved alarm, only the marks and comments of persons are sent."""
     return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 

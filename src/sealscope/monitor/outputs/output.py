@@ -37,7 +37,7 @@ class Output(Protocol):
 
 
 def open_outputs(actuators: WatchedActuators, settings: MonitorSettings) -> Iterator[Output]:
-    """Yield an output for each of its tables in the settings, in the order of `MonitorSettings`."""
+    """Build the outputs of alarms that the settings switch on, one for each table such as [webhook]; yield each."""
     for name in type(settings).model_fields:
         table = getattr(settings, name)
         if isinstance(table, OutputSettings):

@@ -137,11 +137,11 @@ class LiveSamples:
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
         """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
 
-        Times are relative to the last sample, which is at 0 s. In the result, `pressures` has the chamber pressures
-        [bar]; `details` the wavelet details d1 to d4 of one pressure [kPa]; and `motion` the position [mm], the
-        pressures [bar], and the speeds of piston [mm/s] and pump [rpm]. `pressure`: channel for `details`;
-        `detail_form`: "rms" for the RMS of the details in windows of `WINDOW_SIZE` samples, "details" for the details
-        themselves.
+        In the result, `t` is the time of the last sample [s], None if there are no samples. The times of the curves are
+        relative to it. `pressures` has the chamber pressures [bar]; `details` the wavelet details d1 to d4 of one
+        pressure [kPa]; and `motion` the position [mm], the pressures [bar], and the speeds of piston [mm/s] and pump
+        [rpm]. `pressure`: channel for `details`; `detail_form`: "rms" for the RMS of the details in windows of
+        `WINDOW_SIZE` samples, "details" for the details themselves.
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -169,10 +169,11 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce long series to the minimum and maximum in each of about `_BINS` bins, in the order in which they occur.
+    """Reduce long series to the minimum and maximum in each of at most `_BINS` bins, in the order in which they occur.
 
-    `series`: values by name, over the times `t` (n,). Returns the reduced times as "t", and the reduced series by
-    name. Series of at most two samples per bin are not reduced.
+    `series`: values by name, over the times `t` (n,). Returns the times of the bins' starts and middles as "t", and the
+    reduced series by name, rounded. Samples before the first full bin are left out. Series of at most two samples per
+    bin are not reduced.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -249,9 +250,9 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 def describe_rig(rig: str) -> dict[str, Any]:
     """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rig`: name or path; `title`; `rods`: sides of the cylinder at which a rod leaves it; `valve`: True if a servo
-    valve drives the cylinder; `stroke` [mm]; `area` [L/min per mm/s]: mean piston area, flow per speed;
-    `displacement` of the pump [L/rev].
+    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are `title`; `rods`, the sides of
+    the cylinder at which a rod leaves it; `valve`, True if a servo valve drives the cylinder; `stroke` [mm]; `area`,
+    the mean piston area as flow per speed [L/min per mm/s]; and `displacement`, that of the pump [L/rev].
     """
     from sealscope.diagnosis.commissioned.watched import load_watched
     from sealscope.reporting.schematic import build_circuit

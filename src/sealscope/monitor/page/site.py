@@ -154,7 +154,11 @@ class _Pages:
         return JSONResponse(details)
 
     async def mark(self, request: Request) -> Response:
-        """Apply the mark in the request's body to the alarm of an actuator, and answer with the alarm as JSON."""
+        """Apply the mark in the request's body to the alarm of an actuator, and answer with the alarm as JSON.
+
+        Query: `name` of the actuator. The body is a JSON mapping of texts: `mark`, such as "acknowledged", and
+        optionally `by`, the name of the person, and `text`, a comment. An invalid request is refused with its reason.
+        """
         # against forged requests: a form of another site cannot send this header
         if request.headers.get("x-sealscope") != "mark":
             return _make_refusal("the header X-Sealscope is missing", 403)
@@ -256,7 +260,7 @@ class _Pages:
         return Response(_read_packaged("login.html"), status, media_type="text/html")
 
     def _find_refusal(self, request: Request) -> Response | None:
-        """Check the token or cookie of a request; return the answer that refuses it, or None if it is admitted."""
+        """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it."""
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None

@@ -205,8 +205,9 @@ class _Connection:
                     refusing_socket.shutdown(socket.SHUT_RDWR)
 
     def _submit(self, connection: int, message: Any) -> None:
-        """Decode a message and submit its block, or the reason to refuse it; it is acknowledged once that is stored.
+        """Decode a message, and submit its block or the reason to refuse the message.
 
+        The message is acknowledged once the block or the refusal is stored, and at once if there is neither.
         `connection`: number of the connection by which the message came.
         """
         number, qos = message.mid, message.qos

@@ -91,9 +91,10 @@ class WatchedFolder:
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
-        An unreadable file is tried again when it has not changed for a longer time. If it fails again, it is refused:
-        a block without samples is stored, and the file is not read again. A recording that is older than the samples
-        watched so far is refused too. Raises PartAway if the folder cannot be read.
+        A file is complete when it has not changed for `settle_s`. An unreadable file is tried again when it has not
+        changed for `_PATIENCE_FACTOR` times as long. If it fails again, it is refused: a block without samples is
+        stored, and the file is not read again. A recording that is older than the samples watched so far is refused
+        too. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())
         self._first_seen = {file.identity: self._first_seen.get(file.identity, time.monotonic()) for file in files}
@@ -129,8 +130,8 @@ class WatchedFolder:
     def _is_due(self, file: _FoundFile) -> bool:
         """Return True if a file is to be read now: it has not changed for `settle_s` and is not stored yet.
 
-        An unreadable file is due again only when it has not changed for a longer time. A file that is stored already
-        is marked as submitted.
+        An unreadable file is due again only when it has not changed for `_PATIENCE_FACTOR` times as long. A file that
+        is stored already is marked as submitted.
         """
         if file.identity in self._unreadable and self._may_be_incomplete(file):
             return False
@@ -142,13 +143,17 @@ class WatchedFolder:
         return True
 
     def _may_be_incomplete(self, file: _FoundFile) -> bool:
-        """Return True if an unreadable file changed recently and may still be written."""
+        """Return True if an unreadable file changed so recently that it may still be written.
+
+        This is less than `_PATIENCE_FACTOR` times `settle_s` ago.
+        """
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The file is read for this; its recording is kept for `blocks` if there is memory for it.
+        The file is read for this. Its recording is kept for `blocks`, if there is room in `_READ_AHEAD_BYTES`; else
+        `blocks` reads the file again.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
@@ -173,7 +178,9 @@ class WatchedFolder:
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
         """Return the reason to refuse a recording that is older than those watched before, or "" to accept it.
 
-        If the newest recording is dated in the future, none is refused. A file that is dated in the future is logged.
+        It is older if its first sample is earlier than the newest time watched. A recording that states the day of that
+        time and no time of day is accepted. If that newest time is in the future, none is refused. A file that is dated
+        in the future is logged.
         """
         if samples is None:
             return ""
@@ -212,7 +219,7 @@ class WatchedFolder:
     def _judge(
         self, machine: CommissionedMachine, recording: Recording, path: Path, shift: float
     ) -> RecordingVerdict | None:
-        """Judge a whole recording; if that raises an error, log it and return None: only its blocks are then watched.
+        """Judge a whole recording by its machine's healthy ones; if that raises an error, log it and return None.
 
         `shift` [s]: added to the recording's times to give seconds since 1970.
         """

@@ -77,10 +77,12 @@ class ValueGatherer:
         self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
-        """Add samples of a channel in SI units; return the blocks that they complete, often none.
+        """Add successive samples of a channel, in SI units; return the blocks of all channels that they complete.
 
-        `t` [s]: time of the first sample. NaN is an unknown value. Values without a finite time are dropped. If the
-        time jumps forward, the blocks continue after the pause; if it jumps back, they start again.
+        `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
+        is an unknown value. Values without a finite time are dropped. If the time jumps forward by more than
+        `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by more than
+        that, all values are discarded first; but the first value of a channel, if as old, counts as constant since.
         """
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
@@ -106,7 +108,7 @@ class ValueGatherer:
             self._channels[name] = _Channel(previous=old_channel.last_value(), arrival=old_channel.arrival)
 
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
-        """Add values to a channel from index `first` on; values that are too late for the next block are dropped."""
+        """Add values to a channel from index `first` of the time axis on; drop those before the block to come."""
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
                 self._count(LATE)
@@ -126,8 +128,8 @@ class ValueGatherer:
     def _pop_blocks(self) -> list[Recording]:
         """Remove and return the blocks that are complete.
 
-        In a complete block every channel has values up to the end; channels that have been silent for `SILENT_S` do
-        not count, as their last value is repeated.
+        A block is complete if every channel has a value at its last sample or later. A channel that has been silent for
+        `SILENT_S` seconds is not waited for: its last value is repeated.
         """
         channels = self._channels.values()
         if self._start is None:

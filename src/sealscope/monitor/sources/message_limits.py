@@ -55,10 +55,10 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check the numbers and the depth of the items in a CBOR message; return its number of pairs of key and value.
+    """Check how many and how deeply nested the items of a CBOR message are; return its number of key-value pairs.
 
-    Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, or if an item is of a
-    type that is not allowed.
+    Raises MessageLimit if lists, containers, pairs or texts are too many, too long or too deep, if an item is of a
+    type that is not allowed, or if the message is incomplete.
     """
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
@@ -67,10 +67,10 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check the numbers of quotation marks and brackets in a JSON message; return its number of colons.
+    """Check that a JSON message has not too many quotation marks and brackets; return its number of colons.
 
-    Their number, with which `check_json_keys` finds repeated keys, includes those within texts. Raises MessageLimit if
-    quotation marks or brackets are too many.
+    Colons within texts count, too; their number serves `check_json_keys` to find repeated keys. Raises MessageLimit if
+    there are more than `_MAX_QUOTES` quotation marks or `_MAX_BRACKETS` opening brackets and braces.
     """
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:

@@ -116,7 +116,11 @@ class _OpcUaSession:
                 await asyncio.sleep(_LOOK_S)
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this."""
+        """Add a value of a subscription, and queue the blocks that it completes; asyncua calls this.
+
+        The value is a number or an array of samples. Samples that are not finite or not of good quality count as
+        unknown (NaN). Any other value is dropped and counted.
+        """
         name, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value
         timestamp = data_value.SourceTimestamp or data_value.ServerTimestamp or datetime.now(UTC)

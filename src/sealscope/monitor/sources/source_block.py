@@ -115,7 +115,7 @@ REASONS = (
 
 @contextmanager
 def raising_refused_message() -> Iterator[None]:
-    """Convert any unexpected error within the context to RefusedMessage; no message can then end its decoder."""
+    """Convert any unexpected error of decoding a message to RefusedMessage, which does not end the decoder's thread."""
     try:
         yield
     except (RefusedMessage, MissingExtra):

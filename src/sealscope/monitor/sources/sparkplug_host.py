@@ -284,10 +284,11 @@ class SparkplugHost:
         return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
-        """Compute the times [s] of `size` samples at `rate` [Hz]; the first has the stated time `t` [s].
+        """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        If the block before ends close to `t`, the times continue it: they start at its end, shifted by at most
-        `_MAX_SHIFT` samples towards the interval that the rounding of `t` to milliseconds allows.
+        `t` is in whole milliseconds. If the end of the actuator's block before, one sampling interval after its last
+        sample, is within 3 ms of `t`, the times start there. If the rounding of `t` cannot explain the difference, they
+        are also shifted towards `t`, by at most `_MAX_SHIFT` samples.
         """
         start, expected = t, self._next_starts.get(actuator, math.nan)
         if abs(expected - t) < 3.0 * _LATE_S:  # else samples are missing, or the clock was set
@@ -302,9 +303,9 @@ def _simultaneous_samples(
 ) -> dict[str, Array]:
     """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
-    `group`: metric by channel; `channel_of`: channel by name of its metric. If the values are single numbers, n is 1,
-    and a channel that is left out repeats its last value. Raises RefusedMessage if the values are no numbers, or
-    arrays of different lengths.
+    `group`: metric by channel; `birth`: the last value of each metric, which is updated with single numbers;
+    `channel_of`: channel by name of its metric. If all values are single numbers, n is 1, and a channel that is left
+    out repeats its last value. Raises RefusedMessage if the values are no numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {name: np.atleast_1d(metric.value) for name, metric in group.items() if metric.value is not None}
